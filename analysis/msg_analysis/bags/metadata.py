@@ -1,0 +1,161 @@
+"""metadata.yaml of a bag, version 9 of rosbag2's format."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from msg_analysis.errors import BagError
+
+METADATA_FILE = "metadata.yaml"
+_ROOT = "rosbag2_bagfile_information"
+_NEVER = 2**63 - 1  # what rosbag2 writes as the start of a bag without messages
+
+
+@dataclass(slots=True)
+class ChannelCount:
+    """A topic of a file and how many messages it has.
+
+    Attributes
+    ----------
+    topic, type_name, type_hash : of the channel
+    qos : offered profiles, the same list as in the MCAP channel
+    messages : counted so far
+    """
+
+    topic: str
+    type_name: str
+    type_hash: str
+    qos: list[dict[str, Any]]
+    messages: int = 0
+
+
+@dataclass(slots=True)
+class FileCount:
+    """A file of a bag and what is in it.
+
+    Attributes
+    ----------
+    name : without directory
+    start, end : log times of the first and the last message [ns]
+    channels : its topics, by name
+    """
+
+    name: str
+    start: int = _NEVER
+    end: int = 0
+    channels: dict[str, ChannelCount] = field(default_factory=dict)
+
+    @property
+    def messages(self) -> int:
+        """Of all topics."""
+        return sum(channel.messages for channel in self.channels.values())
+
+    @property
+    def duration(self) -> int:
+        """From the first to the last message [ns]."""
+        return max(0, self.end - self.start)
+
+
+def bag_information(files: Sequence[FileCount], custom: Mapping[str, str]) -> dict[str, Any]:
+    """What rosbag2 wants to know about a bag.
+
+    Parameters
+    ----------
+    files : Sequence[FileCount]
+        its files, in order
+    custom : Mapping[str, str]
+        our own entries
+    """
+    topics: dict[str, ChannelCount] = {}
+    for file in files:
+        for name, channel in file.channels.items():
+            total = topics.setdefault(
+                name, ChannelCount(name, channel.type_name, channel.type_hash, channel.qos)
+            )
+            total.messages += channel.messages
+    start = min(file.start for file in files)
+    return {
+        "version": 9,
+        "storage_identifier": "mcap",
+        "duration": {"nanoseconds": max(0, max(file.end for file in files) - start)},
+        "starting_time": {"nanoseconds_since_epoch": start},
+        "message_count": sum(file.messages for file in files),
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": topic.topic,
+                    "type": topic.type_name,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": topic.qos,
+                    "type_description_hash": topic.type_hash,
+                },
+                "message_count": topic.messages,
+            }
+            for topic in topics.values()
+        ],
+        "compression_format": "",  # of rosbag2's own kinds; the chunks of MCAP are compressed by themselves
+        "compression_mode": "",
+        "relative_file_paths": [file.name for file in files],
+        "files": [
+            {
+                "path": file.name,
+                "starting_time": {"nanoseconds_since_epoch": file.start},
+                "duration": {"nanoseconds": file.duration},
+                "message_count": file.messages,
+            }
+            for file in files
+        ],
+        "custom_data": dict(custom),
+        "ros_distro": os.environ.get("ROS_DISTRO", "jazzy"),
+    }
+
+
+def dump(document: Any) -> str:
+    """As YAML, keys in the order given."""
+    return yaml.safe_dump(document, sort_keys=False)
+
+
+def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
+    """Put metadata.yaml into a bag, whole or not at all.
+
+    Parameters
+    ----------
+    directory : Path
+        of the bag
+    information : Mapping[str, Any]
+        from :func:`bag_information`
+    """
+    temporary = directory / f".{METADATA_FILE}.tmp"
+    with temporary.open("w", encoding="utf-8") as stream:
+        stream.write(dump({_ROOT: dict(information)}))
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(directory / METADATA_FILE)
+
+
+def read_metadata(directory: Path) -> dict[str, Any] | None:
+    """Bag information of a directory, or None where there is no metadata.yaml.
+
+    Raises
+    ------
+    BagError : not the metadata of a bag
+    """
+    file = directory / METADATA_FILE
+    try:
+        document = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise BagError(
+            f"{file}: cannot be read ({error}): move it away to read the .mcap files alone"
+        ) from error
+    information = document.get(_ROOT) if isinstance(document, dict) else None
+    if not isinstance(information, dict):
+        raise BagError(f"{file}: no {_ROOT} in it: expected the metadata of a ROS 2 bag")
+    return information

@@ -1,0 +1,258 @@
+"""Reads a recorded run, whoever recorded it, and counts what is there before anything else."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from msg_analysis.bags.cdr import ActiveGraph, CdrError, decode_string
+from msg_analysis.bags.mcapfile import Batch, McapFile
+from msg_analysis.bags.metadata import read_metadata
+from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
+from msg_analysis.bags.states import StateColumns, States
+from msg_analysis.bags.writer import RECORD_NAME, recording_pid
+from msg_analysis.errors import BagError, InputError
+from msg_analysis.model.record import RunRecord
+from msg_analysis.model.trajectory import Completeness, Trajectory
+from msg_analysis.types import IntArray
+
+# Topics are told by type and by the end of their name: the network may run in any namespace.
+_STATE, _GRAPH, _EXPERIMENT = "state", "graph", "experiment"
+_TOPICS = {
+    AGENT_STATE.full_name: (_STATE, re.compile(r"(^|/)agent_\d+/state$")),
+    ACTIVE_GRAPH.full_name: (_GRAPH, re.compile(r"(^|/)graph$")),
+    STRING.full_name: (_EXPERIMENT, re.compile(r"(^|/)experiment$")),
+}
+
+
+def read_bag(path: str | Path) -> Trajectory:
+    """The run that a bag holds.
+
+    Parameters
+    ----------
+    path : str | Path
+        the directory of a bag, with metadata.yaml or without, or one of its .mcap files; torn files are read
+        up to the tear
+
+    Returns
+    -------
+    Trajectory
+        with the account of what is missing in ``completeness``
+
+    Raises
+    ------
+    BagError : no bag, a bag without the run record, or with several runs
+    InputError : the run record in it is not valid
+    """
+    path = Path(path)
+    contents = _Contents()
+    for file in bag_files(path):
+        contents.read(McapFile(file))
+    record = _choose(contents, path)
+    return _trajectory(contents, record)
+
+
+def bag_files(path: Path) -> list[Path]:
+    """The MCAP files of a bag in their order.
+
+    Parameters
+    ----------
+    path : Path
+        directory or file
+
+    Raises
+    ------
+    BagError : there is none, one is missing, or the bag is of a kind that cannot be read
+    """
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise BagError(f"{path}: not found: expected the directory of a bag or an .mcap file")
+    information = read_metadata(path)
+    if information is None:
+        files = [file for suffix in ("mcap", "mcap.zstd") for file in path.glob(f"*.{suffix}")]
+        if not files:
+            raise BagError(f"{path}: no bag: expected metadata.yaml or .mcap files in this directory")
+        return sorted(files, key=_file_number)
+    storage = information.get("storage_identifier")
+    if storage != "mcap":
+        raise BagError(
+            f"{path}: its storage is {storage}, expected mcap: record with `ros2 bag record -s mcap`, or "
+            f"convert it"
+        )
+    if str(information.get("compression_mode", "")).lower() == "message":
+        raise BagError(
+            f"{path}: every message in it is compressed by itself, which cannot be read: convert it, or "
+            f"record with "
+            "`--storage-preset-profile zstd_fast`"
+        )
+    files = [path / str(name) for name in information.get("relative_file_paths") or []]
+    lost = [file.name for file in files if not file.is_file()]
+    if lost or not files:
+        raise BagError(
+            f"{path}: {', '.join(lost) or 'every file'} of its metadata.yaml is missing: copy the whole bag"
+        )
+    return files
+
+
+def _file_number(file: Path) -> tuple[int, str]:
+    """Rosbag2 numbers the files of a split bag: name_0.mcap, name_1.mcap, ..., name_10.mcap."""
+    number = re.search(r"_(\d+)\.mcap", file.name)
+    return int(number[1]) if number else 0, file.name
+
+
+@dataclass(slots=True)
+class _Contents:
+    """What the files of a bag hold of our topics."""
+
+    states: StateColumns = field(default_factory=StateColumns)
+    graphs: list[ActiveGraph] = field(default_factory=list)
+    experiments: dict[str, None] = field(default_factory=dict)  # texts, each once, in order
+    records: dict[str, None] = field(default_factory=dict)  # the same from the metadata of our own files
+    refused: Counter[str] = field(default_factory=Counter)
+
+    def read(self, file: McapFile) -> None:
+        kinds: dict[int, str | None] = {}
+        for batch in file.batches():
+            for number, channel in file.channels.items():
+                if number not in kinds:
+                    schema = file.schemas.get(channel.schema_id)
+                    kind, pattern = _TOPICS.get(schema.name if schema else "", (None, None))
+                    kinds[number] = kind if pattern and pattern.search(channel.topic) else None
+            self._add(batch, kinds)
+        self.records.update(
+            (record.metadata["record"], None)
+            for record in file.metadata
+            if record.name == RECORD_NAME and "record" in record.metadata
+        )
+        self.refused["torn file"] += file.torn is not None
+        self.refused["damaged chunk"] += file.damaged_chunks
+
+    def _add(self, batch: Batch, kinds: dict[int, str | None]) -> None:
+        states = np.isin(batch.channel, [number for number, kind in kinds.items() if kind == _STATE])
+        if states.any():
+            self.states.add(batch, np.flatnonzero(states))
+        others = np.isin(batch.channel, [n for n, kind in kinds.items() if kind in (_GRAPH, _EXPERIMENT)])
+        for index in np.flatnonzero(others).tolist():
+            data = batch.message(index)
+            try:
+                if kinds[int(batch.channel[index])] == _GRAPH:
+                    self.graphs.append(ActiveGraph.decode(data))
+                else:
+                    self.experiments[decode_string(data)] = None
+            except CdrError:
+                self.refused["undecodable"] += 1
+
+
+def _choose(contents: _Contents, path: Path) -> RunRecord:
+    """The run record of the one run that has states."""
+    texts = contents.experiments or contents.records
+    if not texts:
+        pid = recording_pid(path)
+        hint = f" (process {pid} is still recording it)" if pid else ""
+        raise BagError(
+            f"{path}: recorded without the latched topic `experiment`, so nobody knows what run it is "
+            f"of{hint}: record "
+            "that topic too, with durability transient_local (as `ros2 bag record -a` does)"
+        )
+    records: dict[bytes, RunRecord] = {}
+    errors: list[InputError] = []
+    for text in texts:
+        try:
+            record = RunRecord.from_json(text, f"{path}: topic experiment")
+            records.setdefault(record.run.bytes, record)
+        except InputError as error:  # another program's topic of that name, or a record that we cannot use
+            errors.append(error)
+    if not records:
+        raise errors[0]
+    counts = contents.states.runs()
+    with_states = [record for run, record in records.items() if counts.get(run)]
+    candidates = with_states or list(records.values())
+    if len(candidates) > 1:
+        listed = "; ".join(
+            f"{r.run} ({r.experiment.name}, {counts.get(r.run.bytes, 0)} states)" for r in candidates
+        )
+        raise BagError(
+            f"{path}: {len(candidates)} runs in one bag: {listed}: record each run into a bag of its own"
+        )
+    return candidates[0]
+
+
+def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
+    experiment = record.experiment
+    agents, replicas, steps = experiment.agents, experiment.run.replicas, experiment.steps
+    run = record.run.bytes
+    refused = contents.refused
+    refused["undecodable"] += contents.states.undecodable
+    counts = contents.states.runs()
+    refused["other run"] += sum(counts.values()) - counts.get(run, 0)
+    taken = contents.states.take(run, replicas)
+    refused["wrong length"] += counts.get(run, 0) - len(taken.step)
+
+    good = np.ones(len(taken.step), dtype=np.bool_)
+    for reason, bad in (
+        ("unknown agent", (taken.agent < 1) | (taken.agent > agents)),
+        ("step out of range", taken.step > steps),
+        ("unknown mode", taken.mode > len(experiment.graph_list)),
+        ("not finite", ~np.isfinite(taken.state).all(axis=1)),
+    ):
+        refused[reason] += int((good & bad).sum())
+        good &= ~bad
+    index = np.flatnonzero(good)
+    cell = taken.step[index] * agents + taken.agent[index] - 1
+    cells, first, owner = np.unique(cell, return_index=True, return_inverse=True)
+    kept = index[first]  # of several copies, the first in the bag
+    again = np.delete(np.arange(len(cell)), first)
+    differs = (taken.state[index[again]] != taken.state[kept[owner[again]]]).any(axis=1)
+    refused["contradicts an earlier copy"] += int(differs.sum())
+
+    states = np.full(((steps + 1) * agents, replicas), np.nan)
+    states[cells] = taken.state[kept]
+    agent_modes = np.full((steps + 1) * agents, -1, dtype=np.int64)
+    agent_modes[cells] = taken.mode[kept] - 1
+    modes = _modes(contents, run, steps, len(experiment.graph_list))
+    expected = (steps + 1) * agents
+    completeness = Completeness(
+        expected=expected,
+        received=len(cells),
+        missing=expected - len(cells),
+        duplicates=len(cell) - len(cells),
+        out_of_order=_out_of_order(taken, kept),
+        missing_modes=int((modes < 0).sum()),
+        refused={reason: count for reason, count in sorted(refused.items()) if count},
+    )
+    shape = (steps + 1, agents)
+    return Trajectory(
+        record, states.reshape(*shape, replicas), modes, completeness, agent_modes.reshape(shape)
+    )
+
+
+def _out_of_order(states: States, index: IntArray) -> int:
+    """How many of these states came after a later one of the same agent."""
+    agent, step = states.agent[index], states.step[index]
+    order = np.lexsort((states.position[index], agent))
+    height = (agent * (step.max(initial=0) + 1) + step)[order]  # rises from agent to agent
+    return int((height < np.maximum.accumulate(height)).sum())
+
+
+def _modes(contents: _Contents, run: bytes, steps: int, graphs: int) -> IntArray:
+    """(N,) graph of every step from the sojourns; -1 where none or more than one claims it."""
+    sojourns: set[tuple[int, int, int, int]] = set()
+    for graph in contents.graphs:
+        if graph.run != run:
+            contents.refused["other run"] += 1
+        elif not (1 <= graph.mode <= graphs and graph.first_step <= graph.last_step < steps):
+            contents.refused["graph out of range"] += 1
+        else:
+            sojourns.add((graph.sequence, graph.mode, graph.first_step, graph.last_step))
+    modes = np.full(steps, -1, dtype=np.int64)
+    claims = np.zeros(steps, dtype=np.int64)
+    for _, mode, first, last in sorted(sojourns):
+        modes[first : last + 1] = mode - 1
+        claims[first : last + 1] += 1
+    modes[claims != 1] = -1
+    return modes

@@ -1,0 +1,91 @@
+"""Writes a trajectory as a bag with the topics and the layout of a recorded network run."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from msg_analysis.bags.cdr import ActiveGraph, StateCodec, StepClock, encode_string
+from msg_analysis.bags.schemas import network_topics, state_topic
+from msg_analysis.bags.writer import BagWriter
+from msg_analysis.errors import BagError
+from msg_analysis.model.trajectory import Trajectory
+
+
+def write_trajectory(trajectory: Trajectory, directory: str | Path) -> None:
+    """Write a bag, whole or not at all.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+        of the twin, or read from another bag; what is missing in it is missing in the bag
+    directory : str | Path
+        of the bag; must not exist
+
+    Raises
+    ------
+    BagError : the directory exists or cannot be written
+    """
+    directory = Path(directory).absolute()
+    if directory.exists():
+        raise BagError(f"{directory}: exists already: choose another name, or move it away first")
+    record = trajectory.record.to_json()
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{directory.name}.", dir=directory.parent) as workshop:
+            # The bag gets its own name at once: that of its file derives from it.
+            unfinished = Path(workshop) / directory.name
+            topics = network_topics(trajectory.record.experiment.agents)
+            with BagWriter(unfinished, topics, record=record) as bag:
+                bag.write("/experiment", encode_string(record), 0)
+                for topic, data, time in _messages(trajectory):
+                    bag.write(topic, data, time)
+            unfinished.rename(directory)
+    except OSError as error:
+        raise BagError(f"{directory}: cannot be written ({error.strerror}): choose another place") from error
+
+
+def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
+    """(topic, CDR bytes, time [ns]), in the order of time."""
+    experiment = trajectory.record.experiment
+    run, dt, modes = trajectory.record.run.bytes, experiment.step_length, trajectory.modes
+    time = StepClock(dt).nanoseconds
+    codecs = [StateCodec(run, i + 1, experiment.run.replicas, dt) for i in range(experiment.agents)]
+    topics = [state_topic("/", i + 1) for i in range(experiment.agents)]
+    used = trajectory.agent_modes
+    if used is None:
+        used = np.repeat(np.concatenate(([-1], modes))[:, None], experiment.agents, axis=1)
+    present = trajectory.present
+    sojourns = _sojourns(trajectory)
+    sojourn = next(sojourns, None)
+    for k in range(len(trajectory.states)):
+        now = time(k)
+        if sojourn is not None and sojourn.first_step == k:
+            yield "/graph", sojourn.encode(), now
+            sojourn = next(sojourns, None)
+        for i in np.flatnonzero(present[k]).tolist():
+            yield topics[i], codecs[i].encode(k, int(used[k, i]) + 1, trajectory.states[k, i]), now
+
+
+def _sojourns(trajectory: Trajectory) -> Iterator[ActiveGraph]:
+    """The stretches of equal graph, without those whose graph is not known."""
+    experiment, modes = trajectory.record.experiment, trajectory.modes
+    time = StepClock(experiment.step_length).nanoseconds
+    first = np.flatnonzero(np.diff(modes, prepend=-2))
+    last = np.append(first[1:], len(modes)) - 1
+    known = modes[first] >= 0
+    for sequence, (start, end) in enumerate(zip(first[known].tolist(), last[known].tolist(), strict=True)):
+        graph = experiment.graph_list[modes[start]]
+        yield ActiveGraph(
+            stamp=time(start),
+            run=trajectory.record.run.bytes,
+            sequence=sequence,
+            mode=int(modes[start]) + 1,
+            name=graph.name,
+            first_step=start,
+            last_step=end,
+            arcs=graph.arcs,
+        )

@@ -1,0 +1,207 @@
+"""Writes a bag that rosbag2, rosbags, Foxglove and PlotJuggler open: a directory with one MCAP file."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Self
+
+from mcap.writer import CompressionType, Writer
+
+from msg_analysis.bags.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
+from msg_analysis.bags.schemas import Topic
+from msg_analysis.errors import BagError
+
+# Small enough that a killed recorder loses little, large enough that zstd finds what the messages have in
+# common. Measured: 4 us of CPU per message of 16 replicas, with zstd or without; zstd takes a third off the
+# size.
+CHUNK_SIZE = 256 * 1024
+RECORDING_MARKER = ".recording"
+RECORD_NAME = "msg_agents"  # of the MCAP metadata record with the run record
+ROSBAG2_RECORD = "rosbag2"
+
+
+class _Channel:
+    """Number of a topic in the file, and its count."""
+
+    __slots__ = ("count", "id")
+
+    def __init__(self, number: int, count: ChannelCount) -> None:
+        self.id, self.count = number, count
+
+
+class BagWriter:
+    """A bag in the making: its directory has ``.recording`` (locked, with our process id), no metadata.yaml.
+
+    Parameters
+    ----------
+    directory : of the bag; must not exist
+    topics : what it will hold
+    record : the run record as JSON; kept in the file as well, so that a torn bag still tells what run it is
+        of
+
+    Raises
+    ------
+    BagError : the directory exists or cannot be made
+    """
+
+    def __init__(self, directory: Path, topics: Sequence[Topic], *, record: str | None = None) -> None:
+        self.directory = Path(directory).absolute()
+        self._file = FileCount(f"{self.directory.name}_0.mcap")
+        self._custom: dict[str, str] = {}
+        self._closed = False
+        try:
+            self.directory.mkdir(parents=True)
+            self._stream: BinaryIO = (self.directory / self._file.name).open("xb")
+            self._marker = (self.directory / RECORDING_MARKER).open("w", encoding="utf-8")
+        except FileExistsError as error:
+            raise BagError(
+                f"{directory}: exists already: choose another name, or move it away first"
+            ) from error
+        except OSError as error:
+            raise BagError(f"{directory}: cannot be made ({error.strerror}): choose another place") from error
+        try:
+            fcntl.flock(self._marker, fcntl.LOCK_EX)  # the system takes it away when this process dies
+            json.dump({"pid": os.getpid()}, self._marker)
+            self._marker.flush()
+            self._mcap = Writer(self._stream, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD)
+            self._mcap.start(profile="ros2", library="mcap")
+            self._add_information()
+            if record is not None:
+                self._custom["run"] = str(json.loads(record).get("run", ""))
+                self._mcap.add_metadata(RECORD_NAME, {"record": record})
+            schemas: dict[str, int] = {}
+            self._channels: dict[str, _Channel] = {}
+            for topic in topics:
+                kind = topic.type.full_name
+                if kind not in schemas:
+                    schemas[kind] = self._mcap.register_schema(kind, "ros2msg", topic.type.schema.encode())
+                self._add_channel(topic, schemas[kind])
+            self._mcap.flush()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _add_channel(self, topic: Topic, schema: int) -> None:
+        count = ChannelCount(topic.name, topic.type.full_name, topic.type.type_hash, topic.qos)
+        metadata = {"offered_qos_profiles": dump(topic.qos), "topic_type_hash": topic.type.type_hash}
+        number = self._mcap.register_channel(topic.name, "cdr", schema, metadata)
+        self._channels[topic.name] = _Channel(number, count)
+        self._file.channels[topic.name] = count
+
+    def write(self, topic: str, data: bytes, time_ns: int) -> None:
+        """Append one message.
+
+        Parameters
+        ----------
+        topic : str
+            absolute name of one of the bag's topics
+        data : bytes
+            the message as CDR, with its encapsulation header
+        time_ns : int
+            simulated time [ns]; :func:`msg_analysis.bags.cdr.stamp_ns` takes it from the message's header
+
+        Raises
+        ------
+        BagError : the disk is full or the bag is closed; what was written before stays readable
+        """
+        channel = self._channels.get(topic)
+        if channel is None or self._closed:
+            reason = "is closed" if self._closed else f"has no topic {topic}"
+            raise BagError(f"{self.directory}: {reason}: nothing more can be written to it")
+        count = channel.count
+        try:
+            self._mcap.add_message(channel.id, time_ns, data, time_ns, count.messages)
+        except OSError as error:
+            raise self._failed(error) from error
+        count.messages += 1
+        file = self._file
+        if time_ns > file.end:
+            file.end = time_ns
+        if time_ns < file.start:
+            file.start = time_ns
+
+    def flush(self) -> None:
+        """Hand everything so far to the operating system, so that it survives the end of this process.
+
+        Raises
+        ------
+        BagError : the disk is full
+        """
+        try:
+            self._mcap.flush()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def close(self, complete: bool = True) -> None:
+        """Finish the file, write metadata.yaml, remove the marker. Calling it again does nothing.
+
+        Parameters
+        ----------
+        complete : bool
+            whether the recorder saw the end of the run
+
+        Raises
+        ------
+        BagError : the disk is full; the marker stays and the file can be salvaged
+        """
+        if self._closed:
+            return
+        self._custom["complete"] = "true" if complete else "false"
+        try:
+            self._add_information()
+            self._mcap.finish()
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+            self._stream.close()
+            write_metadata(self.directory, bag_information([self._file], self._custom))
+            (self.directory / RECORDING_MARKER).unlink()
+            self._marker.close()
+        except OSError as error:
+            raise self._failed(error) from error
+        self._closed = True
+
+    def _add_information(self) -> None:
+        information = bag_information([self._file], self._custom)
+        self._mcap.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(information)})
+
+    def _failed(self, error: OSError) -> BagError:
+        self._closed = True
+        for stream in (self._stream, self._marker):
+            with contextlib.suppress(OSError):  # closing tries to write what could not be written
+                stream.close()
+        return BagError(
+            f"{self.directory}: cannot be written ({error.strerror or error}): free some space or choose "
+            "another place; what was written before can still be read"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close(complete=error is None)
+
+
+def recording_pid(directory: Path) -> int | None:
+    """Process that is writing this bag; None where nobody is (any more).
+
+    Parameters
+    ----------
+    directory : Path
+        of a bag
+    """
+    try:
+        with (directory / RECORDING_MARKER).open(encoding="utf-8") as marker:
+            try:
+                fcntl.flock(marker, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return int(json.load(marker)["pid"])
+    except OSError:
+        pass
+    return None

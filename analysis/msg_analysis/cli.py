@@ -1,0 +1,155 @@
+"""The command line ``msg-analysis``: plain functions of the other rooms, one a command.
+
+Results go to stdout, everything else to stderr. Exit codes: 0 fine or agrees, 1 disagrees, 2 bad usage or
+input, 3 data incomplete. What takes long to import is imported by the command that needs it.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+import msg_analysis
+from msg_analysis.console import CommandGroup, examples, print_json
+from msg_analysis.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    return Console(highlight=False, markup=False)
+
+
+_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+_experiment = click.argument("experiment", type=click.Path(path_type=Path))
+
+
+@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(msg_analysis.__version__, prog_name="msg-analysis")
+def main() -> None:
+    """Theory, simulation and statistics of Markov-switching networks of agents."""
+
+
+@main.command(
+    epilog=examples(
+        "msg-analysis predict line_ring.yaml", "msg-analysis predict line_ring.yaml --json | jq .emulated"
+    )
+)
+@_experiment
+@_json
+def predict(experiment: Path, as_json: bool) -> None:
+    """Predict the steady errors of EXPERIMENT, exactly."""
+    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.theory.prediction import predict as predict_experiment
+
+    loaded = Experiment.load(experiment)
+    loaded.require_available("predict")
+    document = predict_experiment(loaded).to_json()
+    if as_json:
+        print_json(document)
+    else:
+        from msg_analysis.report.text import print_prediction
+
+        print_prediction(document, _console())
+
+
+@main.command(
+    epilog=examples(
+        "msg-analysis simulate line_ring.yaml", "msg-analysis simulate line_ring.yaml --seed 8 --out twin_8"
+    )
+)
+@_experiment
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Bag directory to write; <name>_twin by default."
+)
+@click.option("--seed", type=int, help="Instead of run.seed.")
+@click.option("--duration", type=float, help="Instead of run.duration [units of simulated time].")
+def simulate(experiment: Path, out: Path | None, seed: int | None, duration: float | None) -> None:
+    """Run EXPERIMENT without ROS and write its bag, whose name is printed."""
+    from msg_analysis.bags.store import write_trajectory
+    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.model.twin import simulate as simulate_experiment
+
+    given = {key: value for key, value in {"seed": seed, "duration": duration}.items() if value is not None}
+    loaded = Experiment.load(experiment).with_run(**given)
+    loaded.require_available()
+    directory = out or Path(f"{loaded.name}_twin")
+    if directory.exists():
+        raise InputError(f"{directory}: exists already: remove it, or choose another name with --out")
+    write_trajectory(simulate_experiment(loaded), directory)
+    click.echo(directory)
+
+
+@main.command(
+    epilog=examples(
+        "msg-analysis compare line_ring_twin", "msg-analysis compare line_ring_twin --report report.html"
+    )
+)
+@click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@_json
+@click.option(
+    "--report", type=click.Path(dir_okay=False, path_type=Path), help="Write a report (HTML) as well."
+)
+@click.pass_context
+def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, report: Path | None) -> None:
+    """Compare what the run in BAG did with what theory predicts.
+
+    Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
+    """
+    from msg_analysis.bags.reader import read_bag
+    from msg_analysis.inference.compare import compare as compare_trajectory
+
+    if len(bags) > 1:
+        raise InputError(f"{len(bags)} bags: one bag at a time: call compare for each")
+    if report and not report.parent.is_dir():
+        raise InputError(f"{report}: no such directory {report.parent}: create it")
+    trajectory = read_bag(bags[0])
+    comparison = compare_trajectory(trajectory)
+    if report:
+        from msg_analysis.report.html import write_report
+
+        write_report(comparison, trajectory, report)
+    if as_json:
+        print_json(comparison.to_json())
+    else:
+        from msg_analysis.report.text import print_comparison
+
+        print_comparison(comparison.to_json(), _console())
+    context.exit(comparison.exit_code)
+
+
+@main.command(epilog=examples("msg-analysis info line_ring.yaml", "msg-analysis info line_ring_twin --json"))
+@click.argument("source", metavar="EXPERIMENT|BAG", type=click.Path(path_type=Path))
+@_json
+def info(source: Path, as_json: bool) -> None:
+    """Explain an experiment file, or say what a bag holds."""
+    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.report import text
+    from msg_analysis.report.info import describe_bag, describe_experiment
+
+    if source.is_dir() or source.suffix == ".mcap":
+        document, show = describe_bag(source), text.print_bag
+    else:
+        document, show = describe_experiment(Experiment.load(source)), text.print_experiment
+    if as_json:
+        print_json(document)
+    else:
+        show(document, _console())
+
+
+@main.command(epilog=examples("msg-analysis schema > experiment.schema.json"))
+def schema() -> None:
+    """Print the JSON Schema of experiment files, for editors."""
+    from msg_analysis.model.experiment import json_schema
+
+    click.echo(json.dumps(json_schema(), indent=2))
+
+
+if __name__ == "__main__":
+    main(prog_name="msg-analysis")

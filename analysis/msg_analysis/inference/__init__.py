@@ -1,0 +1,1 @@
+"""Comparisons of runs with predictions: estimates, standard errors, tests, the verdict."""

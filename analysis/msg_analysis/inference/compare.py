@@ -1,0 +1,306 @@
+"""A run against its prediction: the verdict."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy import stats
+
+from msg_analysis.inference.batch import batch_interval
+from msg_analysis.inference.innovations import InnovationTests, innovation_tests, quadratic_form
+from msg_analysis.inference.martingale import TimeMeans, time_means
+from msg_analysis.inference.multiplicity import holm
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.switching import SwitchingTest, switching_test
+from msg_analysis.model.trajectory import Trajectory
+from msg_analysis.theory import symmetric
+from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.types import FloatArray
+
+Verdict = Literal["agrees", "disagrees", "incomplete"]
+
+EXIT_CODES: dict[Verdict, int] = {"agrees": 0, "disagrees": 1, "incomplete": 3}
+MIN_STEPS = 100
+"""Fewest steps for which numbers are given."""
+RUNNING_POINTS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A measured error beside its prediction; None where it cannot be had.
+
+    Attributes
+    ----------
+    measured, predicted : time mean over the run, and its exact expectation
+    standard_error : of the measured one, the martingale one
+    z : (measured - predicted) / standard_error
+    p : two-sided, of z
+    p_holm : adjusted over the nodes; None for the system error
+    """
+
+    measured: float | None = None
+    predicted: float | None = None
+    standard_error: float | None = None
+    z: float | None = None
+    p: float | None = None
+    p_holm: float | None = None
+
+    @property
+    def interval(self) -> tuple[float | None, float | None]:
+        """95 % confidence interval around the measured error."""
+        if self.measured is None or self.standard_error is None:
+            return None, None
+        half = float(stats.norm.ppf(0.975)) * self.standard_error
+        return self.measured - half, self.measured + half
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of one estimate."""
+        return {**asdict(self), "interval": list(self.interval)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CovarianceTest:
+    """All second moments at once; arrays are (m, m), None where they were not estimated."""
+
+    measured: FloatArray | None = None
+    predicted: FloatArray | None = None
+    chi2: float | None = None
+    dof: int | None = None
+    p: float | None = None
+    note: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Test:
+    """One member of the family that the verdict is about; ``p_adjusted`` is Holm's, over the family."""
+
+    name: str
+    p: float
+    p_adjusted: float
+    rejected: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """What ``msg-analysis compare`` says.
+
+    Attributes
+    ----------
+    trajectory : what was compared
+    level : chance of a false "disagrees"
+    steps : steps used: all, or those before the first gap
+    system_error, node_errors, covariance, innovations, switching : one test or several each
+    continuous_error : the paper's continuous-time system error; None where it has none
+    batch : model-free interval for the system error
+    tests : the family, in the order of the report
+    running : "time" [simulated time], "system_error" and "standard_error" of the mean up to then (400 points)
+    """
+
+    trajectory: Trajectory
+    level: float
+    steps: int
+    system_error: Estimate
+    node_errors: list[Estimate]
+    covariance: CovarianceTest
+    innovations: InnovationTests
+    switching: SwitchingTest | None
+    continuous_error: float | None
+    batch: tuple[float, float] | None
+    tests: list[Test]
+    running: dict[str, FloatArray]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Incomplete data get no verdict; else one rejected test of the family is a disagreement."""
+        if not self.trajectory.completeness.complete:
+            return "incomplete"
+        return "disagrees" if any(test.rejected for test in self.tests) else "agrees"
+
+    @property
+    def exit_code(self) -> int:
+        """0 agrees, 1 disagrees, 3 incomplete."""
+        return EXIT_CODES[self.verdict]
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of ``msg-analysis compare --json``; every number is finite or None."""
+        record, covariance, switching = self.trajectory.record, self.covariance, self.switching
+        document = {
+            "verdict": self.verdict,
+            "run": str(record.run),
+            "experiment": record.experiment.name,
+            "seed": record.experiment.run.seed,
+            "level": self.level,
+            "completeness": asdict(self.trajectory.completeness),
+            "steps": self.steps,
+            "simulated_time": self.steps * record.experiment.step_length,
+            "system_error": self.system_error.to_json(),
+            "node_errors": [estimate.to_json() for estimate in self.node_errors],
+            "covariance": {
+                "measured": covariance.measured,
+                "predicted": covariance.predicted,
+                "chi2": covariance.chi2,
+                "dof": covariance.dof,
+                "p": covariance.p,
+                "note": covariance.note,
+            },
+            "innovations": asdict(self.innovations),
+            "switching": {
+                "counts": switching.counts if switching else None,
+                "expected": switching.expected if switching else None,
+                "p": switching.p if switching else None,
+            },
+            "continuous": {"system_error": self.continuous_error},
+            "batch_means": {"interval": self.batch or (None, None)},
+            "tests": [asdict(test) for test in self.tests],
+        }
+        return {key: _plain(value) for key, value in document.items()}
+
+
+def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
+    """Compare a run with what theory predicts for it.
+
+    Every test assumes exactly the law that the record says was run; the family of all of them is wrong with
+    probability at most ``level`` (Holm). A test with nothing to test (no noise, one graph) is left out of it.
+
+    Parameters
+    ----------
+    trajectory : from a bag or from the twin. If something is missing, the numbers are those of the complete
+        beginning
+    level : chance of calling a run that follows its law one that disagrees
+
+    Raises
+    ------
+    InputError : no prediction (too large, unbounded)
+    """
+    prediction = predict(trajectory.record.experiment)
+    continuous = prediction.continuous.system_error if prediction.continuous else None
+    if trajectory.prefix < MIN_STEPS and not trajectory.completeness.complete:
+        return _without_numbers(trajectory, level, prediction, continuous)
+    observation = Observation.of(trajectory, prediction)
+    means = time_means(observation)
+    system_error, node_errors = _estimates(means)
+    covariance = _covariance(means, prediction)
+    innovations = innovation_tests(observation)
+    switching = switching_test(observation.modes, prediction.step.transition)
+    family = [("system error", system_error.p)]
+    family += [(f"error of agent {i}", node.p) for i, node in enumerate(node_errors, start=1)]
+    family += [
+        ("covariance", covariance.p),
+        ("innovations: covariance", innovations.p_covariance),
+        ("innovations: whiteness", innovations.p_whiteness),
+        ("innovations: gains", innovations.p_gain),
+        ("switching", switching.p),
+    ]
+    return Comparison(
+        trajectory=trajectory,
+        level=level,
+        steps=observation.steps,
+        system_error=system_error,
+        node_errors=node_errors,
+        covariance=covariance,
+        innovations=innovations,
+        switching=switching,
+        continuous_error=continuous,
+        batch=batch_interval(means.system_series),
+        tests=_judge(family, level),
+        running=_running(means, prediction.step.dt),
+    )
+
+
+def _without_numbers(
+    trajectory: Trajectory, level: float, prediction: Prediction, continuous: float | None
+) -> Comparison:
+    """Too little came: only what was expected."""
+    predicted = prediction.emulated
+    return Comparison(
+        trajectory=trajectory,
+        level=level,
+        steps=max(trajectory.prefix, 0),
+        system_error=Estimate(predicted=predicted.system_error),
+        node_errors=[Estimate(predicted=float(error)) for error in predicted.node_errors],
+        covariance=CovarianceTest(predicted=predicted.covariance),
+        innovations=InnovationTests(None, None, None),
+        switching=None,
+        continuous_error=continuous,
+        batch=None,
+        tests=[],
+        running={key: np.empty(0) for key in ("time", "system_error", "standard_error")},
+    )
+
+
+def _estimates(means: TimeMeans) -> tuple[Estimate, list[Estimate]]:
+    combinations = np.vstack([means.nodes.sum(axis=0), means.nodes])
+    measured, predicted = combinations @ means.measured, combinations @ means.predicted
+    errors = np.sqrt(np.einsum("aq,qr,ar->a", combinations, means.covariance, combinations).clip(0.0))
+    estimates = [
+        _estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)
+    ]
+    tested = [i for i, estimate in enumerate(estimates) if i > 0 and estimate.p is not None]
+    adjusted = dict(zip(tested, holm(np.array([estimates[i].p for i in tested], dtype=float)), strict=True))
+    nodes = [
+        Estimate(
+            e.measured, e.predicted, e.standard_error, e.z, e.p, float(adjusted[i]) if i in adjusted else None
+        )
+        for i, e in enumerate(estimates)
+        if i > 0
+    ]
+    return estimates[0], nodes
+
+
+def _estimate(measured: float, predicted: float, error: float, scale: float) -> Estimate:
+    if error <= 1e-12 * scale or error == 0.0:  # without noise: nothing but rounding
+        return Estimate(float(measured), float(predicted), float(error))
+    z = float((measured - predicted) / error)
+    return Estimate(float(measured), float(predicted), float(error), z, float(2 * stats.norm.sf(abs(z))))
+
+
+def _covariance(means: TimeMeans, prediction: Prediction) -> CovarianceTest:
+    system = prediction.system
+    if not means.joint:
+        return CovarianceTest(
+            predicted=prediction.emulated.covariance,
+            note="too many agents for a joint test; the node errors are tested one by one",
+        )
+
+    def lifted(packed: FloatArray) -> FloatArray:
+        return system.lifted(symmetric.unpack(packed, system.dimension))
+
+    chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
+    p = float(stats.chi2.sf(chi2, dof)) if dof else None
+    return CovarianceTest(lifted(means.measured), lifted(means.predicted), chi2, dof, p)
+
+
+def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
+    tested = [(name, p) for name, p in family if p is not None]
+    adjusted = holm(np.array([p for _, p in tested], dtype=float))
+    return [Test(name, p, float(a), bool(a < level)) for (name, p), a in zip(tested, adjusted, strict=True)]
+
+
+def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:
+    """Mean of the system error up to some steps, denser at the beginning, and its standard error."""
+    steps = len(means.system_series)
+    spaced = np.concatenate(
+        [np.geomspace(1, steps, RUNNING_POINTS // 2), np.linspace(1, steps, RUNNING_POINTS // 2)]
+    )
+    counts = np.unique(np.rint(spaced).astype(int))
+    return {
+        "time": counts * dt,
+        "system_error": np.cumsum(means.system_series)[counts - 1] / counts,
+        "standard_error": np.sqrt(np.cumsum(means.system_variances)[counts - 1]) / counts,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """JSON-able: arrays become lists, numbers that are not finite become None."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,286 @@
+"""What a step adds that its mean does not explain: e(k) = x(k+1) - W_g(k) x(k) - offset_g(k).
+
+Under the model the e(k) are independent N(0, N_g(k)), whatever the graphs do; so these tests are exact or
+nearly so, and find what the time means hardly see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from msg_analysis.inference.observation import Observation
+from msg_analysis.model.step import StepModel
+from msg_analysis.types import FloatArray, IntArray
+
+LAGS = 10
+MAX_REGRESSORS = 400
+SILENT = 1e-9
+"""Relative size of what counts as rounding in a direction without noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class InnovationTests:
+    """p-values; None where there is nothing to test.
+
+    Attributes
+    ----------
+    p_covariance : covariance of the innovations against N_g; 0 if anything moves where there is no noise
+    p_whiteness : correlation in time (lags 1..10) and between replicas
+    p_gain : regression on what the agents heard: wrong gains, references, offsets
+    """
+
+    p_covariance: float | None
+    p_whiteness: float | None
+    p_gain: float | None
+
+
+@dataclass(slots=True, eq=False)
+class _Sums:
+    """Sums over the steps and replicas of each graph; z is the deviation of the agents, then a constant 1.
+
+    Attributes
+    ----------
+    samples : (n,)
+    noise : (n, m, m) sum of e e^T
+    score : (n, m, m + 1) sum of e z^T
+    inputs : (n, m + 1, m + 1) sum of z z^T
+    silent : largest |e| in directions without noise, over the largest |x|
+    """
+
+    samples: IntArray
+    noise: FloatArray
+    score: FloatArray
+    inputs: FloatArray
+    silent: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Directions:
+    """Directions of the noise of one graph: N_g = (basis * variances) basis^T, largest variance first.
+
+    Attributes
+    ----------
+    whitener : (r, m)
+    quiet : (m, m - r) orthonormal basis of the directions without noise
+    """
+
+    whitener: FloatArray
+    quiet: FloatArray
+
+
+def innovation_tests(observation: Observation) -> InnovationTests:
+    """Test the innovations of a run; all None with lost messages, which make them depend on the state."""
+    step = observation.step
+    if step.loss:
+        return InnovationTests(None, None, None)
+    directions = [_directions(noise) for noise in step.noise]
+    sums, p_whiteness = _pass(observation, directions)
+    if sums.silent > SILENT:
+        p_covariance: float | None = 0.0
+    else:
+        p_covariance = _covariance_p(step, directions, sums)
+    return InnovationTests(p_covariance, p_whiteness, _gain_p(step, sums))
+
+
+def innovations(observation: Observation, first: int, last: int) -> FloatArray:
+    """(last - first, m, R): e of the steps first..last-1."""
+    step, now = observation.step, observation.states[first:last]
+    after = observation.states[first + 1 : last + 1].copy()
+    for mode in range(step.modes):
+        at = np.flatnonzero(observation.modes[first:last] == mode)
+        after[at] -= step.weights[mode] @ now[at] + step.offsets[mode][:, None]
+    return after
+
+
+def _directions(noise: FloatArray) -> _Directions:
+    values, vectors = np.linalg.eigh(noise)
+    values, vectors = values[::-1], vectors[:, ::-1]
+    rank = int((values > 1e-12 * max(values[0], 0.0)).sum()) if values[0] > 0.0 else 0
+    return _Directions((vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:])
+
+
+def _pass(observation: Observation, directions: list[_Directions]) -> tuple[_Sums, float | None]:
+    """One pass over the run: the sums of each graph, and the whiteness test."""
+    step, n, m = observation.step, observation.step.modes, observation.step.agents
+    consensus = observation.prediction.experiment.problem == "consensus"
+    sums = _Sums(
+        np.zeros(n, np.int64), np.zeros((n, m, m)), np.zeros((n, m, m + 1)), np.zeros((n, m + 1, m + 1)), 0.0
+    )
+    # Graphs may differ in the number of noisy directions; the strongest ones that all have are iid N(0, I) in
+    # any case.
+    whitened = _Whiteness(min(len(d.whitener) for d in directions))
+    largest = 0.0
+    for first, last in observation.blocks(observation.states[0].size):
+        e, x = innovations(observation, first, last), observation.states[first:last]
+        largest = max(largest, float(np.abs(x).max()))
+        z = np.ones((last - first, m + 1, observation.replicas))
+        z[:, :m] = x - (x.mean(axis=1, keepdims=True) if consensus else step.reference)
+        white = np.empty((last - first, whitened.rank, observation.replicas))
+        for mode, direction in enumerate(directions):
+            at = np.flatnonzero(observation.modes[first:last] == mode)
+            if not at.size:
+                continue
+            flat_e = e[at].transpose(1, 0, 2).reshape(m, -1)
+            flat_z = z[at].transpose(1, 0, 2).reshape(m + 1, -1)
+            sums.samples[mode] += flat_e.shape[1]
+            sums.noise[mode] += flat_e @ flat_e.T
+            sums.score[mode] += flat_e @ flat_z.T
+            sums.inputs[mode] += flat_z @ flat_z.T
+            sums.silent = max(sums.silent, float(np.abs(direction.quiet.T @ flat_e).max(initial=0.0)))
+            white[at] = direction.whitener[: whitened.rank] @ e[at]
+        whitened.add(white)
+    sums.silent /= largest or 1.0
+    return sums, whitened.p_value()
+
+
+class _Whiteness:
+    """Portmanteau test of iid N(0, I) vectors: lags 1..LAGS, and lag 0 between replicas."""
+
+    def __init__(self, rank: int) -> None:
+        self.rank = rank
+        self._tail: FloatArray | None = None
+        self._products = np.zeros((LAGS, rank, rank))
+        self._counts = np.zeros(LAGS)
+        self._squares = np.zeros(rank)
+        self._pairs = np.zeros(rank)
+        self._steps, self._replicas = 0, 1
+
+    def add(self, white: FloatArray) -> None:
+        """Take the next (b, rank, R) block."""
+        self._steps += len(white)
+        self._replicas = white.shape[2]
+        squares = (white**2).sum(axis=2)
+        self._squares += squares.sum(axis=0)
+        self._pairs += ((white.sum(axis=2) ** 2 - squares) / 2).sum(axis=0)
+        joined = white if self._tail is None else np.concatenate([self._tail, white])
+        old = len(joined) - len(white)
+        for lag in range(1, LAGS + 1):
+            begin = max(old, lag)
+            if begin >= len(joined):
+                continue
+            late, early = joined[begin:], joined[begin - lag : len(joined) - lag]
+            self._products[lag - 1] += np.tensordot(late, early, axes=([0, 2], [0, 2]))
+            self._counts[lag - 1] += len(late) * self._replicas
+        self._tail = joined[-LAGS:]
+
+    def p_value(self) -> float | None:
+        """None without noise. Each coordinate is divided by its own size: that is another test's matter."""
+        size = self._squares / (self._steps * self._replicas)
+        if not self.rank or self._steps <= LAGS or not (size > 0.0).all():
+            return None
+        correlations = self._products**2 / np.outer(size, size)
+        chi2 = float((correlations.sum(axis=(1, 2)) / self._counts).sum())
+        dof = LAGS * self.rank**2
+        if self._replicas > 1:
+            pairs = self._steps * self._replicas * (self._replicas - 1) / 2
+            chi2 += float((self._pairs**2 / size**2).sum() / pairs)
+            dof += self.rank
+        return float(stats.chi2.sf(chi2, dof))
+
+
+def _covariance_p(step: StepModel, directions: list[_Directions], sums: _Sums) -> float | None:
+    """Likelihood-ratio test of the whitened covariance against I, with Bartlett's correction.
+
+    Anderson, An Introduction to Multivariate Statistical Analysis, section 10.8. Over all steps when the
+    noise is the same in every graph, else per graph and added up. With too few samples for a determinant: the
+    exact chi-square of the total size.
+    """
+    groups = (
+        [list(range(step.modes))] if (step.noise == step.noise[0]).all() else [[g] for g in range(step.modes)]
+    )
+    statistic, dof = 0.0, 0.0
+    for group in groups:
+        whitener = directions[group[0]].whitener
+        rank, samples = len(whitener), int(sums.samples[group].sum())
+        if not rank or not samples:
+            continue
+        scatter = whitener @ sums.noise[group].sum(axis=0) @ whitener.T
+        if samples < 10 * rank:
+            # A chi-square of its own many degrees of freedom, brought to one so that the sum stays one.
+            p = stats.chi2.sf(np.trace(scatter), samples * rank)
+            statistic, dof = statistic + stats.chi2.isf(min(2 * min(p, 1 - p), 1.0), 1), dof + 1
+            continue
+        covariance = scatter / samples
+        sign, logdet = np.linalg.slogdet(covariance)
+        if sign <= 0:
+            return 0.0
+        correction = 1 - (2 * rank**2 + 3 * rank - 1) / (6 * samples * (rank + 1))
+        statistic += correction * samples * (np.trace(covariance) - logdet - rank)
+        dof += rank * (rank + 1) / 2
+    return float(stats.chi2.sf(statistic, dof)) if dof else None
+
+
+def _gain_p(step: StepModel, sums: _Sums) -> float | None:
+    """Score test: the innovations of row i do not depend on what row i of W_g uses.
+
+    The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a
+    phi_b given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated
+    noise too.
+    """
+    rows, inputs = _regressors(step)
+    score = np.einsum("gac,gac->a", sums.score[:, rows], inputs)
+    covariance = np.zeros((len(rows), len(rows)))
+    for mode in range(step.modes):
+        products = inputs[mode] @ sums.inputs[mode] @ inputs[mode].T
+        covariance += step.noise[mode][np.ix_(rows, rows)] * products
+    chi2, dof = quadratic_form(score, covariance)
+    return float(stats.chi2.sf(chi2, dof)) if dof else None
+
+
+def _regressors(step: StepModel) -> tuple[IntArray, FloatArray]:
+    """What the innovations are regressed on: phi_a(k) = inputs[g, a] . z(k) for row rows[a].
+
+    rows : (K,), inputs : (n, K, m + 1).
+
+    One for every graph and difference x_j - x_i that row i uses, every graph and leader (x_i - reference),
+    and every agent (1, which finds a wrong reference or offset). When these are more than MAX_REGRESSORS: the
+    whole pull (W_g x - x)_i of a row instead of each of its terms; when that is still too many, without
+    telling graphs apart.
+    """
+    n, m = step.modes, step.agents
+    rows: list[int] = list(range(m))
+    parts: list[tuple[int | None, FloatArray]] = [(None, np.eye(m + 1)[m]) for _ in range(m)]
+    pulls = np.zeros((n, m, m + 1))
+    pulls[:, :, :m] = step.weights - np.eye(m)
+    terms = sum(int((step.weights[g] != 0.0).sum()) for g in range(n))
+    for mode in range(n):
+        for i in range(m):
+            if terms + m > MAX_REGRESSORS:
+                rows.append(i)
+                parts.append((mode, pulls[mode, i]))
+                continue
+            own = np.eye(m + 1)[i]
+            for j in step.inputs(mode, i):
+                if j != i:
+                    rows.append(i)
+                    parts.append((mode, np.eye(m + 1)[j] - own))
+            if abs(1.0 - step.weights[mode, i].sum()) > 1e-12:
+                rows.append(i)
+                parts.append((mode, own))
+    if len(rows) > MAX_REGRESSORS:
+        constants = np.broadcast_to(np.eye(m + 1)[m], (n, m, m + 1))
+        return np.tile(np.arange(m), 2), np.concatenate([constants, pulls], axis=1)
+    inputs = np.zeros((n, len(rows), m + 1))
+    for a, (mode_of, part) in enumerate(parts):
+        inputs[slice(None) if mode_of is None else mode_of, a] = part
+    return np.array(rows), inputs
+
+
+def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, int]:
+    """(v^T C^+ v, rank C), with the rank judged on the correlations, whatever the units of the entries.
+
+    Parameters
+    ----------
+    vector : (q,)
+    covariance : (q, q)
+    """
+    variances = np.diag(covariance)
+    alive = np.flatnonzero(variances > 1e-24 * variances.max(initial=0.0))
+    deviation = np.sqrt(variances[alive])
+    values, vectors = np.linalg.eigh(covariance[np.ix_(alive, alive)] / np.outer(deviation, deviation))
+    keep = values > 1e-10
+    scores = vectors[:, keep].T @ (vector[alive] / deviation)
+    return float((scores**2 / values[keep]).sum()), int(keep.sum())

@@ -1,0 +1,181 @@
+"""Time means of second moments, with standard errors that hold under the model being tested.
+
+For a quadratic form h(y) = y^T H y the Poisson equation gives f(y, g) = y^T Y_g y + kappa_g with
+f - E[f(next) | now] = h - (steady mean of h). So the
+
+    D_k = f(y_k+1, g_k+1) - E[f(y_k+1, g_k+1) | y_k, g_k]
+
+are martingale differences whose sum is N times the error of the time mean, up to a boundary term, whatever
+the correlation in time. The covariance of the sum is estimated by the predictable quadratic variation, the
+sum of Cov(D_k | y_k, g_k), and not by sum D_k D_k^T: jumps of the graph that did not happen count as much as
+those that did, so that the standard errors do not break down in runs with a few jumps. With every step's
+second moments s_k packed, and a_k = (s_k, 1), it is exact and comes from sum a_k a_k^T of each graph alone.
+Replicas share the path of the graphs: they are averaged inside h, and share the part of Cov(D_k) that is due
+to the jump.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.inference.observation import Observation
+from msg_analysis.theory import symmetric
+from msg_analysis.theory.moments import mode_potential, step_operators, transient_mean
+from msg_analysis.theory.prediction import Prediction
+from msg_analysis.types import FloatArray
+
+MAX_JOINT = 210
+"""Most second moments that are all estimated (20 agents); beyond that, only the node errors."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeMeans:
+    """Time means over the steps 0..N-1 of linear functions of y y^T.
+
+    Attributes
+    ----------
+    joint : whether these are all entries of y y^T, packed (q = p); else the node errors (q = m)
+    measured : (q,) time means, replicas averaged
+    predicted : (q,) their exact expectation under the run's start and length
+    covariance : (q, q) of measured under the model
+    nodes : (m, q) the node errors as combinations of them
+    system_series : (N,) system error of every step, replicas averaged
+    system_variances : (N,) Var(D_k | y_k, g_k) of the system error
+    """
+
+    joint: bool
+    measured: FloatArray
+    predicted: FloatArray
+    covariance: FloatArray
+    nodes: FloatArray
+    system_series: FloatArray
+    system_variances: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Value:
+    """What the next step may do to the values f of q forms, given one graph g and a = (s, 1).
+
+    Attributes
+    ----------
+    probability : (n,) P_gj
+    surprises : (n, q, p + 1): E[f(next) | next graph j] - E[f(next)] = surprises[j] @ a
+    forms : (n, q, p) Y_j, packed
+    weights : (d, d) W_g
+    noise : (d, d) N_g
+    """
+
+    probability: FloatArray
+    surprises: FloatArray
+    forms: FloatArray
+    weights: FloatArray
+    noise: FloatArray
+
+    def covariance(self, gram: FloatArray, replicas: int) -> FloatArray:
+        """(q, q): sum over steps of Cov(D_k | now), from gram = sum of a a^T (p + 1, p + 1).
+
+        Given the next graph j, the next state is N(W y, N): Cov(f_a, f_b) = 2 tr(A N B N) + 4 y^T W^T A N B W
+        y.
+        """
+        moved = self.weights @ symmetric.unpack(gram[-1, :-1], len(self.weights)) @ self.weights.T
+        spread = 2.0 * gram[-1, -1] * symmetric.congruence(self.noise)
+        spread += 4.0 * symmetric.product(self.noise, moved)
+        total = np.zeros((self.forms.shape[1],) * 2)
+        for probability, surprise, form in zip(self.probability, self.surprises, self.forms, strict=True):
+            total += probability * (surprise @ gram @ surprise.T + form @ spread @ form.T / replicas)
+        return total
+
+    def variances(self, combination: FloatArray, a: FloatArray, replicas: int) -> FloatArray:
+        """(b,): Var(D_k | now) of one combination (q,) of the forms in every step, a being (b, p + 1)."""
+        total = np.zeros(len(a))
+        linear = np.zeros(a.shape[1])
+        for probability, surprise, form in zip(self.probability, self.surprises, self.forms, strict=True):
+            total += probability * (a @ (combination @ surprise)) ** 2
+            matrix = symmetric.unpack(combination @ form, len(self.weights))
+            seen = matrix @ self.noise @ matrix
+            linear[:-1] += 4.0 * probability * symmetric.pack(self.weights.T @ seen @ self.weights)
+            linear[-1] += 2.0 * probability * np.trace(seen @ self.noise)
+        return np.asarray(total + a @ linear / replicas)
+
+
+def expected_mean(observation: Observation) -> FloatArray:
+    """(d, d) exact mean of E[y(k) y(k)^T] over the run's steps: steady, or transient from the known start.
+
+    A run that was not started from the stationary law is taken as it started, at the x(0) of its record and
+    the graph that it logged first: what one draw of g(0) does to a transient is no error.
+    """
+    prediction = observation.prediction
+    step, system, steady = prediction.step, prediction.system, prediction.steady
+    if prediction.experiment.run.start == "stationary":
+        law = step.initial
+        initial = (law / step.stationary)[:, None, None] * steady
+    else:
+        law = np.eye(step.modes)[observation.modes[0]]
+        y = system.reduced((observation.start - step.reference).T)
+        initial = law[:, None, None] * (y.T @ y / len(y))
+    return transient_mean(system, steady, initial, law, observation.steps)
+
+
+def time_means(observation: Observation) -> TimeMeans:
+    """Measure a run's second moments and their standard errors.
+
+    Time and memory per step are those of p = d (d + 1) / 2 second moments.
+    """
+    system, steps = observation.prediction.system, observation.steps
+    p = symmetric.size(system.dimension)
+    per_node = symmetric.pack(system.lift[:, :, None] * system.lift[:, None, :])
+    joint = p <= MAX_JOINT
+    forms = np.eye(p) if joint else per_node
+    nodes = per_node if joint else np.eye(len(per_node))
+    trace = nodes.sum(axis=0)  # the system error is the sum of the node errors
+
+    values = _values(observation.prediction, forms)
+    grams = np.zeros((system.modes, p + 1, p + 1))
+    series, variances = np.empty(steps), np.empty(steps)
+    for first, last in observation.blocks(max(p, observation.states[0].size)):
+        a = np.ones((last - first, p + 1))
+        a[:, :p] = _moments(observation, first, last)
+        series[first:last] = a[:, :p] @ (trace @ forms)
+        for mode, value in enumerate(values):
+            at = np.flatnonzero(observation.modes[first:last] == mode)
+            grams[mode] += a[at].T @ a[at]
+            variances[first + at] = value.variances(trace, a[at], observation.replicas)
+    covariance = sum(v.covariance(gram, observation.replicas) for v, gram in zip(values, grams, strict=True))
+    return TimeMeans(
+        joint=joint,
+        measured=forms @ grams.sum(axis=0)[-1, :p] / steps,
+        predicted=forms @ symmetric.pack(expected_mean(observation)),
+        covariance=np.asarray(covariance) / steps**2,
+        nodes=nodes,
+        system_series=series,
+        system_variances=variances,
+    )
+
+
+def _values(prediction: Prediction, forms: FloatArray) -> list[_Value]:
+    """One for each graph. The spread that lost messages add to the noise enters with its steady mean."""
+    system = prediction.system
+    dual = prediction.solver.dual(symmetric.unpack(forms, system.dimension))
+    _, kappa = mode_potential(system, dual)
+    packed = np.moveaxis(symmetric.pack(dual), 1, 0)
+    usual = prediction.steady / system.stationary[:, None, None]
+    moved = system.matrices @ usual @ system.matrices.transpose(0, 2, 1)
+    noise = system.noise + (system.propagate(usual) - moved)
+    values = []
+    for mode, operator in enumerate(step_operators(system)):
+        constant = packed @ symmetric.pack(system.noise[mode]) + kappa.T
+        ahead = np.concatenate([packed @ operator, constant[:, :, None]], axis=2)
+        law = system.chain[mode]
+        surprises = ahead - np.tensordot(law, ahead, axes=1)
+        values.append(_Value(law, surprises, packed, system.matrices[mode], noise[mode]))
+    return values
+
+
+def _moments(observation: Observation, first: int, last: int) -> FloatArray:
+    """(last - first, p): packed y y^T of the states first..last-1, averaged over the replicas."""
+    system = observation.prediction.system
+    states = observation.states[first:last] - observation.step.reference
+    y = np.einsum("kmr,md->krd", states, system.lift, optimize=True)
+    return symmetric.pack(y.transpose(0, 2, 1) @ y / observation.replicas)

@@ -1,0 +1,115 @@
+"""The logged transitions of the graph against P: a wrong switching rate shows nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from msg_analysis.types import FloatArray, IntArray
+
+PATHS = 9999
+MAX_JUMPS = 100_000_000
+"""Jumps simulated at most; longer runs make do with fewer paths."""
+MIN_EXPECTED = 5.0
+SEED = 20_240_229
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SwitchingTest:
+    """Counts of the N - 1 transitions.
+
+    Attributes
+    ----------
+    counts : (n, n) observed
+    expected : (n, n) visits of the row times P
+    p : None where the chain leaves nothing to test; 0 if a transition happened that P forbids
+    """
+
+    counts: IntArray
+    expected: FloatArray
+    p: float | None
+
+
+def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
+    """Test a path of the graph against its chain.
+
+    Pearson's chi-square when every possible transition is expected at least 5 times; else the likelihood-
+    ratio statistic against its law over simulated paths of the same length from the same first graph (fixed
+    seed), with a gamma fit for p-values that the number of paths cannot resolve.
+
+    Parameters
+    ----------
+    modes : (N,) from 0
+    transition : (n, n) P
+    """
+    n = len(transition)
+    counts = np.zeros((n, n), dtype=np.int64)
+    np.add.at(counts, (modes[:-1], modes[1:]), 1)
+    visits = counts.sum(axis=1)
+    expected = visits[:, None] * transition
+    possible = (transition > 0.0) & (visits[:, None] > 0)
+    dof = int(possible.sum() - (visits > 0).sum())
+    if counts[transition == 0.0].any():
+        return SwitchingTest(counts, expected, 0.0)
+    if dof == 0:
+        return SwitchingTest(counts, expected, None)
+    if expected[possible].min() >= MIN_EXPECTED:
+        chi2 = float(((counts - expected)[possible] ** 2 / expected[possible]).sum())
+        return SwitchingTest(counts, expected, float(stats.chi2.sf(chi2, dof)))
+    return SwitchingTest(counts, expected, _simulated_p(counts, transition, int(modes[0])))
+
+
+def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
+    """(...): G = 2 sum c log(c / e) of (..., n, n) counts."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = counts * np.log(counts / (counts.sum(axis=-1, keepdims=True) * transition))
+    return np.asarray(2.0 * np.where(counts > 0, terms, 0.0).sum(axis=(-2, -1)))
+
+
+def simulate_counts(
+    transition: FloatArray, first: int, transitions: int, paths: int, random: np.random.Generator
+) -> IntArray:
+    """(paths, n, n): transition counts of independent paths, drawn sojourn by sojourn.
+
+    Parameters
+    ----------
+    transition : (n, n) P
+    first : first graph
+    transitions : of every path
+    """
+    n = len(transition)
+    leaving = 1.0 - np.diag(transition)
+    jumps = transition - np.diag(np.diag(transition))
+    total = jumps.sum(axis=1, keepdims=True)
+    cumulative = np.cumsum(np.divide(jumps, total, out=np.zeros_like(jumps), where=total > 0.0), axis=1)
+    counts = np.zeros((paths, n, n), dtype=np.int64)
+    mode, left, path = np.full(paths, first), np.full(paths, transitions), np.arange(paths)
+    while path.size:
+        stay = leaving[mode] <= 0.0
+        held = np.where(stay, left, random.geometric(np.where(stay, 1.0, leaving[mode])) - 1)
+        ends = held >= left
+        counts[path, mode, mode] += np.where(ends, left, held)
+        mode, left, path, held = (a[~ends] for a in (mode, left, path, held))
+        # Guard against a cumulative law that ends just below 1.
+        after = np.minimum((random.random(path.size)[:, None] >= cumulative[mode]).sum(axis=1), n - 1)
+        counts[path, mode, after] += 1
+        mode, left = after, left - held - 1
+        mode, left, path = (a[left > 0] for a in (mode, left, path))
+    return counts
+
+
+def _simulated_p(counts: IntArray, transition: FloatArray, first: int) -> float:
+    transitions = int(counts.sum())
+    jumps = max(1.0, float(counts.sum(axis=1) @ (1.0 - np.diag(transition))))
+    paths = int(np.clip(MAX_JUMPS / jumps, 199, PATHS))
+    random = np.random.default_rng(SEED)
+    drawn = likelihood_ratio(simulate_counts(transition, first, transitions, paths, random), transition)
+    observed = float(likelihood_ratio(counts, transition))
+    # Ties (few jumps leave few possible values) count as at least as extreme.
+    above = int((drawn >= observed * (1 - 1e-12)).sum())
+    if above >= 10 or drawn.std() == 0.0:
+        return (above + 1) / (paths + 1)
+    shape = (drawn.mean() / drawn.std()) ** 2
+    return float(min((above + 1) / (paths + 1), stats.gamma.sf(observed, shape, scale=drawn.mean() / shape)))

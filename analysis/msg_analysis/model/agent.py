@@ -1,0 +1,60 @@
+"""One agent: one row of the Markov jump linear system, and its share of the random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from msg_analysis.model.law import step
+from msg_analysis.model.noise import ProcessNoise
+from msg_analysis.model.record import RunRecord
+from msg_analysis.model.step import StepModel
+from msg_analysis.model.streams import STEPS_PER_BLOCK
+from msg_analysis.types import FloatArray
+
+
+class AgentLaw:
+    """The state of one agent and how it moves on.
+
+    Parameters
+    ----------
+    record : of the run
+    model : its step model
+    agent : index of the agent from 0
+    """
+
+    def __init__(self, record: RunRecord, model: StepModel, agent: int) -> None:
+        self.agent = agent
+        self.step = 0
+        self.state: FloatArray = record.start[agent].copy()
+        self._noise = ProcessNoise(
+            record.experiment.run.seed, model.noise_gain, record.experiment.run.replicas
+        )
+        self._block = self._noise.block(agent, 0)
+        modes = range(model.modes)
+        self._inputs = [[int(j) for j in model.inputs(mode, agent)] for mode in modes]
+        self._weights = [[float(w) for w in model.weights[mode, agent, self._inputs[mode]]] for mode in modes]
+        self._offsets = [float(offset) for offset in model.offsets[:, agent]]
+
+    def neighbours(self, mode: int) -> list[int]:
+        """The other agents, ascending, whose states this agent uses under a mode (index from 0)."""
+        return [j for j in self._inputs[mode] if j != self.agent]
+
+    def advance(self, mode: int, heard: Mapping[int, FloatArray]) -> FloatArray:
+        """Move from x(k) to x(k+1).
+
+        Parameters
+        ----------
+        mode : index of g(k) from 0
+        heard : x_j(k), (replicas,), of each of the mode's neighbours
+
+        Returns
+        -------
+        (replicas,) x(k+1)
+        """
+        within = self.step % STEPS_PER_BLOCK
+        if within == 0 and self.step:
+            self._block = self._noise.block(self.agent, self.step // STEPS_PER_BLOCK)
+        values = [self.state if j == self.agent else heard[j] for j in self._inputs[mode]]
+        self.state = step(self._weights[mode], values, self._offsets[mode], self._block[within])
+        self.step += 1
+        return self.state

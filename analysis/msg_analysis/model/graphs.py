@@ -1,0 +1,53 @@
+"""Weighted directed graphs of agents and their Laplacians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Graph:
+    """One mode of the switching network.
+
+    Attributes
+    ----------
+    name : name of the graph in the experiment file
+    adjacency : (m, m), zero diagonal; ``adjacency[i, j]`` [1 / unit of time] is the weight with which agent i+1
+        listens to agent j+1. Symmetric for an undirected graph.
+    """
+
+    name: str
+    adjacency: FloatArray
+
+    @property
+    def agents(self) -> int:
+        """Number of agents m."""
+        return int(self.adjacency.shape[0])
+
+    @property
+    def laplacian(self) -> FloatArray:
+        """(m, m) in-degree Laplacian L = D - A; every row sums to zero (section II of the paper)."""
+        return np.diag(self.adjacency.sum(axis=1)) - self.adjacency
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the graph is undirected."""
+        return bool(np.array_equal(self.adjacency, self.adjacency.T))
+
+    @property
+    def arcs(self) -> list[tuple[int, int, float]]:
+        """(source, target, weight) of every arc, agents from 1: target listens to source. Sorted by target, source."""
+        targets, sources = np.nonzero(self.adjacency)
+        return [
+            (int(source) + 1, int(target) + 1, float(self.adjacency[target, source]))
+            for target, source in zip(targets, sources, strict=True)
+        ]
+
+    @property
+    def edges(self) -> list[tuple[int, int, float]]:
+        """(i, j, weight) with i < j of every pair that listens to each other with equal weight, agents from 1."""
+        return [(s, t, w) for s, t, w in self.arcs if s < t and self.adjacency[s - 1, t - 1] == w]

@@ -1,0 +1,47 @@
+"""The update law, once: agents, twin and checks all call these functions.
+
+Bit-for-bit equality between a network of processes and the vectorised twin rests on two rules kept here: sums run over
+the agents in ascending order, one term at a time (never through BLAS or a reduction, whose order depends on shapes and
+threads), and each term is one multiplication and one addition of doubles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from msg_analysis.types import FloatArray
+
+
+def weighted_sum(weights: Sequence[float | FloatArray], values: Sequence[FloatArray]) -> FloatArray:
+    """sum_j weights[j] * values[j], term after term, in the order given.
+
+    Parameters
+    ----------
+    weights : numbers, or arrays that broadcast against the values
+    values : arrays of one shape, at least one
+    """
+    total = weights[0] * values[0]
+    for weight, value in zip(weights[1:], values[1:], strict=True):
+        total += weight * value
+    return total
+
+
+def step(
+    weights: Sequence[float | FloatArray],
+    values: Sequence[FloatArray],
+    offset: float | FloatArray,
+    noise: FloatArray,
+) -> FloatArray:
+    """x_i(k+1) = sum_j W_ij x_j(k) + offset_i + noise_i(k).
+
+    Parameters
+    ----------
+    weights : the non-zero W_ij of row i, j ascending (for many rows at once: columns, padded with zeros)
+    values : the matching x_j(k), each one entry per replica
+    offset : what a reference adds to the row
+    noise : like one of the values
+    """
+    total = weighted_sum(weights, values)
+    total += offset
+    total += noise
+    return total

@@ -1,0 +1,276 @@
+"""The experiment file as data: every key, its type, its default and what it means.
+
+Only what one value can tell by itself is checked here; what needs several keys is checked in ``validation``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, PlainValidator
+from pydantic_core import PydanticCustomError
+
+LARGEST_NUMBER = 1e100  # so that no sum or product of two numbers overflows
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+LARGEST_COUNT = 2**32 - 1  # messages carry agents as uint32
+Count = Annotated[int, Field(strict=True, ge=1, le=LARGEST_COUNT)]
+Label = Count
+GraphName = Annotated[str, Field(pattern=r"^\S(.{0,62}\S)?$")]
+Link = tuple[int, int, float]
+Matrix = list[list[Number]]
+Purpose = Literal["predict", "run"]
+
+
+def expected(text: str) -> PydanticCustomError:
+    """The error of a value that is not what ``text`` says."""
+    return PydanticCustomError("expected", "{text}", {"text": text})
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is a real number (no boolean) of a reasonable size."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= LARGEST_COUNT
+
+
+def _link(value: object) -> Link:
+    wanted = expected("[agent, agent] or [agent, agent, weight], agents from 1, the weight a number > 0")
+    if not isinstance(value, list | tuple) or len(value) not in (2, 3):
+        raise wanted
+    first, second = value[:2]
+    for label in (first, second):
+        if not _is_count(label):
+            raise wanted
+    weight = value[2] if len(value) == 3 else 1.0
+    if not is_number(weight) or weight <= 0:
+        raise expected("a weight > 0 as the third entry")
+    return (first, second, float(weight))
+
+
+def _process(value: object) -> float | list[float] | list[list[float]]:
+    if is_number(value):
+        if value < 0:  # type: ignore[operator]
+            raise expected("a standard deviation >= 0")
+        return float(value)  # type: ignore[arg-type]
+    if isinstance(value, list) and value and all(is_number(entry) for entry in value):
+        if min(value) < 0:
+            raise expected("standard deviations >= 0")
+        return [float(entry) for entry in value]
+    rows = value if isinstance(value, list) else []
+    if rows and all(isinstance(row, list) and all(is_number(entry) for entry in row) for row in rows):
+        return [[float(entry) for entry in row] for row in rows]
+    raise expected("a finite number, one per agent, or a square matrix F (Q = F F^T)")
+
+
+def _start(value: object) -> str | list[float]:
+    if isinstance(value, str) and value in ("stationary", "zero"):
+        return value
+    if isinstance(value, list) and all(is_number(entry) for entry in value):
+        return [float(entry) for entry in value]
+    raise expected("'stationary', 'zero' or a list of one finite number per agent")
+
+
+def _processes(value: object) -> str | int:
+    if isinstance(value, str) and value in ("auto", "one_per_agent"):
+        return value
+    if isinstance(value, int) and _is_count(value):
+        return value
+    raise expected("'auto', 'one_per_agent' or a whole number >= 1")
+
+
+def _gain(value: object) -> float:
+    if value in ("inf", ".inf") or (isinstance(value, float) and value == math.inf):
+        return math.inf
+    if is_number(value) and value > 0:  # type: ignore[operator]
+        return float(value)  # type: ignore[arg-type]
+    raise expected("a number > 0, or inf for leaders held at the reference")
+
+
+def _grid(value: object) -> object:
+    sizes = value if isinstance(value, list | tuple) else ()
+    if len(sizes) != 2 or not all(_is_count(size) for size in sizes):
+        raise expected("[rows, columns], two whole numbers >= 1")
+    return value
+
+
+Links = list[
+    Annotated[
+        Link,
+        BeforeValidator(_link, json_schema_input_type=tuple[Label, Label] | tuple[Label, Label, Positive]),
+    ]
+]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Star(_Section):
+    """A star: everybody is connected with the centre."""
+
+    center: Label = Field(description="the agent in the middle", examples=[1])
+
+
+class GraphSpec(_Section):
+    """One graph, given in one of these ways. Agents are numbered from 1."""
+
+    model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 1})
+
+    path: list[Label] | None = Field(
+        None, min_length=2, description="agents along a line", examples=[[1, 2, 3]]
+    )
+    cycle: list[Label] | None = Field(
+        None, min_length=3, description="agents around a ring", examples=[[1, 2, 3]]
+    )
+    edges: Links | None = Field(
+        None,
+        description="undirected: [i, j] or [i, j, weight], weight 1 by default",
+        examples=[[[1, 2], [2, 3, 0.5]]],
+    )
+    arcs: Links | None = Field(
+        None,
+        description="directed: [1, 2, 0.5] says that agent 2 listens to agent 1",
+        examples=[[[1, 2], [2, 3, 0.5]]],
+    )
+    star: Star | None = Field(None, description="a star with its centre", examples=[{"center": 1}])
+    complete: Literal[True] | None = Field(None, description="everybody with everybody", examples=[True])
+    grid: Annotated[tuple[Count, Count], BeforeValidator(_grid)] | None = Field(
+        None, description="[rows, columns], agents row by row", examples=[[3, 4]]
+    )
+    graphml: str | None = Field(
+        None,
+        min_length=1,
+        description="a GraphML file, relative to the experiment file; node ids that are whole numbers from 1 "
+        "are the agents' numbers, else nodes are numbered in the order of the file; edge attribute 'weight', "
+        "default 1",
+        examples=["network.graphml"],
+    )
+
+    @property
+    def kinds(self) -> list[str]:
+        """Ways in which this graph is given (one, in a valid file)."""
+        return [key for key in type(self).model_fields if getattr(self, key) is not None]
+
+
+class SwitchingSpec(_Section):
+    """The Markov chain that switches between the graphs. May be left out where there is one graph."""
+
+    generator: Matrix | None = Field(
+        None,
+        description="continuous time: rates between the graphs in file order; every row sums to 0",
+        examples=[[[-0.5, 0.5], [0.5, -0.5]]],
+    )
+    rates: dict[str, dict[str, NonNegative]] | None = Field(
+        None,
+        description="continuous time: rates by name, from: {to: rate}; left out = 0",
+        examples=[{"line": {"ring": 1.0}, "ring": {"line": 1.0}}],
+    )
+    scale: Positive = Field(1.0, description="multiplies the rates", examples=[0.5])
+    transition: Matrix | None = Field(
+        None,
+        description="discrete time: probabilities between the graphs in file order; every row sums to 1",
+        examples=[[[0.9, 0.1], [0.2, 0.8]]],
+    )
+    initial: str = Field("stationary", description="'stationary' or a graph's name", examples=["stationary"])
+
+
+class NoiseSpec(_Section):
+    """What is random besides the graphs."""
+
+    process: Annotated[
+        float | list[float] | list[list[float]],
+        PlainValidator(_process, json_schema_input_type=NonNegative | list[NonNegative] | Matrix),
+    ] = Field(
+        1.0, description="noise gain: a number, one per agent, or the matrix F with Q = F F^T", examples=[1.0]
+    )
+    broadcast: NonNegative = Field(
+        0.0, description="standard deviation added to each published value", examples=[0.0]
+    )
+    link: NonNegative = Field(0.0, description="standard deviation added by each receiver", examples=[0.0])
+    loss: Annotated[Number, Field(ge=0, lt=1)] = Field(
+        0.0, description="probability that a directed message is ignored in a step", examples=[0.0]
+    )
+
+
+class LeadersSpec(_Section):
+    """Who knows the reference (tracking only)."""
+
+    agents: list[Label] = Field(min_length=1, description="the leaders", examples=[[3]])
+    gain: Annotated[
+        float,
+        PlainValidator(_gain, json_schema_input_type=Positive | Literal["inf"]),
+        PlainSerializer(lambda gain: "inf" if math.isinf(gain) else gain, return_type=Any),
+    ] = Field(1.0, description="pull towards the reference; inf = held at it", examples=[1.0])
+    reference: Number = Field(0.0, description="the value to track", examples=[0.0])
+
+
+class RunSpec(_Section):
+    """How long, how often and how to run."""
+
+    dt: Positive = Field(
+        0.05,
+        description="simulated time of a step; 0.05 by default, always 1 in discrete time",
+        examples=[0.05],
+    )
+    duration: Positive = Field(
+        100.0, description="simulated time units, a whole number of steps", examples=[400.0]
+    )
+    replicas: Count = Field(
+        1, description="independent copies of every state under the same graphs", examples=[16]
+    )
+    seed: Annotated[int, Field(strict=True, ge=0)] = Field(
+        0, description="of everything random in the run", examples=[7]
+    )
+    start: Annotated[
+        str | list[float],
+        PlainValidator(_start, json_schema_input_type=Literal["stationary", "zero"] | list[Number]),
+    ] = Field(
+        "stationary", description="'stationary', 'zero' or one value per agent", examples=["stationary"]
+    )
+    pace: Literal["lockstep", "realtime"] = Field(
+        "lockstep",
+        description="lockstep: as fast as it goes, deterministic; realtime: every agent on its own timer",
+        examples=["lockstep"],
+    )
+    speed: Positive = Field(1.0, description="realtime: simulated time units per second", examples=[1.0])
+    processes: Annotated[
+        str | int,
+        PlainValidator(_processes, json_schema_input_type=Literal["auto", "one_per_agent"] | Count),
+    ] = Field("auto", description="'auto', 'one_per_agent' or a number of processes", examples=["auto"])
+
+
+class ExperimentSpec(_Section):
+    """A Markov switching network and a run of it."""
+
+    name: str = Field(
+        pattern="^[a-z][a-z0-9_]*$",
+        description="a name for bags and topics, [a-z][a-z0-9_]*",
+        examples=["line_ring"],
+    )
+    problem: Literal["consensus", "tracking"] = Field(
+        "consensus", description="agree with each other, or follow leaders", examples=["consensus"]
+    )
+    time: Literal["continuous", "discrete"] = Field(
+        "continuous",
+        description="continuous: Euler steps of run.dt; discrete: W = exp(-Z), one step = 1",
+        examples=["continuous"],
+    )
+    agents: Annotated[int, Field(strict=True, ge=2)] | None = Field(
+        None, description="number of agents; by default the largest number in any graph", examples=[5]
+    )
+    graphs: dict[GraphName, GraphSpec] = Field(
+        min_length=1,
+        description="named graphs; their order is the order of the modes",
+        examples=[{"line": {"path": [1, 2, 3]}}],
+    )
+    switching: SwitchingSpec = Field(
+        default_factory=SwitchingSpec, examples=[{"generator": [[-0.5, 0.5], [0.5, -0.5]]}]
+    )
+    noise: NoiseSpec = Field(default_factory=NoiseSpec, examples=[{"process": 1.0}])
+    leaders: LeadersSpec | None = Field(None, examples=[{"agents": [3], "gain": 1.0, "reference": 0.0}])
+    run: RunSpec = Field(default_factory=RunSpec, examples=[{"dt": 0.05, "duration": 400}])

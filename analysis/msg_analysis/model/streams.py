@@ -1,0 +1,44 @@
+"""Random streams that need no communication.
+
+Every number of a run is a function of (seed, stream, agent, block of steps): the key of a counter-based Philox
+generator comes from the seed, its counter from the rest. So any process can compute any agent's noise at any step, a
+restarted agent draws the same numbers again, and another agent more changes nobody else's stream.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from msg_analysis.types import FloatArray
+
+STEPS_PER_BLOCK = 256
+"""Steps whose noise is drawn at once. Part of the definition of a run: another value gives other numbers."""
+
+
+class Stream(IntEnum):
+    """What a random number is used for."""
+
+    SWITCHING = 1
+    START = 2
+    PROCESS = 3
+
+
+def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.random.Generator:
+    """The generator of one block of one agent's stream.
+
+    Parameters
+    ----------
+    seed : the experiment's seed, >= 0
+    stream : what the numbers are for
+    agent : index of the agent from 0 (0 where the stream belongs to nobody)
+    block : number of the block of steps, step // STEPS_PER_BLOCK
+    """
+    key = np.random.SeedSequence(seed).generate_state(2, np.uint64)
+    return np.random.Generator(np.random.Philox(key=key, counter=[0, block, agent, int(stream)]))
+
+
+def normals(seed: int, stream: Stream, agent: int, block: int, shape: tuple[int, ...]) -> FloatArray:
+    """Standard normal numbers of one block, of the given shape."""
+    return generator(seed, stream, agent, block).standard_normal(shape)

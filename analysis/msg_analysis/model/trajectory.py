@@ -1,0 +1,72 @@
+"""What a run did: the states of every agent and the graph of every step, from a bag or from the twin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from msg_analysis.model.record import RunRecord
+from msg_analysis.types import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Completeness:
+    """What came and what did not, counted in states x_i(k): m (N + 1) are expected of a run of N steps.
+
+    Attributes
+    ----------
+    expected, received, missing : states; received counts each (agent, step) once
+    duplicates : states that came again
+    out_of_order : states that came after a later one of the same agent
+    refused : messages that are no part of this run, by reason
+    missing_modes : steps whose graph is not known
+    """
+
+    expected: int
+    received: int
+    missing: int
+    duplicates: int = 0
+    out_of_order: int = 0
+    missing_modes: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is missing."""
+        return self.missing == 0 and self.missing_modes == 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """One run, ordered by step.
+
+    Attributes
+    ----------
+    record : what the run was started from
+    states : (N + 1, m, replicas); NaN where a state is missing
+    modes : (N,) index from 0 of the graph used in the step k -> k+1; -1 where not known
+    agent_modes : (N + 1, m) graph that each agent says it used in the step that led to this state (from 0; -1 at
+        step 0 and where missing), or None where nobody logged it
+    completeness : the account of what is there
+    """
+
+    record: RunRecord
+    states: FloatArray
+    modes: IntArray
+    completeness: Completeness
+    agent_modes: IntArray | None = None
+
+    @property
+    def present(self) -> BoolArray:
+        """(N + 1, m): which states are there."""
+        return np.asarray(~np.isnan(self.states).any(axis=2))
+
+    @property
+    def prefix(self) -> int:
+        """Steps in the longest complete beginning: x(0..prefix) and g(0..prefix-1) are all there (-1: not even x(0))."""
+        whole = self.present.all(axis=1)
+        states = int(np.argmin(whole)) if not whole.all() else len(whole)
+        known = self.modes >= 0
+        modes = int(np.argmin(known)) if not known.all() else len(known)
+        return min(states - 1, modes)

@@ -1,0 +1,111 @@
+"""The offline twin: a run without ROS, by the same law and the same random numbers."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+
+import numpy as np
+
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.law import step, weighted_sum
+from msg_analysis.model.noise import ProcessNoise
+from msg_analysis.model.path import mode_path
+from msg_analysis.model.record import RunRecord
+from msg_analysis.model.step import StepModel, build_step_model
+from msg_analysis.model.streams import STEPS_PER_BLOCK, Stream, normals
+from msg_analysis.model.trajectory import Completeness, Trajectory
+from msg_analysis.types import FloatArray, IntArray
+
+
+def draw_start(experiment: Experiment, model: StepModel, first_mode: int) -> FloatArray:
+    """(m, replicas) x(0): zero, the given values, or drawn from N(reference, C_g0 / pi_g0).
+
+    Parameters
+    ----------
+    first_mode : index of g(0); the stationary start depends on it
+    """
+    replicas = experiment.run.replicas
+    start = experiment.run.start
+    if start == "zero":
+        return np.zeros((experiment.agents, replicas))
+    if start != "stationary":
+        return np.repeat(np.array(start, dtype=float)[:, None], replicas, axis=1)
+    from msg_analysis.theory.prediction import stationary_start_factor
+
+    factor = stationary_start_factor(model, experiment.problem, first_mode)
+    sources = [
+        normals(experiment.run.seed, Stream.START, j, 0, (replicas,)) for j in range(experiment.agents)
+    ]
+    deviations = np.array([weighted_sum([float(w) for w in row], sources) for row in factor])
+    return deviations + model.reference
+
+
+def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecord:
+    """Everything that a new run of an experiment starts from.
+
+    Parameters
+    ----------
+    run : run id; a new random one if not given
+    """
+    model = build_step_model(experiment)
+    modes = mode_path(experiment, model.initial)
+    start = draw_start(experiment, model, int(modes[0]))
+    return RunRecord(run or uuid.uuid4(), experiment, start)
+
+
+def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Trajectory:
+    """Run an experiment without ROS.
+
+    Parameters
+    ----------
+    record : of the run to repeat; a new run with a new id if not given
+
+    Returns
+    -------
+    The same states, to the last bit, as those of a lockstep network run.
+    """
+    record = record or new_record(experiment)
+    experiment = record.experiment
+    experiment.require_available()
+    model = build_step_model(experiment)
+    modes = mode_path(experiment, model.initial)
+    states = np.empty((experiment.steps + 1, *record.start.shape))
+    states[0] = record.start
+    for k, state in enumerate(_states(experiment, model, modes, record.start), start=1):
+        states[k] = state
+    return Trajectory(
+        record, states, modes, Completeness(expected := states.shape[0] * states.shape[1], expected, 0)
+    )
+
+
+def _states(
+    experiment: Experiment, model: StepModel, modes: IntArray, start: FloatArray
+) -> Iterator[FloatArray]:
+    """x(1), x(2), ... of a path of graphs."""
+    noise = ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas)
+    rows = [_padded_rows(model, mode) for mode in range(model.modes)]
+    offsets = [offset[:, None] for offset in model.offsets]
+    state = start
+    for k, mode in enumerate(modes):
+        within = k % STEPS_PER_BLOCK
+        if within == 0:
+            block = np.stack([noise.block(i, k // STEPS_PER_BLOCK) for i in range(model.agents)], axis=1)
+        weights, inputs = rows[mode]
+        state = step(weights, [state[j] for j in inputs], offsets[mode], block[within])
+        yield state
+
+
+def _padded_rows(model: StepModel, mode: int) -> tuple[list[FloatArray], list[IntArray]]:
+    """All rows of W_mode at once: its d-th entries list holds every agent's d-th input, ascending, padded with zeros.
+
+    Adding 0 * x at the end of a row changes nothing, so every row comes out as the agent computes it alone.
+    """
+    inputs = [model.inputs(mode, i) for i in range(model.agents)]
+    width = max(len(row) for row in inputs)
+    weights = np.zeros((width, model.agents, 1))
+    columns = np.zeros((width, model.agents), dtype=np.int64)
+    for i, row in enumerate(inputs):
+        weights[: len(row), i, 0] = model.weights[mode, i, row]
+        columns[: len(row), i] = row
+    return list(weights), list(columns)

@@ -1,0 +1,275 @@
+"""Results as tables for a terminal. Every function takes the document that ``--json`` would print."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from msg_analysis.model.validation import amount
+
+_ROWS = 30
+_LAWS = {
+    "continuous": "continuous time",
+    "emulated": "steps of the run",
+    "discrete": "discrete time",
+    "static": "graphs held for ever",
+}
+_VERDICTS = {
+    "agrees": ("The run agrees with the prediction.", "bold green"),
+    "disagrees": ("The run disagrees with the prediction.", "bold red"),
+    "incomplete": ("No verdict: the data are incomplete.", "bold yellow"),
+}
+
+
+def print_prediction(document: dict[str, Any], console: Console) -> None:
+    """Steady errors of every law that the prediction has, and the share of time of every graph.
+
+    Parameters
+    ----------
+    document : of ``Prediction.to_json()``
+    console : where to print
+    """
+    laws = {title: document[key] for key, title in _LAWS.items() if document.get(key) is not None}
+    errors = _table(console, "Mean-square error in the steady state", "", *laws)
+    errors.add_row("system", *(_number(law["system_error"]) for law in laws.values()), end_section=True)
+    for agent in range(min(document["agents"], _ROWS)):
+        errors.add_row(f"agent {agent + 1}", *(_number(law["node_errors"][agent]) for law in laws.values()))
+    _note_cut(errors, document["agents"], "agents")
+    errors.add_section()
+    errors.add_row("certainty", *(_number(law["system_certainty"]) for law in laws.values()))
+    console.print(errors)
+    modes = _table(console, "Graphs", "graph", "share of time")
+    for name, share in zip(document["modes"], document["stationary"], strict=True):
+        modes.add_row(Text(name), _number(share))
+    console.print(modes)
+    for key, title in _LAWS.items():
+        if key in document and document[key] is None:
+            console.print(f"{title}: not finite, or not defined with this noise", style="dim")
+
+
+def print_comparison(document: dict[str, Any], console: Console) -> None:
+    """Verdict, errors measured and predicted, tests, and what came and what did not.
+
+    Parameters
+    ----------
+    document : of ``Comparison.to_json()``
+    console : where to print
+    """
+    verdict, style = _VERDICTS[document["verdict"]]
+    console.print(verdict, style=style)
+    count = document["completeness"]
+    console.print(
+        f"{count['received']} of {count['expected']} states in {document['steps']} steps "
+        f"({_number(document['simulated_time'])} units of time): {count['missing']} missing, "
+        f"{count['duplicates']} twice, {count['out_of_order']} out of order"
+    )
+    _print_errors(document, console)
+    _print_tests(document, console)
+    interval = document["batch_means"]["interval"]
+    console.print(f"95 % interval of batch means, free of the model: {_interval(interval)}", style="dim")
+    continuous = document["continuous"]["system_error"]
+    if continuous is not None:
+        console.print(f"System error in continuous time, for reference: {_number(continuous)}", style="dim")
+
+
+def _print_errors(document: dict[str, Any], console: Console) -> None:
+    columns = ("measured", "95 % interval", "predicted", "z")
+    table = _table(console, "Mean-square error over the run", "", *columns)
+
+    def row(label: str, entry: dict[str, Any] | None, end_section: bool = False) -> None:
+        entry = entry or {}
+        measured, predicted = _number(entry.get("measured")), _number(entry.get("predicted"))
+        table.add_row(
+            label,
+            measured,
+            _interval(entry.get("interval")),
+            predicted,
+            _z(entry.get("z")),
+            end_section=end_section,
+        )
+
+    row("system", document["system_error"], end_section=True)
+    nodes = document["node_errors"] or []
+    for agent, entry in enumerate(nodes[:_ROWS], start=1):
+        row(f"agent {agent}", entry)
+    _note_cut(table, len(nodes), "agents")
+    console.print(table)
+
+
+def _print_tests(document: dict[str, Any], console: Console) -> None:
+    tests = document.get("tests") or []
+    if not tests:
+        return
+    title = f"Tests, together at level {_number(document.get('level'))}"
+    table = _table(console, title, "test", "p", "p adjusted", "")
+    # With many agents the table is cut: what rejects comes first.
+    shown = [test for test in tests if test["rejected"]] + [test for test in tests if not test["rejected"]]
+    for test in shown[:_ROWS]:
+        table.add_row(Text(str(test["name"])), _p(test["p"]), _p(test["p_adjusted"]), _mark(test))
+    _note_cut(table, len(shown), "tests")
+    console.print(table)
+
+
+def print_experiment(document: dict[str, Any], console: Console) -> None:
+    """An experiment explained back.
+
+    Parameters
+    ----------
+    document : of ``msg_analysis.report.info.describe_experiment``
+    console : where to print
+    """
+    run = document["run"]
+    facts = _facts(console, document["name"])
+    facts.add_row(
+        "problem", f"{document['problem']} of {document['agents']} agents in {document['time']} time"
+    )
+    if document["leaders"]:
+        leaders = document["leaders"]
+        text = f"{_names(leaders['agents'])}, gain {leaders['gain']}, reference {leaders['reference']}"
+        facts.add_row("leaders", text)
+    facts.add_row("noise", ", ".join(f"{key} {_short(value)}" for key, value in document["noise"].items()))
+    facts.add_row(
+        "steps", f"{run['steps']} of {_number(run['dt'])}, {_number(run['duration'])} units of time"
+    )
+    facts.add_row("stability limit of a step", _number(document["stability_limit"]))
+    facts.add_row("copies (replicas)", str(run["replicas"]))
+    facts.add_row("seed", str(run["seed"]))
+    facts.add_row("start", f"{_short(run['start'])}, first graph {document['switching']['initial']}")
+    facts.add_row("pace", f"{run['pace']}, processes {run['processes']}")
+    facts.add_row("predicted system error", _number(document["predicted_system_error"]))
+    memory = document["memory"]
+    facts.add_row("memory", f"states {amount(memory['states'])}, graphs {amount(memory['matrices'])}")
+    facts.add_row("can be run by this version", "yes" if not document["unavailable"] else "no")
+    console.print(facts)
+    columns = ("connectivity", "share", "held for", "dt below")
+    graphs = _table(console, "Graphs", "graph", *columns)
+    graphs.add_column("links", overflow="fold")
+    for graph in document["graphs"]:
+        graphs.add_row(
+            Text(graph["name"]),
+            _number(graph["algebraic_connectivity"]),
+            _number(graph["stationary"]),
+            _number(graph["mean_holding_time"]),
+            _number(graph["stability_limit"]),
+            _links(graph),
+        )
+    console.print(graphs)
+    switching = document["switching"]
+    title = (
+        "Rates from graph to graph"
+        if document["time"] == "continuous"
+        else "Probabilities from graph to graph"
+    )
+    names = [graph["name"] for graph in document["graphs"]]
+    if 1 < len(names) <= _ROWS:
+        chain = _table(console, title, "from / to", *names)
+        for name, row in zip(names, switching["matrix"], strict=True):
+            chain.add_row(Text(name), *map(_number, row))
+        console.print(chain)
+    for line in document["unavailable"]:
+        console.print(Text(line, style="yellow"))
+
+
+def print_bag(document: dict[str, Any], console: Console) -> None:
+    """What a bag holds.
+
+    Parameters
+    ----------
+    document : of ``msg_analysis.report.info.describe_bag``
+    console : where to print
+    """
+    count = document["completeness"]
+    facts = _facts(console, document["bag"])
+    facts.add_row("run", document["run"])
+    facts.add_row("experiment", f"{document['experiment']}, seed {document['seed']}")
+    facts.add_row("agents, replicas", f"{document['agents']}, {document['replicas']}")
+    facts.add_row("steps", f"{document['steps']}, {_number(document['simulated_time'])} units of time")
+    state = "complete" if count["complete"] else "incomplete"
+    facts.add_row(
+        "states", f"{state}: {count['received']} of {count['expected']}, {count['missing']} missing"
+    )
+    facts.add_row("came twice, out of order", f"{count['duplicates']}, {count['out_of_order']}")
+    facts.add_row("steps without a graph", str(count["missing_modes"]))
+    for reason, number in count["refused"].items():
+        facts.add_row("refused", Text(f"{number}: {reason}"))
+    for file in document["files"]:
+        facts.add_row("file", Text(f"{file['name']}, {amount(file['size'])}"))
+    for name, version in document["versions"].items():
+        facts.add_row(Text(name), Text(str(version)))
+    console.print(facts)
+
+
+def _table(console: Console, title: str, first: str, *numbers: str) -> Table:
+    """A table under its heading: one column of names, the others of numbers."""
+    console.print(Text(title, style="bold"))
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column(Text(first))
+    for number in numbers:
+        table.add_column(Text(number), justify="right")
+    return table
+
+
+def _facts(console: Console, title: str) -> Table:
+    """A table of names and what they are, under its heading."""
+    console.print(Text(title, style="bold"))
+    table = Table(box=box.SIMPLE, show_header=False)
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    return table
+
+
+def _note_cut(table: Table, total: int, what: str) -> None:
+    if total > _ROWS:
+        table.caption = f"{total - _ROWS} more {what}: use --json"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6g}"
+
+
+def _z(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.2f}"
+
+
+def _p(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _mark(test: dict[str, Any]) -> Text:
+    if test["p"] is None:
+        return Text("not done", style="dim")
+    return Text("rejected", style="bold red") if test["rejected"] else Text("passed", style="green")
+
+
+def _interval(interval: Sequence[float | None] | None) -> str:
+    if not interval or None in interval:
+        return "-"
+    return f"{_number(interval[0])} .. {_number(interval[1])}"
+
+
+def _short(value: Any) -> str:
+    """A number or word as it is, a list by its size."""
+    if isinstance(value, list):
+        if value and isinstance(value[0], list):
+            return f"matrix {len(value)} x {len(value[0])}"
+        return f"[{_names(value)}]"
+    return str(value)
+
+
+def _names(values: Sequence[Any], longest: int = 12) -> str:
+    shown = ", ".join(str(value) for value in values[:longest])
+    return shown + (f", and {len(values) - longest} more" if len(values) > longest else "")
+
+
+def _links(graph: dict[str, Any]) -> str:
+    """``1-2, 2-3 (0.5)`` of edges, ``1>2`` of arcs (2 listens to 1)."""
+    sign, links = ("-", graph["edges"]) if graph["edges"] is not None else (">", graph["arcs"])
+    return (
+        _names([f"{i}{sign}{j}" + (f" ({weight:g})" if weight != 1 else "") for i, j, weight in links])
+        or "none"
+    )

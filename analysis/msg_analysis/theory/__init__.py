@@ -1,0 +1,1 @@
+"""Predictions: second moments of jump linear systems."""

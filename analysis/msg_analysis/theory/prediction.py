@@ -1,0 +1,186 @@
+"""What theory says about an experiment: in continuous time, for the run's steps, and without switching."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import networkx as nx
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from msg_analysis.errors import InputError
+from msg_analysis.model.step import StepModel, build_step_model
+from msg_analysis.theory import system as systems
+from msg_analysis.theory.moments import MomentSolver
+from msg_analysis.theory.system import JumpSystem
+from msg_analysis.types import FloatArray
+
+if TYPE_CHECKING:
+    from msg_analysis.model.experiment import Experiment
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """Steady second moments of the agents.
+
+    Attributes
+    ----------
+    covariance : (m, m) of the disagreement (consensus) or of the deviation from the reference (tracking)
+    by_mode : (n, m, m) E[.; mode i], which sum to ``covariance``; None for the static baseline
+    """
+
+    covariance: FloatArray
+    by_mode: FloatArray | None = None
+
+    @property
+    def node_errors(self) -> FloatArray:
+        """(m,) E_i."""
+        return np.diag(self.covariance).copy()
+
+    @property
+    def system_error(self) -> float:
+        """E, the sum of the node errors."""
+        return float(np.trace(self.covariance))
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of one law; what is infinite or undefined is None."""
+        document: dict[str, Any] = {
+            "system_error": _finite(self.system_error),
+            "node_errors": [_finite(e) for e in self.node_errors],
+            "system_certainty": _inverse(self.system_error),
+            "node_certainty": [_inverse(e) for e in self.node_errors],
+            "covariance": self.covariance.tolist(),
+        }
+        if self.by_mode is not None:
+            document["mode_second_moments"] = self.by_mode.tolist()
+        return document
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Everything ``msg-analysis predict`` says, and what a comparison needs.
+
+    Attributes
+    ----------
+    experiment : what is predicted
+    step : the experiment compiled to one step
+    solver : the equations of the run's steps, factorised; its ``system`` is the reduced system
+    steady : (n, d, d) steady second moments of the reduced system of the run's steps
+    emulated : what the run's steps do, exactly ("discrete" in the document of a discrete-time experiment)
+    continuous : the paper's continuous-time system; None in discrete time or with noise on the air or loss
+    static : the pi-weighted mean over the graphs held for ever; None where one of them cannot keep the
+        agents together
+    """
+
+    experiment: Experiment
+    step: StepModel
+    solver: MomentSolver
+    steady: FloatArray
+    emulated: Moments
+    continuous: Moments | None
+    static: Moments | None
+
+    @property
+    def system(self) -> JumpSystem:
+        """The reduced system of the run's steps."""
+        return self.solver.system
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of ``msg-analysis predict --json``."""
+        document: dict[str, Any] = {
+            "agents": self.experiment.agents,
+            "modes": [graph.name for graph in self.experiment.graph_list],
+            "stationary": self.step.stationary.tolist(),
+        }
+        if self.experiment.time == "discrete":
+            document["discrete"] = self.emulated.to_json()
+        else:
+            document["continuous"] = self.continuous.to_json() if self.continuous else None
+            document["emulated"] = self.emulated.to_json()
+        document["static"] = self.static.to_json() if self.static else None
+        return document
+
+
+def predict(experiment: Experiment) -> Prediction:
+    """Steady-state prediction of an experiment (Propositions 3 to 5 of the paper and their discrete twins).
+
+    Raises
+    ------
+    InputError : too large, or without finite steady errors
+    """
+    step = build_step_model(experiment)
+    noise = experiment.noise
+    continuous = static = None
+    if not (noise.broadcast or noise.link or noise.loss):
+        if experiment.time == "continuous":
+            paper = systems.continuous(experiment)
+            continuous = _moments(paper, MomentSolver(paper).steady())
+        else:
+            paper = systems.emulated(step, experiment.problem)
+        if all(_holds_together(experiment, mode) for mode in range(step.modes)):
+            static = _static(paper)
+    solver, steady = _steady(step, experiment.problem)
+    emulated = _moments(solver.system, steady)
+    return Prediction(experiment, step, solver, steady, emulated, continuous, static)
+
+
+def stationary_start_factor(step: StepModel, problem: str, mode: int) -> FloatArray:
+    """(m, m) square root S of the law of x(0) given g(0) = mode in the steady state: S S^T = C_g0 / pi_g0.
+
+    S is the symmetric positive semidefinite root, which is unique. One thread of linear algebra, so that the
+    number of threads does not change its last bits.
+
+    Parameters
+    ----------
+    step : the compiled experiment
+    problem : "consensus" or "tracking"
+    mode : g(0), from 0
+    """
+    with threadpool_limits(1):
+        solver, steady = _steady(step, problem)
+        values, vectors = np.linalg.eigh(steady[mode] / step.stationary[mode])
+        root = (vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T
+        return solver.system.lifted(root)
+
+
+def _steady(step: StepModel, problem: str) -> tuple[MomentSolver, FloatArray]:
+    solver = MomentSolver(systems.emulated(step, problem))
+    return solver, solver.steady()
+
+
+def _moments(system: JumpSystem, steady: FloatArray) -> Moments:
+    return Moments(system.lifted(steady.sum(axis=0)), system.lifted(steady))
+
+
+def _static(system: JumpSystem) -> Moments | None:
+    covariance = np.zeros((len(system.lift), len(system.lift)))
+    for mode, share in enumerate(system.stationary):
+        alone = systems.held(system, mode)
+        try:
+            covariance += share * alone.lifted(MomentSolver(alone).steady()[0])
+        except InputError:  # a connected graph whose connection is lost to rounding
+            return None
+    return Moments(covariance)
+
+
+def _holds_together(experiment: Experiment, mode: int) -> bool:
+    """Whether one graph held for ever bounds the errors: all hear one agent, or a leader, in some steps."""
+    graph = experiment.graph_list[mode]
+    digraph: nx.DiGraph = nx.DiGraph()
+    digraph.add_nodes_from(range(1, graph.agents + 1))
+    digraph.add_edges_from((source, target) for source, target, _ in graph.arcs)
+    if experiment.problem == "tracking":
+        digraph.add_edges_from((0, int(leader) + 1) for leader in np.flatnonzero(experiment.leader_gains))
+        return 0 in digraph and len(nx.descendants(digraph, 0)) == graph.agents
+    parts = nx.condensation(digraph)
+    return sum(int(degree == 0) for _, degree in parts.in_degree()) == 1
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _inverse(value: float) -> float | None:
+    return _finite(1.0 / value) if value > 0.0 else None

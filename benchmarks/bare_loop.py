@@ -1,0 +1,179 @@
+"""The ceiling: a ring of agents in lockstep with nothing but the middleware in it.
+
+Raw bytes of the size of an AgentState, one precompiled struct a message, no arithmetic, no checks, no graph, no
+start-up protocol; reliable and keep-all like the real network. With --recorder, one more process writes every message
+to an MCAP file and does nothing else. Prints steps per second of the lockstep loop.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import rclpy
+from mcap.writer import CompressionType, Writer
+from msg_agents_interfaces.msg import AgentState
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0)
+FRAME = struct.Struct("<4xQI")  # CDR header, step, agent
+
+
+def bare_node(name: str) -> Node:
+    return Node(name, start_parameter_services=False, enable_rosout=False)
+
+
+def executor(kind: str) -> Executor:
+    return EventsExecutor() if kind == "events" else SingleThreadedExecutor()
+
+
+class Agent:
+    """Publishes step k + 1 when both neighbours' step k is there."""
+
+    def __init__(self, index: int, agents: int, steps: int, readers: int, payload: bytes) -> None:
+        self.node = bare_node(f"agent_{index}")
+        self.index, self.steps, self.readers, self.payload = index, steps, readers, payload
+        self.step, self.heard = 0, {}
+        self.started = 0.0
+        self.publisher = self.node.create_publisher(AgentState, f"agent_{index}/state", QOS)
+        self.neighbours = {(index - 1) % agents, (index + 1) % agents} - {index}
+        for j in self.neighbours:
+            self.node.create_subscription(AgentState, f"agent_{j}/state", self.receive, QOS, raw=True)
+
+    def ready(self) -> bool:
+        return self.publisher.get_subscription_count() >= self.readers
+
+    def publish(self) -> None:
+        data = FRAME.pack(self.step, self.index) + self.payload
+        while True:
+            try:
+                return self.publisher.publish(data)
+            except rclpy._rclpy_pybind11.RCLError:
+                pass
+
+    def receive(self, data: bytes) -> None:
+        step, _ = FRAME.unpack_from(data)
+        self.heard[step] = self.heard.get(step, 0) + 1
+        while self.step < self.steps and self.heard.get(self.step, 0) == len(self.neighbours):
+            del self.heard[self.step]
+            self.step += 1
+            self.publish()
+
+
+def run_agents(arguments: argparse.Namespace) -> None:
+    rclpy.init()
+    payload = bytes(68 + 8 * arguments.replicas - FRAME.size)
+    mine = range(arguments.worker, arguments.agents, arguments.processes)
+    readers = min(2, arguments.agents - 1) + arguments.recorder
+    agents = [Agent(i, arguments.agents, arguments.steps, readers, payload) for i in mine]
+    spin = executor(arguments.executor)
+    for agent in agents:
+        spin.add_node(agent.node)
+    while not all(agent.ready() for agent in agents):
+        time.sleep(0.2)
+    started = time.monotonic()
+    for agent in agents:
+        agent.publish()
+    while any(agent.step < arguments.steps for agent in agents):
+        spin.spin_once(timeout_sec=1.0) if arguments.executor == "single" else spin_events(spin)
+    elapsed = time.monotonic() - started
+    print(f"{arguments.steps / elapsed:.1f}", flush=True)
+    for agent in agents:
+        agent.publisher.wait_for_all_acked()
+    sys.stdin.read()  # leave when everyone is done
+
+
+def spin_events(spin: Executor) -> None:
+    spin.spin_once(timeout_sec=1.0)
+
+
+def run_recorder(arguments: argparse.Namespace) -> None:
+    rclpy.init()
+    node = bare_node("recorder")
+    with tempfile.TemporaryDirectory() as directory, (Path(directory) / "bare.mcap").open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start("ros2", "bare")
+        schema = writer.register_schema("msg_agents_interfaces/msg/AgentState", "ros2msg", b"")
+        received = 0
+
+        def record(channel: int) -> object:
+            def receive(data: bytes) -> None:
+                nonlocal received
+                received += 1
+                writer.add_message(channel, received, data, received)
+
+            return receive
+
+        for i in range(arguments.agents):
+            channel = writer.register_channel(f"/agent_{i}/state", "cdr", schema)
+            node.create_subscription(AgentState, f"agent_{i}/state", record(channel), QOS, raw=True)
+        spin = executor(arguments.executor)
+        spin.add_node(node)
+        while received < arguments.agents * (arguments.steps + 1):
+            spin.spin_once(timeout_sec=1.0)
+        writer.finish()
+    print(received, flush=True)
+    sys.stdin.read()
+
+
+def measure(
+    agents: int, processes: int, steps: int, *, recorder: bool, kind: str, replicas: int, domain: int
+) -> float:
+    """Steps per second: N over the time that the slowest process took."""
+    environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    common = (
+        f"--agents {agents} --processes {processes} --steps {steps} --executor {kind} --replicas {replicas}"
+    )
+    roles = [f"--worker {w}" for w in range(processes)] + (["--worker -1"] if recorder else [])
+    command = [sys.executable, __file__, *common.split(), *(["--recorder"] if recorder else [])]
+    children = [
+        subprocess.Popen(
+            [*command, *role.split()],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        for role in roles
+    ]
+    rates = [float(child.stdout.readline()) for child in children]
+    for child in children:
+        child.stdin.close()
+        child.wait(timeout=30)
+    return min(rates[:processes])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--agents", type=int, default=5)
+    parser.add_argument("--processes", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=8000)
+    parser.add_argument("--replicas", type=int, default=16)
+    parser.add_argument("--recorder", action="store_true")
+    parser.add_argument("--executor", choices=["events", "single"], default="events")
+    parser.add_argument("--domain", type=int, default=90)
+    parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.worker is None:
+        rate = measure(
+            arguments.agents, arguments.processes, arguments.steps, recorder=arguments.recorder,
+            kind=arguments.executor, replicas=arguments.replicas, domain=arguments.domain,
+        )  # fmt: skip
+        print(f"{rate:.0f} steps/s")
+    elif arguments.worker < 0:
+        run_recorder(arguments)
+    else:
+        run_agents(arguments)
+
+
+if __name__ == "__main__":
+    main()

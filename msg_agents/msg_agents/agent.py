@@ -1,0 +1,131 @@
+"""The agent node: one row of the MJLS on topics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
+from msg_agents_interfaces.msg import AgentState as AgentStateMsg
+from msg_agents_interfaces.msg import Progress as ProgressMsg
+
+from msg_agents.node import GRAPH_TOPIC, PROGRESS_TOPIC, NetworkNode, agent_name, state_topic
+from msg_agents.qos import LOSSLESS
+from msg_agents.synchronizer import Synchronizer
+from msg_analysis.bags.cdr import ActiveGraph, CdrError, Progress, StateCodec, StateFrame, StepClock
+from msg_analysis.model.agent import AgentLaw
+from msg_analysis.model.record import RunRecord
+from msg_analysis.model.step import StepModel
+
+PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages
+OTHER_RUN = "of another run or layout"
+
+
+class Agent(NetworkNode):
+    """Moves numbers between topics, the synchronizer and the law.
+
+    Parameters
+    ----------
+    record : of the run
+    model : its step model
+    agent : index from 0
+    readers : names of the nodes, besides the other agents, that must read the states before the run starts
+    """
+
+    def __init__(self, *, record: RunRecord, model: StepModel, agent: int, readers: list[str]) -> None:
+        super().__init__(agent_name(agent), record=record)
+        experiment = record.experiment
+        self._law = AgentLaw(record, model, agent)
+        listens = model.listens()
+        peers = [j for j in range(model.agents) if listens[agent, j] or listens[j, agent]]
+        self._synchronizer: Synchronizer = Synchronizer(
+            agent=agent,
+            steps=experiment.steps,
+            inputs=[self._law.neighbours(mode) for mode in range(model.modes)],
+            peers=peers,
+        )
+        self._codec = StateCodec(self.run, agent + 1, experiment.run.replicas, experiment.step_length)
+        self._frame = StateFrame(self.run, experiment.run.replicas)
+        self._clock = StepClock(experiment.step_length)
+        self._expected = [agent_name(j) for j in peers] + readers
+        self._next_progress = 0.0
+        self._states = self.create_publisher(AgentStateMsg, state_topic(agent), LOSSLESS)
+        self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LOSSLESS)
+        self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._receive_graph, LOSSLESS, raw=True)
+        for j in peers:
+            self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), LOSSLESS, raw=True)
+        self._begun = False
+
+    def awaited(self) -> dict[str, list[str]]:
+        """See NetworkNode."""
+        missing = self.missing_readers(self._states, self._expected)
+        return {self._states.topic_name: missing} if missing else {}
+
+    def begin(self) -> None:
+        """Publish x(0)."""
+        self._begun = True
+        self.publish(self._states, self._codec.encode(0, 0, self._law.state))
+        self._report()
+        self._advance()
+
+    def finish(self, *, complete: bool) -> None:
+        """See NetworkNode."""
+        if complete:
+            self.wait_until_read(self._states, self._progress)
+
+    def waiting_for(self) -> str:
+        """What keeps the agent from its next step."""
+        return self._synchronizer.waiting_for()
+
+    def _receiver(self, peer: int) -> Callable[[bytes], None]:
+        """The callback for one peer's states: this is the hot path."""
+        decode = self._frame.decode
+        offer = self._synchronizer.offer
+        ready = self._synchronizer.ready
+        topic = state_topic(peer)
+
+        def receive(data: bytes) -> None:
+            frame = decode(data)
+            if frame is None or frame[0] != peer + 1:
+                self.refuse(OTHER_RUN, topic)
+                return
+            reason = offer(peer, frame[1], frame[3])
+            if reason:
+                self.refuse(reason, topic)
+            elif ready():
+                self._advance()
+
+        return receive
+
+    def _receive_graph(self, data: bytes) -> None:
+        try:
+            graph = ActiveGraph.decode(data)
+        except CdrError as error:
+            self.refuse(str(error), GRAPH_TOPIC)
+            return
+        if graph.run != self.run:
+            self.refuse(OTHER_RUN, GRAPH_TOPIC)
+            return
+        reason = self._synchronizer.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step)
+        if reason:
+            self.refuse(reason, GRAPH_TOPIC)
+        else:
+            self._advance()
+
+    def _advance(self) -> None:
+        """Make every step that can be made."""
+        synchronizer, law = self._synchronizer, self._law
+        while self._begun and synchronizer.ready():
+            mode, heard = synchronizer.take()
+            state = law.advance(mode, heard)
+            self.publish(self._states, self._codec.encode(law.step, mode + 1, state))
+            if time.monotonic() >= self._next_progress or synchronizer.finished:
+                self._report()
+                if synchronizer.finished:
+                    self.done.set_result(None)
+
+    def _report(self) -> None:
+        step = self._law.step
+        message = Progress(self._clock.nanoseconds(step), self.run, self._law.agent + 1, step)
+        self.publish(self._progress, message.encode())
+        self._next_progress = time.monotonic() + PROGRESS_PERIOD

@@ -1,0 +1,331 @@
+"""The command line ``msg-agents``.
+
+Results go to stdout, everything else to stderr. Exit codes: 0 fine or agrees, 1 disagrees, 2 bad usage or input,
+3 data incomplete. What takes long to import is imported by the command that needs it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import msg_agents
+from msg_analysis.console import CommandGroup, examples
+
+if TYPE_CHECKING:
+    from msg_agents.node import NetworkNode
+    from msg_agents.runner import RunResult
+    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.model.record import RunRecord
+
+DISAGREES, INCOMPLETE = 1, 3
+DISCOVERY_TIMEOUT = 30.0  # s
+
+
+@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(msg_agents.__version__, prog_name="msg-agents")
+def main() -> None:
+    """Networks of agents under Markov-switching graphs, as ROS 2 processes."""
+
+
+@main.command(
+    epilog=examples(
+        "msg-agents run line_ring.yaml",
+        "msg-agents run line_ring.yaml --seed 3 --duration 100 --out runs --json",
+    )
+)
+@click.argument("experiment", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("runs"),
+    show_default=True,
+    help="Where the bag's directory <name>_<time> is made.",
+)
+@click.option("--no-record", is_flag=True, help="Only run: no bag, no verdict.")
+@click.option("--seed", type=int, help="Instead of run.seed.")
+@click.option("--duration", type=float, help="Instead of run.duration, in units of simulated time.")
+@click.option("--pace", help="Instead of run.pace: lockstep.")
+@click.option("--processes", help="Instead of run.processes: auto, one_per_agent or a number.")
+@click.option(
+    "--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own."
+)
+@click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
+def run(
+    experiment: Path,
+    *,
+    out: Path,
+    no_record: bool,
+    seed: int | None,
+    duration: float | None,
+    pace: str | None,
+    processes: str | None,
+    domain: int | None,
+    executor: str | None,
+    as_json: bool,
+) -> None:
+    """Run EXPERIMENT as a network of processes, record it, and compare the record with the theory."""
+    from rich.console import Console
+
+    from msg_agents.runner import conclude, run_network
+
+    changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace}
+    if processes is not None:
+        changes["processes"] = int(processes) if processes.isdigit() else processes
+    what = _load(experiment).with_run(**{key: value for key, value in changes.items() if value is not None})
+    console = Console(stderr=True)
+    with _progress_bar(console, what) as on_progress:
+        result = run_network(
+            what,
+            None if no_record else out,
+            domain=domain,
+            on_progress=on_progress,
+            environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
+        )
+    for line in result.failures:
+        click.echo(f"{click.style('failed:', fg='red', bold=True)} {line}", err=True)
+    conclude(result)
+    _show(result, as_json)
+    if result.failures or (result.bag is not None and result.comparison is None):
+        sys.exit(INCOMPLETE)
+    if result.comparison is not None:
+        sys.exit(result.comparison.exit_code)
+
+
+def _show(result: RunResult, as_json: bool) -> None:
+    """The result on stdout, and as result.json beside the bag."""
+    from msg_agents.runner import REPORT_FILE, RESULT_FILE
+
+    document: dict[str, Any] = (
+        dict(result.comparison.to_json()) if result.comparison else {"verdict": "incomplete"}
+    )
+    document |= {
+        "bag": str(result.bag) if result.trajectory else None,
+        "report": str(result.bag / REPORT_FILE) if result.bag and result.comparison else None,
+        "rate": result.rate,
+        "wall_time": result.wall_time,
+        "failures": result.failures,
+    }
+    if result.bag is not None and result.comparison is not None:
+        (result.bag / RESULT_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    if as_json:
+        click.echo(json.dumps(document))
+        return
+    if result.comparison is not None:
+        from rich.console import Console
+
+        from msg_analysis.report.text import print_comparison
+
+        print_comparison(document, Console())
+        click.echo(f"bag:    {document['bag']}\nreport: {document['report']}")
+    if result.rate:
+        click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
+
+
+class _progress_bar:  # noqa: N801  used like a function
+    """A progress bar on stderr: steps, steps/s, time left. On a terminal only."""
+
+    def __init__(self, console: Any, experiment: Experiment) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]:.0f} steps/s"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+            transient=True,
+        )
+        self._task = self._progress.add_task(f"{experiment.name}: starting", total=experiment.steps, rate=0.0)
+        self._name = experiment.name
+
+    def __enter__(self) -> Callable[[int], None]:
+        self._progress.start()
+        return self._update
+
+    def _update(self, step: int) -> None:
+        rate = self._progress.tasks[0].speed or 0.0
+        self._progress.update(self._task, completed=step, description=self._name, rate=rate)
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+
+@main.command(epilog=examples("msg-agents check runs/line_ring_20250101_120000", "msg-agents check"))
+@click.argument("bag", type=click.Path(path_type=Path), required=False)
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
+def check(bag: Path | None, *, as_json: bool) -> None:
+    """Compute the run in BAG again with the offline twin; name the first agent and step that differ.
+
+    Without BAG, the newest one below ./runs is checked.
+    """
+    from msg_agents.check import check as check_trajectory
+    from msg_analysis.bags.reader import read_bag
+
+    path = bag or _newest_bag(Path("runs"))
+    outcome = check_trajectory(read_bag(path))
+    if as_json:
+        document = {"bag": str(path), "equal": outcome.difference is None, "compared": outcome.compared}
+        click.echo(json.dumps(document | {"missing": outcome.missing, "difference": outcome.difference}))
+    elif outcome.difference:
+        click.echo(f"{path}: differs from the twin, first: {outcome.difference}")
+    else:
+        missing = f", {outcome.missing} missing" if outcome.missing else ""
+        click.echo(f"{path}: equal to the twin to the last bit: {outcome.compared} states{missing}")
+    sys.exit(DISAGREES if outcome.difference else INCOMPLETE if outcome.missing else 0)
+
+
+def _newest_bag(directory: Path) -> Path:
+    bags = sorted(directory.glob("*/metadata.yaml"), key=lambda file: file.stat().st_mtime)
+    if not bags:
+        raise click.UsageError(f"no bag below {directory.absolute()}: name one")
+    return bags[-1].parent
+
+
+@main.command(epilog=examples("msg-agents prepare line_ring.yaml > run.json"))
+@click.argument("experiment", type=click.Path(path_type=Path))
+def prepare(experiment: Path) -> None:
+    """Print the run record of a new run of EXPERIMENT: the file that the single nodes are started with."""
+    from msg_analysis.model.twin import new_record
+
+    what = _load(experiment)
+    what.require_available()
+    click.echo(new_record(what).to_json())
+
+
+def _node_options(command: Callable[..., None]) -> Callable[..., None]:
+    """What the commands of single nodes have in common."""
+    for option in (
+        click.argument("run_record", type=click.Path(path_type=Path)),
+        click.option(
+            "--discovery-timeout",
+            type=float,
+            default=DISCOVERY_TIMEOUT,
+            show_default=True,
+            help="Seconds to wait for the other nodes.",
+        ),
+        click.option("--lifeline", type=int, hidden=True),
+    ):
+        command = option(command)
+    return command
+
+
+_await = click.option(
+    "--await",
+    "readers",
+    multiple=True,
+    help="A node, such as recorder, that must be there before the run starts. Repeatable.",
+)
+
+
+@main.command(epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
+@_node_options
+@click.option(
+    "--agent",
+    "agents",
+    type=int,
+    multiple=True,
+    required=True,
+    help="Number of an agent, from 1. Repeatable.",
+)
+@_await
+def agent(run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...], **options: Any) -> None:
+    """Run one or more agents of the run in RUN_RECORD in one process."""
+    from msg_analysis.errors import InputError
+    from msg_analysis.model.step import build_step_model
+
+    record = _load_record(run_record)
+    total = record.experiment.agents
+    for number in agents:
+        if not 1 <= number <= total:
+            raise InputError(f"--agent: {number}: expected a number from 1 to {total}")
+    if len(set(agents)) < len(agents):
+        raise InputError(f"--agent: {list(agents)}: expected each agent once")
+
+    def nodes() -> list[NetworkNode]:
+        from msg_agents.agent import Agent
+
+        model = build_step_model(record.experiment)
+        return [Agent(record=record, model=model, agent=i - 1, readers=list(readers)) for i in agents]
+
+    _run_nodes(nodes, **options)
+
+
+@main.command(epilog=examples("msg-agents switcher run.json --await recorder"))
+@_node_options
+@_await
+@click.option("--status", type=int, hidden=True)
+def switcher(run_record: Path, *, readers: tuple[str, ...], status: int | None, **options: Any) -> None:
+    """Run the switcher of the run in RUN_RECORD: it publishes the experiment and the active graph."""
+    from msg_analysis.model.step import build_step_model
+
+    record = _load_record(run_record)
+
+    def report(steps: Any) -> None:
+        if status is not None:
+            os.write(status, json.dumps(list(steps)).encode() + b"\n")
+
+    def nodes() -> list[NetworkNode]:
+        from msg_agents.switcher import Switcher
+
+        model = build_step_model(record.experiment)
+        return [Switcher(record=record, model=model, readers=list(readers), on_progress=report)]
+
+    _run_nodes(nodes, **options)
+
+
+@main.command(epilog=examples("msg-agents recorder run.json --out runs/mine"))
+@_node_options
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="Directory of the bag; must not exist."
+)
+def recorder(run_record: Path, *, out: Path, **options: Any) -> None:
+    """Record the run in RUN_RECORD to a bag."""
+    record = _load_record(run_record)
+
+    def nodes() -> list[NetworkNode]:
+        from msg_agents.recorder import Recorder
+
+        return [Recorder(record=record, directory=out)]
+
+    _run_nodes(nodes, **options)
+
+
+def _run_nodes(
+    nodes: Callable[[], list[NetworkNode]], *, lifeline: int | None, discovery_timeout: float
+) -> None:
+    from msg_agents.process import hold_lifeline, run_nodes
+
+    if lifeline is not None:
+        hold_lifeline(lifeline)
+    executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
+    if not run_nodes(nodes, executor=executor, discovery_timeout=discovery_timeout):
+        sys.exit(INCOMPLETE)
+
+
+def _load(path: Path) -> Experiment:
+    from msg_analysis.model.experiment import Experiment
+
+    return Experiment.load(path)
+
+
+def _load_record(path: Path) -> RunRecord:
+    from msg_analysis.errors import InputError
+    from msg_analysis.model.record import RunRecord
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({error}): expected a run record from msg-agents prepare"
+        ) from error
+    return RunRecord.from_json(text, str(path))

@@ -1,0 +1,61 @@
+"""A ROS domain of our own, so that two runs on one machine do not hear each other."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from msg_analysis.errors import InputError
+
+DOMAINS = range(1, 102)
+"""0 is everybody's default; above 101 the ports lie among those that Linux hands out to anyone."""
+
+PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
+
+
+def _ports_in_use() -> set[int]:
+    """UDP ports bound on this machine."""
+    ports = set()
+    for table in ("/proc/net/udp", "/proc/net/udp6"):
+        try:
+            lines = Path(table).read_text(encoding="ascii").splitlines()[1:]
+        except OSError:
+            continue
+        ports.update(int(line.split()[1].rpartition(":")[2], 16) for line in lines)
+    return ports
+
+
+@contextmanager
+def free_domain() -> Iterator[int]:
+    """Hold a ROS_DOMAIN_ID that no other run holds and whose ports nobody uses.
+
+    A lock on a file marks it as taken; the system takes the lock away when this process ends, however it ends.
+
+    Raises
+    ------
+    InputError : all are taken
+    """
+    busy = {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in _ports_in_use()}
+    candidates = [domain for domain in DOMAINS if domain not in busy]
+    random.shuffle(candidates)
+    for domain in candidates:
+        path = Path(tempfile.gettempdir()) / f"msg_agents_domain_{domain}.lock"
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError:
+            continue
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield domain
+            return
+        finally:
+            os.close(descriptor)
+    raise InputError(f"no free ROS domain among {DOMAINS[0]}..{DOMAINS[-1]}: end some runs or give --domain")

@@ -1,0 +1,79 @@
+"""The plan of a network: which nodes run in which processes. One source for the runner and for launch files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from msg_analysis.errors import InputError
+from msg_analysis.model.experiment import Experiment
+
+RECORDER = "recorder"
+SMALL = 8  # agents up to which each one gets a process of its own
+MOST_PROCESSES = 28
+"""Agent processes. LOCALHOST discovery of the ROS 2 wheels finds about 32 participants and waits for more for ever."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessPlan:
+    """One process of a network.
+
+    Attributes
+    ----------
+    name : what people call it
+    arguments : of the command ``msg-agents`` that runs it
+    agents : indices from 0 of the agents in it
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    agents: tuple[int, ...] = ()
+
+
+def count_processes(experiment: Experiment) -> int:
+    """Agent processes that an experiment asks for.
+
+    Raises
+    ------
+    InputError : more than discovery can handle
+    """
+    agents, wanted = experiment.agents, experiment.run.processes
+    if wanted == "auto":
+        return agents if agents <= SMALL else min(agents, max(2, 2 * (os.cpu_count() or 1)))
+    count = agents if wanted == "one_per_agent" else min(int(wanted), agents)
+    if count > MOST_PROCESSES:
+        raise InputError(
+            f"run.processes: {wanted} ({count} processes): expected at most {MOST_PROCESSES}, because discovery on one "
+            "machine finds about 32 participants: give a smaller number, several agents share a process"
+        )
+    return count
+
+
+def plan_network(experiment: Experiment, run_file: Path, bag: Path | None) -> list[ProcessPlan]:
+    """The processes of a run, in the order in which they should be started.
+
+    Parameters
+    ----------
+    experiment : what is run
+    run_file : the run record that every node is given
+    bag : directory to record to; None: no recorder
+
+    Raises
+    ------
+    InputError : more processes than discovery can handle
+    """
+    count = count_processes(experiment)
+    readers = ("--await", RECORDER) if bag is not None else ()
+    plans = []
+    if bag is not None:
+        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag))))
+    for index in range(count):
+        # Neighbouring numbers share a process: in most graphs they are neighbours, and their messages stay inside.
+        agents = tuple(range(index * experiment.agents // count, (index + 1) * experiment.agents // count))
+        numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
+        first, last = agents[0] + 1, agents[-1] + 1
+        name = f"agent_{first}" if first == last else f"agents_{first}_to_{last}"
+        plans.append(ProcessPlan(name, ("agent", str(run_file), *numbers, *readers), agents))
+    plans.append(ProcessPlan("switcher", ("switcher", str(run_file), *readers)))
+    return plans

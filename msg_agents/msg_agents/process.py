@@ -1,0 +1,134 @@
+"""The life of one process of a network: nodes, start gate, spin, end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import rclpy
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+
+from msg_agents.node import NetworkNode, RCLError
+from msg_analysis.errors import InputError
+
+GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
+SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wakes up
+LIFELINE_GRACE = 5.0  # s
+
+
+class NotFoundError(InputError):
+    """Some nodes of the run were not discovered in time."""
+
+
+def make_executor(kind: str = "events") -> Executor:
+    """The events executor where this rclpy has it (a third of the CPU per message), else the single-threaded one.
+
+    Parameters
+    ----------
+    kind : "events" or "single"; "single" is there for comparison
+    """
+    if kind == "events":
+        try:
+            from rclpy.experimental.events_executor import EventsExecutor
+        except ImportError:
+            pass
+        else:
+            return EventsExecutor()
+    return SingleThreadedExecutor()
+
+
+def hold_lifeline(descriptor: int) -> None:
+    """End this process when the other end of a pipe closes, that is when the parent is gone, however it went."""
+
+    def watch() -> None:
+        while os.read(descriptor, 1):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(LIFELINE_GRACE)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True, name="lifeline").start()
+
+
+def run_nodes(
+    make_nodes: Callable[[], Sequence[NetworkNode]], *, executor: str = "events", discovery_timeout: float
+) -> bool:
+    """Run nodes in this process until each has done its part.
+
+    Parameters
+    ----------
+    make_nodes : called once ROS is up
+    executor : "events" or "single"
+    discovery_timeout : s to wait for the other nodes of the run
+
+    Returns
+    -------
+    True if all nodes did their part, False if the process was told to stop (SIGINT, SIGTERM) before
+
+    Raises
+    ------
+    NotFoundError : with the names of who is missing
+    InputError : what a node failed with
+    """
+    # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
+    # installed on top, ends the spin between two callbacks.
+    signal.signal(signal.SIGINT, lambda *_: None)
+    rclpy.init()
+    nodes: Sequence[NetworkNode] = []
+    complete = False
+    try:
+        nodes = make_nodes()
+        spinner = make_executor(executor)
+        for node in nodes:
+            spinner.add_node(node)
+        _gate(nodes, discovery_timeout)
+        for node in nodes:
+            node.begin()
+        for node in nodes:
+            while not node.done.done():
+                spinner.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
+            node.done.result()
+        complete = True
+    except ExternalShutdownException:
+        pass
+    except RCLError:
+        if rclpy.ok():
+            raise
+    finally:
+        for node in nodes:
+            node.finish(complete=complete)
+        rclpy.try_shutdown()
+    return complete
+
+
+def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
+    """Wait until the publishers of all nodes have found their readers."""
+    deadline = time.monotonic() + timeout
+    waiting = list(nodes)
+    while True:
+        awaited = {node: node.awaited() for node in waiting}
+        waiting = [node for node, missing in awaited.items() if missing]
+        if not waiting:
+            return
+        if time.monotonic() > deadline:
+            missing = sorted(
+                {name for topics in awaited.values() for names in topics.values() for name in names}
+            )
+            raise NotFoundError(
+                f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} had not found: "
+                f"{', '.join(missing)}. Are they running, in the same ROS_DOMAIN_ID "
+                f"({os.environ.get('ROS_DOMAIN_ID', '0')}) and within ROS_AUTOMATIC_DISCOVERY_RANGE "
+                f"({os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')})?"
+            )
+        if not rclpy.ok():
+            raise ExternalShutdownException
+        time.sleep(GATE_POLL)
+
+
+def complain(text: str) -> None:
+    """One line on stderr."""
+    print(f"error: {text}", file=sys.stderr, flush=True)

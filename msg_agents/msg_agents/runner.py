@@ -1,0 +1,216 @@
+"""A whole run: processes, bag, verdict, report."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from msg_agents.domain import free_domain
+from msg_agents.network import count_processes, plan_network
+from msg_agents.supervisor import Supervisor
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.salvage import salvage_in_place
+from msg_analysis.bags.writer import RECORDING_MARKER
+from msg_analysis.errors import BagError
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.trajectory import Trajectory
+from msg_analysis.model.twin import new_record
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.compare import Comparison
+
+POLL = 0.05  # s
+REPORT_FILE, RESULT_FILE = "report.html", "result.json"
+
+
+@dataclass(slots=True)
+class RunResult:
+    """What a run left behind.
+
+    Attributes
+    ----------
+    bag : directory; None if nothing was recorded
+    failures : what went wrong, one line each
+    interrupted : whether the user ended the run
+    wall_time : s from the first state to the last one
+    rate : steps per second of wall time
+    trajectory, comparison : of the bag, if it could be read
+    """
+
+    bag: Path | None
+    failures: list[str] = field(default_factory=list)
+    interrupted: bool = False
+    wall_time: float = 0.0
+    rate: float = 0.0
+    trajectory: Trajectory | None = None
+    comparison: Comparison | None = None
+
+
+def node_environment(domain: int) -> dict[str, str]:
+    """Environment of the processes of a run on this machine, where the user has not said otherwise.
+
+    Parameters
+    ----------
+    domain : ROS_DOMAIN_ID
+    """
+    defaults = {
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        # As fast as shared memory for messages of this size, and a killed process leaves no segment in /dev/shm.
+        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
+        # The arithmetic of one agent is far too small for threads, which would only fight for the cores.
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+    return {**defaults, **os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+
+
+def bag_directory(experiment: Experiment, out: Path) -> Path:
+    """A directory for a new bag, <out>/<name>_<time>, that does not exist yet."""
+    stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
+    candidate, number = out / stem, 2
+    while candidate.exists():
+        candidate, number = out / f"{stem}_{number}", number + 1
+    return candidate
+
+
+def run_network(
+    experiment: Experiment,
+    out: Path | None,
+    *,
+    domain: int | None = None,
+    on_progress: Callable[[int], None] = lambda _: None,
+    environment: Mapping[str, str] | None = None,
+) -> RunResult:
+    """Run an experiment as a network of ROS 2 processes.
+
+    Parameters
+    ----------
+    experiment : what to run
+    out : directory in which a new bag is made; None: do not record
+    domain : ROS_DOMAIN_ID; a free one is chosen if not given
+    on_progress : called a few times a second with the step that every agent has reached
+    environment : changes to the environment of the processes
+
+    Returns
+    -------
+    The result, without comparison. ``failures`` is empty if every process did its part.
+
+    Raises
+    ------
+    NotAvailableError, InputError : the experiment cannot be run; nothing was started or written
+    """
+    experiment.require_available()
+    count_processes(experiment)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    bag = bag_directory(experiment, out.absolute()) if out is not None else None
+    result = RunResult(bag)
+    workshop = Path(tempfile.mkdtemp(prefix="msg_agents_"))
+    try:
+        run_file = workshop / "run.json"
+        run_file.write_text(new_record(experiment).to_json(), encoding="utf-8")
+        with (
+            free_domain() if domain is None else nullcontext(domain) as chosen,
+            _interruptible() as interrupted,
+        ):
+            supervisor = Supervisor(workshop, node_environment(chosen) | dict(environment or {}))
+            with supervisor:
+                supervisor.start(plan_network(experiment, run_file, bag))
+                _watch(supervisor, experiment.steps, result, interrupted, on_progress)
+            _collect_failures(supervisor, result, interrupted)
+        if bag is not None:
+            _settle(bag, result)
+            if bag.exists():
+                shutil.copytree(workshop, bag / "log")
+    finally:
+        shutil.rmtree(workshop, ignore_errors=True)
+    return result
+
+
+def _watch(
+    supervisor: Supervisor,
+    steps: int,
+    result: RunResult,
+    interrupted: list[int],
+    on_progress: Callable[[int], None],
+) -> None:
+    """Until all have done their part, one has failed, or the user has had enough."""
+    began: float | None = None
+    while supervisor.running and not supervisor.failures and not interrupted:
+        time.sleep(POLL)
+        supervisor.read_status()
+        reached = min(supervisor.steps, default=-1)
+        if reached < 0:
+            continue
+        now = time.monotonic()
+        began = began or now
+        if reached < steps or not result.wall_time:
+            result.wall_time = now - began
+        on_progress(reached)
+    if result.wall_time:
+        result.rate = min(supervisor.steps, default=0) / result.wall_time
+
+
+def _collect_failures(supervisor: Supervisor, result: RunResult, interrupted: list[int]) -> None:
+    if interrupted:
+        result.interrupted = True
+        result.failures.append(f"ended by {signal.Signals(interrupted[0]).name}")
+    for child in supervisor.failures:
+        words = child.last_words()
+        result.failures.append(f"{child.plan.name}: {child.failure}" + (f": {words}" if words else ""))
+
+
+def _settle(bag: Path, result: RunResult) -> None:
+    """Make the bag whole if its recorder could not, read it, and tell how far everybody came."""
+    try:
+        if (bag / RECORDING_MARKER).exists():
+            report = salvage_in_place(bag)
+            result.failures.append(f"the bag was salvaged: {report.kept_messages} messages kept")
+        result.trajectory = read_bag(bag)
+    except BagError as error:
+        result.failures.append(str(error))
+        return
+    if result.failures:
+        last = [
+            int(steps[-1]) if (steps := present.nonzero()[0]).size else -1
+            for present in result.trajectory.present.T
+        ]
+        result.failures.append(
+            "last recorded step: "
+            + ", ".join(f"agent {i + 1}: {k if k >= 0 else 'none'}" for i, k in enumerate(last))
+        )
+
+
+@contextmanager
+def _interruptible() -> Iterator[list[int]]:
+    """Collects SIGINT and SIGTERM instead of dying of them, so that the run can be ended in order."""
+    received: list[int] = []
+    previous = {
+        number: signal.signal(number, lambda signum, _: received.append(signum))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def conclude(result: RunResult) -> None:
+    """Compare the bag of a run with its prediction; write report.html and result.json beside it."""
+    from msg_analysis.inference.compare import compare
+    from msg_analysis.report.html import write_report
+
+    if result.trajectory is None or result.bag is None:
+        return
+    result.comparison = compare(result.trajectory)
+    write_report(result.comparison, result.trajectory, result.bag / REPORT_FILE)

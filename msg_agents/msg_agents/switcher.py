@@ -1,0 +1,108 @@
+"""The switcher node: publishes the experiment and the path of the active graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
+from msg_agents_interfaces.msg import Progress as ProgressMsg
+from std_msgs.msg import String
+
+from msg_agents.node import EXPERIMENT_TOPIC, GRAPH_TOPIC, PROGRESS_TOPIC, NetworkNode, agent_name
+from msg_agents.qos import LOSSLESS
+from msg_analysis.bags.cdr import ActiveGraph, CdrError, Progress, StepClock, encode_string
+from msg_analysis.model.path import Sojourn, sojourns
+from msg_analysis.model.record import RunRecord
+from msg_analysis.model.step import StepModel
+
+AHEAD = 1000
+"""Sojourns that are published before the slowest agent reaches them. Enough never to be waited for; bounded, so that a
+long run keeps little in memory, and below the 5,000 messages that a late reader is given."""
+
+
+class Switcher(NetworkNode):
+    """Draws the exact path of the chain and keeps a bounded number of sojourns ahead of the agents.
+
+    Parameters
+    ----------
+    record : of the run
+    model : its step model
+    readers : names of the nodes, besides the agents, that must read the graph before the run starts
+    on_progress : called with the newest step of every agent (-1: none yet) whenever one of them reports
+    """
+
+    def __init__(
+        self,
+        *,
+        record: RunRecord,
+        model: StepModel,
+        readers: list[str],
+        on_progress: Callable[[Sequence[int]], None] = lambda _: None,
+    ) -> None:
+        super().__init__("switcher", record=record)
+        self._graphs = record.experiment.graph_list
+        self._clock = StepClock(record.experiment.step_length)
+        self._path = sojourns(record.experiment, model.initial)
+        self._steps = record.experiment.steps
+        self._reached = [-1] * model.agents
+        self._on_progress = on_progress
+        self._ahead: list[
+            int
+        ] = []  # first steps of the published sojourns that the slowest agent has not reached
+        self._expected = [agent_name(i) for i in range(model.agents)] + readers
+        self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LOSSLESS)
+        self._graph = self.create_publisher(ActiveGraphMsg, GRAPH_TOPIC, LOSSLESS)
+        self.create_subscription(ProgressMsg, PROGRESS_TOPIC, self._receive, LOSSLESS, raw=True)
+
+    def awaited(self) -> dict[str, list[str]]:
+        """See NetworkNode."""
+        missing = self.missing_readers(self._graph, self._expected)
+        return {self._graph.topic_name: missing} if missing else {}
+
+    def begin(self) -> None:
+        """Publish the experiment and the beginning of the path."""
+        self.publish(self._experiment, encode_string(self.record.to_json()))
+        self._keep_ahead()
+
+    def finish(self, *, complete: bool) -> None:
+        """See NetworkNode."""
+        if complete:
+            self.wait_until_read(self._experiment, self._graph)
+
+    def _receive(self, data: bytes) -> None:
+        try:
+            progress = Progress.decode(data)
+        except CdrError as error:
+            self.refuse(str(error), PROGRESS_TOPIC)
+            return
+        if progress.run != self.run or not 1 <= progress.agent <= len(self._reached):
+            self.refuse("of another run or agent", PROGRESS_TOPIC)
+            return
+        self._reached[progress.agent - 1] = max(progress.step, self._reached[progress.agent - 1])
+        self._on_progress(self._reached)
+        self._keep_ahead()
+        if min(self._reached) >= self._steps and not self.done.done():
+            self.done.set_result(None)
+
+    def _keep_ahead(self) -> None:
+        slowest = min(self._reached)
+        self._ahead = [first for first in self._ahead if first > slowest]
+        while len(self._ahead) < AHEAD:
+            sojourn = next(self._path, None)
+            if sojourn is None:
+                return
+            self.publish(self._graph, self._message(sojourn).encode())
+            self._ahead.append(sojourn.first_step)
+
+    def _message(self, sojourn: Sojourn) -> ActiveGraph:
+        graph = self._graphs[sojourn.mode]
+        return ActiveGraph(
+            stamp=self._clock.nanoseconds(sojourn.first_step),
+            run=self.run,
+            sequence=sojourn.sequence,
+            mode=sojourn.mode + 1,
+            name=graph.name,
+            first_step=sojourn.first_step,
+            last_step=sojourn.last_step,
+            arcs=graph.arcs,
+        )

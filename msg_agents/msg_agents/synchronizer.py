@@ -1,0 +1,168 @@
+"""When may an agent make its next step? The distributed lockstep, without ROS and without arithmetic.
+
+Agent i makes step k (from x(k) to x(k+1)) when it knows the graph g(k), has x_j(k) from every j that row i of W_g(k)
+uses, and nobody whom it can ever exchange states with is more than ``window`` steps behind it. There is no barrier
+and no master. The last rule bounds every buffer even while the graph is disconnected, and it cannot deadlock: whoever
+is furthest behind is ahead of nobody, and all that it waits for has been published.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+Value = TypeVar("Value")
+
+WINDOW = 64
+"""Steps that an agent may be ahead of a peer. Small enough for a burst to fit a socket's receive buffer."""
+
+
+class Refusal:
+    """Why something offered was not taken."""
+
+    STRANGER = "not a peer"
+    OLD = "a step already done or already here"
+    FAR = "a step that a peer cannot have reached"
+    SEQUENCE = "a sojourn out of sequence"
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Steps up to the last one use this mode."""
+
+    mode: int
+    last: int
+
+
+class Synchronizer(Generic[Value]):
+    """The lockstep of one agent. Steps count from 0; x(0) is the start, the run ends at x(steps).
+
+    Parameters
+    ----------
+    agent : index of the agent
+    steps : N, steps of the run
+    inputs : for each mode, the other agents whose states the agent's row uses, ascending
+    peers : every other agent that the agent ever hears or is heard by (of which ``inputs`` are some)
+    window : steps that the agent may be ahead of a peer, >= 0
+    """
+
+    def __init__(
+        self,
+        *,
+        agent: int,
+        steps: int,
+        inputs: Sequence[Sequence[int]],
+        peers: Collection[int],
+        window: int = WINDOW,
+    ) -> None:
+        self.agent = agent
+        self.step = 0
+        self.steps = steps
+        self._inputs = [tuple(row) for row in inputs]
+        self._window = window
+        self._buffers: dict[int, dict[int, Value]] = {j: {} for j in sorted(peers)}
+        self._newest = dict.fromkeys(self._buffers, -1)
+        self._limit = window - 1 if peers else steps
+        self._known: deque[_Known] = deque()
+        self._sequence = 0
+        self._unplanned = 0  # first step whose graph is not known
+        missing = {j for row in inputs for j in row} - self._buffers.keys()
+        if missing:
+            raise ValueError(
+                f"agent {agent} uses {sorted(missing)}, who are not among its peers {sorted(peers)}"
+            )
+
+    def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
+        """Take note of a sojourn of the graph.
+
+        Returns
+        -------
+        None if taken, else the reason (a ``Refusal``). Sojourns must come in sequence, each where the last one ended.
+        """
+        if sequence != self._sequence or first_step != self._unplanned or last_step < first_step:
+            return Refusal.SEQUENCE
+        self._sequence += 1
+        self._unplanned = last_step + 1
+        self._known.append(_Known(mode, last_step))
+        return None
+
+    def offer(self, agent: int, step: int, value: Value) -> str | None:
+        """Take x_agent(step).
+
+        Returns
+        -------
+        None if taken, else the reason (a ``Refusal``).
+        """
+        buffer = self._buffers.get(agent)
+        if buffer is None:
+            return Refusal.STRANGER
+        if step < self.step or step in buffer:
+            # A peer that is behind is heard of here too: its value is of no use, its progress is.
+            if step <= self._newest[agent]:
+                return Refusal.OLD
+            self._newest[agent] = step
+            return None
+        if step > self.step + self._window + 1:
+            return Refusal.FAR
+        buffer[step] = value
+        if step > self._newest[agent]:
+            self._newest[agent] = step
+        return None
+
+    def ready(self) -> bool:
+        """Whether the next step can be made now."""
+        step = self.step
+        if step >= self.steps or not self._known:
+            return False
+        if step > self._limit:
+            self._limit = min(self._newest.values()) + self._window
+            if step > self._limit:
+                return False
+        buffers = self._buffers
+        return all(step in buffers[j] for j in self._inputs[self._known[0].mode])
+
+    def take(self) -> tuple[int, Mapping[int, Value]]:
+        """Make the step that is ready: move on to x(step + 1).
+
+        Returns
+        -------
+        mode and the states x_j(step) of the agents that the row of this mode uses, and of nobody else
+        """
+        step = self.step
+        known = self._known[0]
+        inputs = self._inputs[known.mode]
+        taken = {j: self._buffers[j].pop(step) for j in inputs}
+        if len(inputs) < len(self._buffers):  # what was sent by agents that this graph does not connect
+            for buffer in self._buffers.values():
+                buffer.pop(step, None)
+        self.step = step + 1
+        if known.last <= step:
+            self._known.popleft()
+        return known.mode, taken
+
+    @property
+    def finished(self) -> bool:
+        """Whether x(steps) has been reached."""
+        return self.step >= self.steps
+
+    def waiting_for(self) -> str:
+        """What keeps the agent from its next step, for people (agents from 1)."""
+        if self.finished:
+            return "nothing, it has finished"
+        if not self._known:
+            return f"the graph of step {self.step}"
+        inputs = self._inputs[self._known[0].mode]
+        missing = [j for j in inputs if self.step not in self._buffers[j]]
+        if missing:
+            return f"step {self.step} of " + ", ".join(f"agent {j + 1}" for j in missing)
+        behind = [j for j, newest in self._newest.items() if newest + self._window < self.step]
+        if behind:
+            return "agents too far behind: " + ", ".join(f"{j + 1}" for j in behind)
+        return "nothing"
+
+    @property
+    def buffered(self) -> int:
+        """Most values held of any one peer; never more than window + 2."""
+        return max((len(buffer) for buffer in self._buffers.values()), default=0)

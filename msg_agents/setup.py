@@ -1,0 +1,24 @@
+from setuptools import find_packages, setup
+
+PACKAGE = "msg_agents"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    description="Networks of agents under Markov-switching graphs, as ROS 2 nodes",
+    license="Apache-2.0",
+    author="The msg_agents authors",
+    maintainer="The msg_agents authors",
+    maintainer_email="maintainers@msg-agents.example.org",
+    python_requires=">=3.11",
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    zip_safe=False,
+    # rclpy, std_msgs and the interfaces come with ROS 2, as system packages or as wheels: see package.xml.
+    install_requires=["click", "msg_analysis", "numpy", "rich"],
+    entry_points={"console_scripts": ["msg-agents = msg_agents.cli:main"]},
+)

@@ -1,0 +1,227 @@
+"""The verdict: calibrated on twins that follow their law, powerful against twins that do not."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from msg_analysis.inference.compare import compare
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.record import RunRecord
+from msg_analysis.model.trajectory import Completeness
+from msg_analysis.model.twin import simulate
+from msg_analysis.theory.prediction import predict
+
+GOLDEN = Path(__file__).parents[2] / "data" / "golden"
+SEEDS = range(100, 160)
+
+
+def golden(name, **run):
+    return Experiment.load(GOLDEN / f"{name}.yaml").with_run(**run)
+
+
+def changed(experiment, **changes):
+    return Experiment.parse(experiment.to_document() | changes)
+
+
+def claimed(trajectory, experiment):
+    """The same data, recorded as a run of another experiment."""
+    record = RunRecord(trajectory.record.run, experiment, trajectory.record.start)
+    return dataclasses.replace(trajectory, record=record)
+
+
+def cut(trajectory, step):
+    """The same run with x(step..) and g(step..) lost."""
+    states, modes = trajectory.states.copy(), trajectory.modes.copy()
+    states[step:], modes[step:] = np.nan, -1
+    missing = int(np.isnan(states).any(axis=2).sum())
+    completeness = Completeness(
+        states[:, :, 0].size, states[:, :, 0].size - missing, missing, missing_modes=int((modes < 0).sum())
+    )
+    return dataclasses.replace(trajectory, states=states, modes=modes, completeness=completeness)
+
+
+def p_values(comparison):
+    return {test.name: test.p for test in comparison.tests}
+
+
+@pytest.fixture(scope="module")
+def short_run():
+    return simulate(golden("line_ring", duration=25, replicas=2))
+
+
+CASES = {
+    "line_ring": {"duration": 60, "replicas": 4},
+    "tracking": {"duration": 60, "replicas": 4},
+    "discrete": {"duration": 400, "replicas": 4},
+    "zero start": {"duration": 60, "replicas": 4, "start": "zero"},
+    "far start": {"duration": 30, "replicas": 4, "start": [3.0, 0.0, 0.0, 1.0, -2.0]},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_calibration(case):
+    """p-values of 60 true runs are uniform, intervals cover, verdicts agree.
+
+    Kolmogorov-Smirnov at 2e-4 for each of at most 11 tests, coverage and verdicts at 1e-4 by the binomial law:
+    a right program fails a case with probability below 0.3 %.
+    """
+    experiment = golden(case if case in ("tracking", "discrete") else "line_ring", **CASES[case])
+    results = [compare(simulate(experiment.with_run(seed=seed))) for seed in SEEDS]
+    collected = [p_values(result) for result in results]
+    for name in collected[0]:
+        assert stats.kstest([p[name] for p in collected], "uniform").pvalue > 2e-4, name
+    covered = sum(
+        r.system_error.interval[0] <= r.system_error.predicted <= r.system_error.interval[1] for r in results
+    )
+    assert covered >= stats.binom.ppf(1e-4, len(results), 0.95)
+    false_alarms = sum(result.verdict == "disagrees" for result in results)
+    assert false_alarms <= stats.binom.isf(1e-4, len(results), 0.01)
+
+
+def test_standard_errors_hold_when_the_graph_hardly_ever_switches():
+    """Rate 0.01 over 200 time units: two switches a run. 95 % intervals of 60 runs, binomial at 1e-4."""
+    slow = changed(
+        golden("line_ring", duration=200, replicas=2, dt=0.2),
+        switching={"generator": [[-0.01, 0.01], [0.01, -0.01]]},
+    )
+    z = np.array([compare(simulate(slow.with_run(seed=seed))).system_error.z for seed in SEEDS])
+    assert (np.abs(z) < 1.96).sum() >= stats.binom.ppf(1e-4, len(z), 0.95)
+    assert 0.6 < z.std() < 1.35
+
+
+@pytest.mark.parametrize(
+    ("truth", "found_by"),
+    [
+        ({"noise": {"process": 1.05}}, "innovations: covariance"),
+        ({"noise": {"process": [1.0, 1.0, 1.15, 1.0, 1.0]}}, "innovations: covariance"),
+        (
+            {
+                "graphs": {
+                    "line": {"path": [1, 2, 3, 4, 5]},
+                    "ring": {"edges": [[i, i % 5 + 1, 0.85] for i in range(1, 6)]},
+                }
+            },
+            "innovations: gains",
+        ),
+        ({"switching": {"generator": [[-1.0, 1.0], [1.0, -1.0]]}}, "switching"),
+    ],
+)
+def test_power_in_consensus(truth, found_by):
+    """Runs of a wrong law, 200 time units: rejected, and by the test that should."""
+    experiment = golden("line_ring", duration=200, replicas=8)
+    result = compare(claimed(simulate(changed(experiment, **truth)), experiment))
+    assert result.verdict == "disagrees"
+    assert result.exit_code == 1
+    assert min(result.tests, key=lambda test: test.p).name == found_by
+
+
+def test_power_against_a_wrong_reference():
+    experiment = golden("tracking", replicas=8)
+    leaders = experiment.to_document()["leaders"] | {"reference": 2.3}
+    result = compare(claimed(simulate(changed(experiment, leaders=leaders)), experiment))
+    assert result.verdict == "disagrees"
+    assert p_values(result)["innovations: gains"] < 1e-4
+
+
+def test_power_of_the_time_means():
+    """Twice the noise shows in every error, and in their joint covariance."""
+    experiment = golden("line_ring", duration=100, replicas=8)
+    result = compare(claimed(simulate(changed(experiment, noise={"process": 1.4})), experiment))
+    assert result.system_error.z > 5
+    assert all(node.p_holm < 0.01 for node in result.node_errors)
+    assert result.covariance.p < 1e-6
+
+
+def test_document(short_run):
+    result = compare(short_run)
+    document = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    assert document["verdict"] == "agrees"
+    assert result.exit_code == 0
+    assert document["completeness"]["missing"] == 0
+    assert document["steps"] == 500
+    assert document["simulated_time"] == pytest.approx(25.0)
+    assert document["seed"] == 7
+    assert document["run"] == str(short_run.record.run)
+    error = document["system_error"]
+    assert error["predicted"] == pytest.approx(predict(short_run.record.experiment).emulated.system_error)
+    assert error["z"] == pytest.approx((error["measured"] - error["predicted"]) / error["standard_error"])
+    assert error["interval"][1] - error["measured"] == pytest.approx(1.959964 * error["standard_error"])
+    nodes = document["node_errors"]
+    assert sum(node["measured"] for node in nodes) == pytest.approx(error["measured"])
+    assert all(node["p_holm"] >= node["p"] for node in nodes)
+    y = short_run.states[:-1] - short_run.states[:-1].mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(
+        document["covariance"]["measured"], np.einsum("kir,kjr->ij", y, y) / (500 * 2), atol=1e-12
+    )
+    assert document["covariance"]["dof"] == 10
+    assert np.sum(document["switching"]["counts"]) == 499
+    assert document["continuous"]["system_error"] == pytest.approx(1.3594132029339856, rel=1e-8)
+    assert len(document["batch_means"]["interval"]) == 2
+    assert [test["rejected"] for test in document["tests"]] == [False] * 11
+
+
+def test_running_mean_ends_at_the_estimate(short_run):
+    result = compare(short_run)
+    running = result.running
+    assert len(running["time"]) == len(running["system_error"]) == len(running["standard_error"]) <= 400
+    assert running["time"][-1] == pytest.approx(25.0)
+    assert running["system_error"][-1] == pytest.approx(result.system_error.measured)
+    assert running["standard_error"][-1] == pytest.approx(result.system_error.standard_error)
+
+
+def test_incomplete_data_get_numbers_of_the_beginning_but_no_verdict(short_run):
+    result = compare(cut(short_run, 301))
+    assert result.verdict == "incomplete"
+    assert result.exit_code == 3
+    assert result.steps == 300
+    y = short_run.states[:300] - short_run.states[:300].mean(axis=1, keepdims=True)
+    assert result.system_error.measured == pytest.approx((y**2).mean(axis=(0, 2)).sum())
+
+
+@pytest.mark.parametrize("step", [0, 1, 60])
+def test_too_little_data_get_no_numbers(short_run, step):
+    result = compare(cut(short_run, step))
+    document = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    assert result.exit_code == 3
+    assert document["system_error"]["measured"] is None
+    assert document["system_error"]["interval"] == [None, None]
+    assert document["system_error"]["predicted"] > 0
+    assert document["innovations"] == {"p_covariance": None, "p_whiteness": None, "p_gain": None}
+    assert document["switching"] == {"counts": None, "expected": None, "p": None}
+    assert document["batch_means"]["interval"] == [None, None]
+    assert document["tests"] == []
+
+
+def test_without_noise_there_is_nothing_to_reject():
+    quiet = changed(golden("line_ring", duration=10), noise={"process": 0.0})
+    result = compare(simulate(quiet))
+    assert result.verdict == "agrees"
+    assert result.system_error.z is None
+    assert set(p_values(result)) == {"switching"}
+    json.dumps(result.to_json(), allow_nan=False)
+
+
+def test_one_graph_leaves_switching_out():
+    one = changed(
+        golden("line_ring", duration=20),
+        graphs={"ring": {"cycle": [1, 2, 3, 4, 5]}},
+        switching={"generator": [[0.0]]},
+    )
+    result = compare(simulate(one))
+    assert result.verdict == "agrees"
+    assert "switching" not in p_values(result)
+
+
+def test_agents_that_are_where_no_noise_could_have_put_them():
+    leaders = {"agents": [1], "gain": "inf", "reference": 2.0}
+    experiment = changed(golden("tracking", duration=20), leaders=leaders)
+    trajectory = simulate(experiment)
+    assert compare(trajectory).verdict == "agrees"
+    trajectory.states[100, 0] += 0.5
+    result = compare(trajectory)
+    assert result.verdict == "disagrees"
+    assert result.innovations.p_covariance == 0.0

@@ -1,0 +1,358 @@
+"""The experiment file: what valid files mean, and that they survive being written and read again."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import networkx as nx
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from msg_analysis.errors import InputError, NotAvailableError
+from msg_analysis.model.experiment import Experiment, ExperimentError, json_schema
+from msg_analysis.model.spec import ExperimentSpec
+from msg_analysis.types import FloatArray
+
+ROOT = Path(__file__).parents[3]
+EXPERIMENTS = ROOT / "ros_ws/src/msg_agents_bringup/experiments"
+
+SMALL: dict[str, Any] = {"name": "small", "graphs": {"line": {"path": [1, 2, 3]}}}
+
+
+def small(**changes: Any) -> Experiment:
+    return Experiment.parse(SMALL | changes)
+
+
+def adjacency_of(graph: dict[str, Any], agents: int) -> FloatArray:
+    """Adjacency of a consensus graph that is completed by a line, so that any graph is accepted."""
+    line = {"path": list(range(1, agents + 1))}
+    switching = {"generator": [[-1, 1], [1, -1]]}
+    experiment = small(graphs={"graph": graph, "line": line}, switching=switching, agents=agents)
+    return experiment.graph_list[0].adjacency
+
+
+def oracle(graph: Any, agents: int) -> FloatArray:
+    return np.asarray(nx.to_numpy_array(graph, nodelist=range(1, agents + 1)))
+
+
+def test_defaults_of_a_minimal_file() -> None:
+    experiment = small()
+    assert experiment.to_document() == {
+        "name": "small",
+        "problem": "consensus",
+        "time": "continuous",
+        "agents": 3,
+        "graphs": {"line": {"path": [1, 2, 3]}},
+        "switching": {"scale": 1.0, "initial": "stationary"},
+        "noise": {"process": 1.0, "broadcast": 0.0, "link": 0.0, "loss": 0.0},
+        "run": {
+            "dt": 0.05,
+            "duration": 100.0,
+            "replicas": 1,
+            "seed": 0,
+            "start": "stationary",
+            "pace": "lockstep",
+            "speed": 1.0,
+            "processes": "auto",
+        },
+    }
+    assert experiment.steps == 2000
+    assert experiment.reference == 0.0
+    assert experiment.chain.matrix.tolist() == [[0.0]]
+    assert not experiment.leader_gains.any()
+
+
+def test_shipped_experiments_are_valid_and_say_what_the_golden_files_say() -> None:
+    for name in ("line_ring", "tracking", "discrete"):
+        shipped = Experiment.load(EXPERIMENTS / f"{name}.yaml")
+        assert shipped == Experiment.load(ROOT / f"tests/data/golden/{name}.yaml")
+
+
+@pytest.mark.parametrize(
+    ("graph", "expected"),
+    [
+        ({"path": [3, 1, 2]}, nx.Graph([(3, 1), (1, 2)])),
+        ({"cycle": [1, 3, 5, 2, 4]}, nx.Graph([(1, 3), (3, 5), (5, 2), (2, 4), (4, 1)])),
+        ({"star": {"center": 4}}, nx.Graph([(4, i) for i in (1, 2, 3, 5, 6)])),
+        ({"complete": True}, nx.relabel_nodes(nx.complete_graph(6), lambda i: i + 1)),
+        ({"grid": [2, 3]}, nx.convert_node_labels_to_integers(nx.grid_2d_graph(2, 3), 1, "sorted")),
+        ({"edges": [[1, 2], [5, 2]]}, nx.Graph([(1, 2), (2, 5)])),
+        ({"edges": []}, nx.Graph()),
+    ],
+)
+def test_graphs_against_networkx(graph: dict[str, Any], expected: Any) -> None:
+    expected.add_nodes_from(range(1, 7))
+    assert np.array_equal(adjacency_of(graph, 6), oracle(expected, 6))
+
+
+def test_weights_and_directions() -> None:
+    weighted = adjacency_of({"edges": [[1, 2, 2.5]]}, 3)
+    assert weighted[0, 1] == weighted[1, 0] == 2.5
+    directed = adjacency_of({"arcs": [[1, 2, 0.5]]}, 3)
+    assert directed[1, 0] == 0.5  # 2 listens to 1
+    assert np.count_nonzero(directed) == 1
+
+
+@pytest.mark.parametrize("directed", [False, True])
+def test_graphml_is_read_and_becomes_part_of_the_document(tmp_path: Path, directed: bool) -> None:
+    graph = nx.DiGraph() if directed else nx.Graph()
+    graph.add_weighted_edges_from([(2, 1, 0.5), (1, 3, 2.0), (3, 2, 1.0)])
+    nx.write_graphml(graph, tmp_path / "net.graphml")
+    (tmp_path / "file.yaml").write_text("name: net\ngraphs: {net: {graphml: net.graphml}}\n")
+    experiment = Experiment.load(tmp_path / "file.yaml")
+    expected = oracle(graph, 3)
+    assert np.array_equal(experiment.graph_list[0].adjacency, expected.T if directed else expected)
+    (tmp_path / "net.graphml").unlink()
+    assert Experiment.parse(experiment.to_document()) == experiment
+
+
+def test_graphml_nodes_with_other_names_are_numbered_in_file_order(tmp_path: Path) -> None:
+    graph = nx.Graph([("carol", "alice"), ("alice", "bob")])
+    nx.write_graphml(graph, tmp_path / "net.graphml")
+    experiment = Experiment.parse(SMALL | {"graphs": {"net": {"graphml": "net.graphml"}}}, directory=tmp_path)
+    assert np.array_equal(experiment.graph_list[0].adjacency, nx.to_numpy_array(graph))
+
+
+@pytest.mark.parametrize(
+    ("process", "expected"),
+    [
+        (2, 2.0 * np.eye(3)),
+        ([1, 0.5, 0], np.diag([1, 0.5, 0])),
+        ([[1, -2, 3], [0, 1, 0], [0, 0, 1]], np.array([[1, -2, 3], [0, 1, 0], [0, 0, 1]])),
+    ],
+)
+def test_noise_gain(process: Any, expected: FloatArray) -> None:
+    assert np.array_equal(small(noise={"process": process}).noise_gain, expected)
+
+
+def test_leaders() -> None:
+    leaders = {"agents": [3, 1], "gain": 2, "reference": -1.5}
+    experiment = small(problem="tracking", leaders=leaders)
+    assert experiment.leader_gains.tolist() == [2.0, 0.0, 2.0]
+    assert experiment.reference == -1.5
+
+
+@pytest.mark.parametrize("gain", ["inf", math.inf])
+def test_infinite_gain_survives_json(gain: Any) -> None:
+    experiment = small(problem="tracking", leaders={"agents": [2], "gain": gain})
+    text = json.dumps(experiment.to_document(), allow_nan=False)
+    assert json.loads(text)["leaders"]["gain"] == "inf"
+    assert Experiment.parse(json.loads(text)) == experiment
+    assert experiment.leader_gains.tolist() == [0.0, math.inf, 0.0]
+
+
+def test_rates_are_the_generator() -> None:
+    graphs = {"a": {"path": [1, 2, 3]}, "b": {"cycle": [1, 2, 3]}, "c": {"star": {"center": 1}}}
+    rates = {"a": {"b": 1.0}, "b": {"c": 2.0, "a": 4}, "c": {"a": 3.0}}
+    by_name = small(graphs=graphs, switching={"rates": rates, "scale": 0.5})
+    generator = [[-0.5, 0.5, 0.0], [2.0, -3.0, 1.0], [1.5, 0.0, -1.5]]
+    assert by_name.chain.matrix.tolist() == generator
+    by_matrix = small(graphs=graphs, switching={"generator": generator})
+    assert by_matrix.chain.matrix.tolist() == generator
+
+
+def test_rows_within_the_tolerance_are_made_exact() -> None:
+    third = 0.333333333333
+    graphs = {name: {"path": [1, 2, 3]} for name in "abc"}
+    experiment = small(
+        graphs=graphs, time="discrete", switching={"transition": [[third, third, 1 - 2 * third]] * 3}
+    )
+    assert experiment.chain.matrix.sum(axis=1) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_dt_is_one_in_discrete_time() -> None:
+    experiment = small(time="discrete", run={"duration": 7})
+    assert experiment.step_length == 1.0
+    assert experiment.steps == 7
+
+
+@pytest.mark.parametrize(
+    ("dt", "duration", "steps"), [(0.1, 0.3, 3), (0.05, 400, 8000), (0.3, 0.9, 3), (0.25, 0.25, 1)]
+)
+def test_steps_are_whole_whatever_the_rounding(dt: float, duration: float, steps: int) -> None:
+    assert small(run={"dt": dt, "duration": duration}).steps == steps
+
+
+def test_with_run_checks_again_and_leaves_the_original() -> None:
+    experiment = small()
+    changed = experiment.with_run(seed=9, duration=5)
+    assert (changed.run.seed, changed.steps, experiment.run.seed) == (9, 100, 0)
+    assert experiment.with_run() == experiment
+    with pytest.raises(ExperimentError, match=r"run\.seed: -1: expected a number >= 0"):
+        experiment.with_run(seed=-1)
+    with pytest.raises(ExperimentError, match=r"run\.sead: unknown key: .*did you mean 'seed'"):
+        experiment.with_run(sead=1)
+
+
+def test_the_order_of_the_graphs_matters() -> None:
+    a, b = ({name: {"path": [1, 2, 3]} for name in order} for order in ("ab", "ba"))
+    switching = {"generator": [[-1, 1], [1, -1]]}
+    assert small(graphs=a, switching=switching) != small(graphs=b, switching=switching)
+    assert small(graphs=a, switching=switching) == small(graphs=dict(a), switching=switching)
+
+
+def test_what_is_not_available_yet_is_listed() -> None:
+    assert small().unavailable() == []
+    small().require_available()
+    noisy = small(noise={"broadcast": 0.1, "link": 0.2, "loss": 0.3}, run={"pace": "realtime"})
+    assert [line.split(":")[0] for line in noisy.unavailable()] == [
+        "run.pace",
+        "noise.broadcast",
+        "noise.link",
+        "noise.loss",
+    ]
+    assert noisy.unavailable()[0] == "run.pace: 'realtime': not available yet: use lockstep"
+    with pytest.raises(NotAvailableError, match=r"noise\.loss: 0\.3"):
+        noisy.require_available()
+    assert len(noisy.unavailable("predict")) == 1
+    small(noise={"loss": 0.3}).require_available("predict")
+
+
+def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path: Path) -> None:
+    file = tmp_path / "file.yaml"
+    file.write_text("name: no\ngraphs: {on: {path: [1, 02, 3]}}\nrun: {dt: 1e-3, duration: 1.0e+1}\n")
+    experiment = Experiment.load(file)
+    assert experiment.name == "no"
+    assert experiment.graph_list[0].name == "on"
+    assert experiment.agents == 3
+    assert experiment.steps == 10000
+    file.write_text("name: true\ngraphs: {a: {path: [1, 2]}}\n")
+    with pytest.raises(ExperimentError, match="name: true: expected a text"):
+        Experiment.load(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("name: a\nname: b\n", "line 2, column 1: key 'name' stands twice"),
+        ("run:\n  seed: 1\n  dt: 1\n  seed: 2\n", "line 4, column 3: key 'seed' stands twice"),
+        ("name: [1\n", "line 2"),
+        ("a: &x [*x]\n", "name: missing"),
+        ("? [1, 2]\n: 3\n", "line 1"),
+        ("a: !!python/object:os.system {}\n", "line 1"),
+        ("", "experiment: null: expected keys with values"),
+        ("- 1\n", "experiment: [1]: expected keys with values"),
+        ("a: 1\n---\nb: 2\n", "single document"),
+        ("a: " + "9" * 5000, "not YAML"),
+        ("[" * 5000, "nested too deeply"),
+        ("\0", "not YAML"),
+    ],
+)
+def test_files_that_are_not_experiments(tmp_path: Path, text: str, expected: str) -> None:
+    file = tmp_path / "file.yaml"
+    file.write_text(text)
+    with pytest.raises(InputError) as caught:
+        Experiment.load(file)
+    assert str(caught.value).startswith(str(file))
+    assert expected in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nope\.yaml: no such file"):
+        Experiment.load(tmp_path / "nope.yaml")
+    with pytest.raises(InputError, match="is a directory"):
+        Experiment.load(tmp_path)
+    (tmp_path / "binary").write_bytes(b"name: \xff")
+    with pytest.raises(InputError, match="byte 6: not UTF-8"):
+        Experiment.load(tmp_path / "binary")
+
+
+def test_schema_is_up_to_date_and_describes_every_key() -> None:
+    committed = json.loads((ROOT / "docs/experiment.schema.json").read_text())
+    assert committed == json_schema(), "run: msg-analysis schema > docs/experiment.schema.json"
+    sections = [committed, *committed["$defs"].values()]
+    for section in sections:
+        assert section["description"]
+        for key, entry in section["properties"].items():
+            assert "description" in entry or "$ref" in entry or "anyOf" in entry, key
+    assert set(committed["properties"]) == set(ExperimentSpec.model_fields)
+
+
+def switchings(modes: int, discrete: bool) -> st.SearchStrategy[dict[str, Any]]:
+    rate = st.floats(0.01, 100)
+    rows = st.lists(st.lists(rate, min_size=modes, max_size=modes), min_size=modes, max_size=modes)
+
+    def switching(rates: list[list[float]]) -> dict[str, Any]:
+        matrix = np.array(rates)
+        if discrete:
+            return {"transition": (matrix / matrix.sum(axis=1, keepdims=True)).tolist()}
+        np.fill_diagonal(matrix, 0)
+        return {"generator": (matrix - np.diag(matrix.sum(axis=1))).tolist()}
+
+    return rows.map(switching)
+
+
+@st.composite
+def documents(draw: st.DrawFn) -> dict[str, Any]:
+    """Valid documents: a line connects everybody, the others are arbitrary."""
+    m = draw(st.integers(2, 6))
+    pairs = [(i, j) for i in range(1, m + 1) for j in range(1, i)]
+    links = st.lists(st.sampled_from(pairs), unique=True).flatmap(
+        lambda chosen: st.tuples(*[st.tuples(st.just(i), st.just(j), st.floats(0.1, 3)) for i, j in chosen])
+    )
+    kinds: list[st.SearchStrategy[dict[str, Any]]] = [
+        st.fixed_dictionaries({"edges": links.map(lambda some: [list(link) for link in some])}),
+        st.fixed_dictionaries({"arcs": links.map(lambda some: [list(link) for link in some])}),
+        st.fixed_dictionaries({"star": st.fixed_dictionaries({"center": st.integers(1, m)})}),
+        st.just({"complete": True}),
+        st.just({"grid": [1, m]}),
+    ]
+    others = draw(st.lists(st.one_of(kinds), max_size=3))
+    graphs = {"line": {"path": list(range(1, m + 1))}} | {
+        f"graph {i}": graph for i, graph in enumerate(others)
+    }
+    discrete = draw(st.booleans())
+    number = st.floats(0, 1e3)
+    document: dict[str, Any] = {
+        "name": draw(st.from_regex(r"[a-z][a-z0-9_]*", fullmatch=True)),
+        "time": "discrete" if discrete else "continuous",
+        "graphs": graphs,
+        "switching": draw(switchings(len(graphs), discrete))
+        | {"initial": draw(st.sampled_from(["stationary", *graphs]))},
+        "noise": {
+            "process": draw(st.one_of(number, st.lists(number, min_size=m, max_size=m))),
+            "broadcast": draw(number),
+            "loss": draw(st.floats(0, 0.99)),
+        },
+        "run": {
+            "duration": draw(st.integers(1, 1000)),
+            "seed": draw(st.integers(0, 2**64)),
+            "replicas": draw(st.integers(1, 5)),
+            "start": draw(st.one_of(st.just("zero"), st.lists(st.floats(-1e9, 1e9), min_size=m, max_size=m))),
+            "processes": draw(st.one_of(st.just("one_per_agent"), st.integers(1, 8))),
+        }
+        | ({} if discrete else {"dt": 0.01}),
+    }
+    if draw(st.booleans()):
+        leaders = draw(st.lists(st.integers(1, m), min_size=1, max_size=m - 1, unique=True))
+        gain = draw(st.one_of(st.just("inf"), st.floats(0.1, 10)))
+        document |= {
+            "problem": "tracking",
+            "leaders": {"agents": leaders, "gain": gain, "reference": draw(number)},
+        }
+    return document
+
+
+@settings(max_examples=60, deadline=None)
+@given(documents())
+def test_document_survives_json_and_yaml(document: dict[str, Any]) -> None:
+    experiment = Experiment.parse(document)
+    written = experiment.to_document()
+    for again in (
+        json.loads(json.dumps(written, allow_nan=False)),
+        yaml.safe_load(yaml.safe_dump(written, sort_keys=False)),
+    ):
+        other = Experiment.parse(again)
+        assert other == experiment
+        assert other.to_document() == written
+        assert np.array_equal(other.chain.matrix, experiment.chain.matrix)
+        assert np.array_equal(other.noise_gain, experiment.noise_gain)
+        for one, two in zip(other.graph_list, experiment.graph_list, strict=True):
+            assert np.array_equal(one.adjacency, two.adjacency)
+    assert experiment != experiment.with_run(seed=experiment.run.seed + 1)
