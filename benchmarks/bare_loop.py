@@ -8,7 +8,6 @@ to an MCAP file and does nothing else. Prints steps per second of the lockstep l
 from __future__ import annotations
 
 import argparse
-import os
 import struct
 import subprocess
 import sys
@@ -18,8 +17,10 @@ from pathlib import Path
 
 import rclpy
 from mcap.writer import CompressionType, Writer
+from msg_agents.domain import free_domain
+from msg_agents.errors import RCLError
+from msg_agents.runner import node_environment
 from msg_agents_interfaces.msg import AgentState
-from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -32,17 +33,14 @@ def bare_node(name: str) -> Node:
     return Node(name, start_parameter_services=False, enable_rosout=False)
 
 
-def executor(kind: str) -> Executor:
-    return EventsExecutor() if kind == "events" else SingleThreadedExecutor()
-
-
 class Agent:
     """Publishes step k + 1 when both neighbours' step k is there."""
 
     def __init__(self, index: int, agents: int, steps: int, readers: int, payload: bytes) -> None:
         self.node = bare_node(f"agent_{index}")
         self.index, self.steps, self.readers, self.payload = index, steps, readers, payload
-        self.step, self.heard = 0, {}
+        self.step = 0
+        self.heard: dict[int, int] = {}
         self.started = 0.0
         self.publisher = self.node.create_publisher(AgentState, f"agent_{index}/state", QOS)
         self.neighbours = {(index - 1) % agents, (index + 1) % agents} - {index}
@@ -50,15 +48,16 @@ class Agent:
             self.node.create_subscription(AgentState, f"agent_{j}/state", self.receive, QOS, raw=True)
 
     def ready(self) -> bool:
-        return self.publisher.get_subscription_count() >= self.readers
+        return bool(self.publisher.get_subscription_count() >= self.readers)
 
     def publish(self) -> None:
         data = FRAME.pack(self.step, self.index) + self.payload
         while True:
             try:
-                return self.publisher.publish(data)
-            except rclpy._rclpy_pybind11.RCLError:
-                pass
+                self.publisher.publish(data)
+            except RCLError:
+                continue
+            return
 
     def receive(self, data: bytes) -> None:
         step, _ = FRAME.unpack_from(data)
@@ -75,7 +74,7 @@ def run_agents(arguments: argparse.Namespace) -> None:
     mine = range(arguments.worker, arguments.agents, arguments.processes)
     readers = min(2, arguments.agents - 1) + arguments.recorder
     agents = [Agent(i, arguments.agents, arguments.steps, readers, payload) for i in mine]
-    spin = executor(arguments.executor)
+    spin = EventsExecutor()
     for agent in agents:
         spin.add_node(agent.node)
     while not all(agent.ready() for agent in agents):
@@ -84,16 +83,12 @@ def run_agents(arguments: argparse.Namespace) -> None:
     for agent in agents:
         agent.publish()
     while any(agent.step < arguments.steps for agent in agents):
-        spin.spin_once(timeout_sec=1.0) if arguments.executor == "single" else spin_events(spin)
+        spin.spin_once(timeout_sec=1.0)
     elapsed = time.monotonic() - started
     print(f"{arguments.steps / elapsed:.1f}", flush=True)
     for agent in agents:
         agent.publisher.wait_for_all_acked()
     sys.stdin.read()  # leave when everyone is done
-
-
-def spin_events(spin: Executor) -> None:
-    spin.spin_once(timeout_sec=1.0)
 
 
 def run_recorder(arguments: argparse.Namespace) -> None:
@@ -116,7 +111,7 @@ def run_recorder(arguments: argparse.Namespace) -> None:
         for i in range(arguments.agents):
             channel = writer.register_channel(f"/agent_{i}/state", "cdr", schema)
             node.create_subscription(AgentState, f"agent_{i}/state", record(channel), QOS, raw=True)
-        spin = executor(arguments.executor)
+        spin = EventsExecutor()
         spin.add_node(node)
         while received < arguments.agents * (arguments.steps + 1):
             spin.spin_once(timeout_sec=1.0)
@@ -126,29 +121,26 @@ def run_recorder(arguments: argparse.Namespace) -> None:
 
 
 def measure(
-    agents: int, processes: int, steps: int, *, recorder: bool, kind: str, replicas: int, domain: int
+    *, agents: int = 5, processes: int = 5, steps: int = 8000, recorder: bool = False, replicas: int = 16
 ) -> float:
-    """Steps per second: N over the time that the slowest process took."""
-    environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    common = (
-        f"--agents {agents} --processes {processes} --steps {steps} --executor {kind} --replicas {replicas}"
-    )
+    """Steps per second of the slowest process, in the environment that the real network gives its processes."""
+    common = f"--agents {agents} --processes {processes} --steps {steps} --replicas {replicas}"
     roles = [f"--worker {w}" for w in range(processes)] + (["--worker -1"] if recorder else [])
     command = [sys.executable, __file__, *common.split(), *(["--recorder"] if recorder else [])]
-    children = [
-        subprocess.Popen(
-            [*command, *role.split()],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=environment,
-        )
-        for role in roles
-    ]
-    rates = [float(child.stdout.readline()) for child in children]
-    for child in children:
-        child.stdin.close()
-        child.wait(timeout=30)
+    with free_domain() as domain:
+        children = [
+            subprocess.Popen(
+                [*command, *role.split()],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                env=node_environment(domain),
+            )
+            for role in roles
+        ]
+        rates = [float(child.stdout.readline()) for child in children if child.stdout]
+        for child in children:
+            child.communicate(timeout=30)
     return min(rates[:processes])
 
 
@@ -159,15 +151,16 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8000)
     parser.add_argument("--replicas", type=int, default=16)
     parser.add_argument("--recorder", action="store_true")
-    parser.add_argument("--executor", choices=["events", "single"], default="events")
-    parser.add_argument("--domain", type=int, default=90)
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.worker is None:
         rate = measure(
-            arguments.agents, arguments.processes, arguments.steps, recorder=arguments.recorder,
-            kind=arguments.executor, replicas=arguments.replicas, domain=arguments.domain,
-        )  # fmt: skip
+            agents=arguments.agents,
+            processes=arguments.processes,
+            steps=arguments.steps,
+            recorder=arguments.recorder,
+            replicas=arguments.replicas,
+        )
         print(f"{rate:.0f} steps/s")
     elif arguments.worker < 0:
         run_recorder(arguments)

@@ -14,11 +14,14 @@ from msg_agents.qos import LOSSLESS
 from msg_agents.synchronizer import Synchronizer
 from msg_analysis.bags.cdr import ActiveGraph, CdrError, Progress, StateCodec, StateFrame, StepClock
 from msg_analysis.model.agent import AgentLaw
+from msg_analysis.model.law import all_finite
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import StepModel
+from msg_analysis.types import FloatArray
 
 PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages
-OTHER_RUN = "of another run or layout"
+OTHER_RUN = "of another run, agent or layout"
+NOT_FINITE = "a state that is not finite"
 
 
 class Agent(NetworkNode):
@@ -38,7 +41,7 @@ class Agent(NetworkNode):
         self._law = AgentLaw(record, model, agent)
         listens = model.listens()
         peers = [j for j in range(model.agents) if listens[agent, j] or listens[j, agent]]
-        self._synchronizer: Synchronizer = Synchronizer(
+        self._synchronizer: Synchronizer[FloatArray] = Synchronizer(
             agent=agent,
             steps=experiment.steps,
             inputs=[self._law.neighbours(mode) for mode in range(model.modes)],
@@ -89,7 +92,8 @@ class Agent(NetworkNode):
             if frame is None or frame[0] != peer + 1:
                 self.refuse(OTHER_RUN, topic)
                 return
-            reason = offer(peer, frame[1], frame[3])
+            _, step, _, state = frame
+            reason = offer(peer, step, state) if all_finite(state) else NOT_FINITE
             if reason:
                 self.refuse(reason, topic)
             elif ready():

@@ -20,7 +20,7 @@ PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
 
 def _ports_in_use() -> set[int]:
     """UDP ports bound on this machine."""
-    ports = set()
+    ports: set[int] = set()
     for table in ("/proc/net/udp", "/proc/net/udp6"):
         try:
             lines = Path(table).read_text(encoding="ascii").splitlines()[1:]
@@ -28,6 +28,16 @@ def _ports_in_use() -> set[int]:
             continue
         ports.update(int(line.split()[1].rpartition(":")[2], 16) for line in lines)
     return ports
+
+
+def _open_lock(path: Path) -> int:
+    """Open a lock file, which may be another user's: that can be read and locked, but not opened for writing, nor, in
+    a directory like /tmp, with O_CREAT.
+    """
+    try:
+        return os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return os.open(path, os.O_RDONLY | os.O_CREAT, 0o644)
 
 
 @contextmanager
@@ -46,7 +56,7 @@ def free_domain() -> Iterator[int]:
     for domain in candidates:
         path = Path(tempfile.gettempdir()) / f"msg_agents_domain_{domain}.lock"
         try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            descriptor = _open_lock(path)
         except OSError:
             continue
         try:

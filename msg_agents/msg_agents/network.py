@@ -40,7 +40,7 @@ def count_processes(experiment: Experiment) -> int:
     """
     agents, wanted = experiment.agents, experiment.run.processes
     if wanted == "auto":
-        return agents if agents <= SMALL else min(agents, max(2, 2 * (os.cpu_count() or 1)))
+        return agents if agents <= SMALL else min(agents, MOST_PROCESSES, max(2, 2 * (os.cpu_count() or 1)))
     count = agents if wanted == "one_per_agent" else min(int(wanted), agents)
     if count > MOST_PROCESSES:
         raise InputError(

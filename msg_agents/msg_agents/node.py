@@ -9,14 +9,9 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
 
+from msg_agents.errors import RCLError
+
 from msg_analysis.model.record import RunRecord
-
-try:
-    from rclpy._rclpy_pybind11 import RCLError
-except ImportError:  # its home in later distributions
-    from rclpy.impl.implementation_singleton import rclpy_implementation
-
-    RCLError = rclpy_implementation.RCLError
 
 EXPERIMENT_TOPIC = "experiment"
 GRAPH_TOPIC = "graph"
@@ -34,7 +29,7 @@ def state_topic(agent: int) -> str:
     return f"{agent_name(agent)}/state"
 
 
-class NetworkNode(Node):
+class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
     """A node of a run.
 
     Parameters

@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 
-from msg_agents.node import NetworkNode, RCLError
+from msg_agents.errors import RCLError
+from msg_agents.node import NetworkNode
 from msg_analysis.errors import InputError
 
 GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine

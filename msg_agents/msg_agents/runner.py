@@ -70,7 +70,13 @@ def node_environment(domain: int) -> dict[str, str]:
         "OPENBLAS_NUM_THREADS": "1",
         "OMP_NUM_THREADS": "1",
     }
-    return {**defaults, **os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
+    fixed = {
+        "ROS_DOMAIN_ID": str(domain),
+        "PYTHONUNBUFFERED": "1",
+        # ``python -m`` would look for msg_agents in the working directory first, and find our source tree's folder.
+        "PYTHONSAFEPATH": "1",
+    }
+    return {**defaults, **os.environ, **fixed}
 
 
 def bag_directory(experiment: Experiment, out: Path) -> Path:
@@ -126,7 +132,8 @@ def run_network(
             with supervisor:
                 supervisor.start(plan_network(experiment, run_file, bag))
                 _watch(supervisor, experiment.steps, result, interrupted, on_progress)
-            _collect_failures(supervisor, result, interrupted)
+                # Before the others are ended: what ends because we end it has not failed.
+                _collect_failures(supervisor, result, interrupted)
         if bag is not None:
             _settle(bag, result)
             if bag.exists():

@@ -100,12 +100,8 @@ class StateCodec:
 
         Parameters
         ----------
-        step : int
-            k
-        mode : int
-            graph of the step that led here, from 1; 0 at step 0
-        state : FloatArray
-            (replicas,) x(k), float64
+        step, mode, state : int, int, FloatArray
+            k; graph of the step that led here, from 1 (0 at step 0); (replicas,) x(k), float64
 
         Raises
         ------

@@ -75,23 +75,21 @@ class Topic:
     ----------
     name : absolute
     type : of its messages
-    latched : whether late subscribers get what was published before (transient-local durability)
     """
 
     name: str
     type: MessageType
-    latched: bool = False
 
     @property
     def qos(self) -> list[dict[str, Any]]:
-        """The one profile that its publishers offer: reliable, keep-all; in the words of rosbag2."""
+        """The one profile that its publishers offer, in rosbag2's words: reliable, keep-all, transient-local."""
         forever = {"sec": 9223372036, "nsec": 854775807}
         return [
             {
                 "history": "keep_all",
                 "depth": 0,
                 "reliability": "reliable",
-                "durability": "transient_local" if self.latched else "volatile",
+                "durability": "transient_local",
                 "deadline": dict(forever),
                 "lifespan": dict(forever),
                 "liveliness": "automatic",
@@ -113,8 +111,8 @@ def network_topics(agents: int, namespace: str = "") -> Sequence[Topic]:
     """
     root = "/" + namespace.strip("/") + "/" if namespace.strip("/") else "/"
     return (
-        Topic(f"{root}experiment", STRING, latched=True),
-        Topic(f"{root}graph", ACTIVE_GRAPH, latched=True),
+        Topic(f"{root}experiment", STRING),
+        Topic(f"{root}graph", ACTIVE_GRAPH),
         *(Topic(state_topic(root, agent), AGENT_STATE) for agent in range(1, agents + 1)),
     )
 

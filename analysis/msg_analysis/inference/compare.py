@@ -16,7 +16,6 @@ from msg_analysis.inference.multiplicity import holm
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.switching import SwitchingTest, switching_test
 from msg_analysis.model.trajectory import Trajectory
-from msg_analysis.theory import symmetric
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.types import FloatArray
 
@@ -258,19 +257,13 @@ def _estimate(measured: float, predicted: float, error: float, scale: float) -> 
 
 
 def _covariance(means: TimeMeans, prediction: Prediction) -> CovarianceTest:
-    system = prediction.system
+    measured = prediction.system.lifted(means.second_moments)
+    predicted = prediction.system.lifted(means.expected_moments)
     if not means.joint:
-        return CovarianceTest(
-            predicted=prediction.emulated.covariance,
-            note="too many agents for a joint test; the node errors are tested one by one",
-        )
-
-    def lifted(packed: FloatArray) -> FloatArray:
-        return system.lifted(symmetric.unpack(packed, system.dimension))
-
+        note = "too many agents for a joint test; the node errors are tested one by one"
+        return CovarianceTest(measured, predicted, note=note)
     chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
-    p = float(stats.chi2.sf(chi2, dof)) if dof else None
-    return CovarianceTest(lifted(means.measured), lifted(means.predicted), chi2, dof, p)
+    return CovarianceTest(measured, predicted, chi2, dof, float(stats.chi2.sf(chi2, dof)) if dof else None)
 
 
 def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:

@@ -17,8 +17,10 @@ from msg_analysis.types import FloatArray, IntArray
 
 LAGS = 10
 MAX_REGRESSORS = 400
-SILENT = 1e-9
-"""Relative size of what counts as rounding in a direction without noise."""
+NO_NOISE = 1e-13
+"""Directions with less variance than this, relative to the noisiest one, count as free of noise."""
+ROUNDING = 1e-9
+"""Relative size of what counts as rounding in such directions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +49,16 @@ class _Sums:
     noise : (n, m, m) sum of e e^T
     score : (n, m, m + 1) sum of e z^T
     inputs : (n, m + 1, m + 1) sum of z z^T
-    silent : largest |e| in directions without noise, over the largest |x|
+    quiet : largest |e| in directions without noise
+    largest : largest |x|
     """
 
     samples: IntArray
     noise: FloatArray
     score: FloatArray
     inputs: FloatArray
-    silent: float
+    quiet: float = 0.0
+    largest: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,10 +82,10 @@ def innovation_tests(observation: Observation) -> InnovationTests:
         return InnovationTests(None, None, None)
     directions = [_directions(noise) for noise in step.noise]
     sums, p_whiteness = _pass(observation, directions)
-    if sums.silent > SILENT:
-        p_covariance: float | None = 0.0
-    else:
-        p_covariance = _covariance_p(step, directions, sums)
+    # What NO_NOISE hides may be there: ten standard deviations of it.
+    hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in step.noise))
+    moved = sums.quiet > max(ROUNDING * sums.largest, hidden)
+    p_covariance = 0.0 if moved else _covariance_p(step, directions, sums)
     return InnovationTests(p_covariance, p_whiteness, _gain_p(step, sums))
 
 
@@ -98,7 +102,7 @@ def innovations(observation: Observation, first: int, last: int) -> FloatArray:
 def _directions(noise: FloatArray) -> _Directions:
     values, vectors = np.linalg.eigh(noise)
     values, vectors = values[::-1], vectors[:, ::-1]
-    rank = int((values > 1e-12 * max(values[0], 0.0)).sum()) if values[0] > 0.0 else 0
+    rank = int((values > NO_NOISE * values[0]).sum()) if values[0] > 0.0 else 0
     return _Directions((vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:])
 
 
@@ -107,15 +111,14 @@ def _pass(observation: Observation, directions: list[_Directions]) -> tuple[_Sum
     step, n, m = observation.step, observation.step.modes, observation.step.agents
     consensus = observation.prediction.experiment.problem == "consensus"
     sums = _Sums(
-        np.zeros(n, np.int64), np.zeros((n, m, m)), np.zeros((n, m, m + 1)), np.zeros((n, m + 1, m + 1)), 0.0
+        np.zeros(n, np.int64), np.zeros((n, m, m)), np.zeros((n, m, m + 1)), np.zeros((n, m + 1, m + 1))
     )
     # Graphs may differ in the number of noisy directions; the strongest ones that all have are iid N(0, I) in
     # any case.
     whitened = _Whiteness(min(len(d.whitener) for d in directions))
-    largest = 0.0
     for first, last in observation.blocks(observation.states[0].size):
         e, x = innovations(observation, first, last), observation.states[first:last]
-        largest = max(largest, float(np.abs(x).max()))
+        sums.largest = max(sums.largest, float(np.abs(x).max()))
         z = np.ones((last - first, m + 1, observation.replicas))
         z[:, :m] = x - (x.mean(axis=1, keepdims=True) if consensus else step.reference)
         white = np.empty((last - first, whitened.rank, observation.replicas))
@@ -129,10 +132,9 @@ def _pass(observation: Observation, directions: list[_Directions]) -> tuple[_Sum
             sums.noise[mode] += flat_e @ flat_e.T
             sums.score[mode] += flat_e @ flat_z.T
             sums.inputs[mode] += flat_z @ flat_z.T
-            sums.silent = max(sums.silent, float(np.abs(direction.quiet.T @ flat_e).max(initial=0.0)))
+            sums.quiet = max(sums.quiet, float(np.abs(direction.quiet.T @ flat_e).max(initial=0.0)))
             white[at] = direction.whitener[: whitened.rank] @ e[at]
         whitened.add(white)
-    sums.silent /= largest or 1.0
     return sums, whitened.p_value()
 
 

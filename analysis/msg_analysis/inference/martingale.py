@@ -36,7 +36,9 @@ class TimeMeans:
 
     Attributes
     ----------
-    joint : whether these are all entries of y y^T, packed (q = p); else the node errors (q = m)
+    second_moments : (d, d) time mean of y y^T
+    expected_moments : (d, d) its exact expectation under the run's start and length
+    joint : whether what follows is about all entries of y y^T, packed (q = p); else the node errors (q = m)
     measured : (q,) time means, replicas averaged
     predicted : (q,) their exact expectation under the run's start and length
     covariance : (q, q) of measured under the model
@@ -45,6 +47,8 @@ class TimeMeans:
     system_variances : (N,) Var(D_k | y_k, g_k) of the system error
     """
 
+    second_moments: FloatArray
+    expected_moments: FloatArray
     joint: bool
     measured: FloatArray
     predicted: FloatArray
@@ -143,10 +147,14 @@ def time_means(observation: Observation) -> TimeMeans:
             grams[mode] += a[at].T @ a[at]
             variances[first + at] = value.variances(trace, a[at], observation.replicas)
     covariance = sum(v.covariance(gram, observation.replicas) for v, gram in zip(values, grams, strict=True))
+    moments = grams.sum(axis=0)[-1, :p] / steps
+    expected = expected_mean(observation)
     return TimeMeans(
+        second_moments=symmetric.unpack(moments, system.dimension),
+        expected_moments=expected,
         joint=joint,
-        measured=forms @ grams.sum(axis=0)[-1, :p] / steps,
-        predicted=forms @ symmetric.pack(expected_mean(observation)),
+        measured=forms @ moments,
+        predicted=forms @ symmetric.pack(expected),
         covariance=np.asarray(covariance) / steps**2,
         nodes=nodes,
         system_series=series,

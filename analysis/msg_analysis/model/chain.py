@@ -37,7 +37,7 @@ def stationary_law(matrix: FloatArray) -> FloatArray:
     law = np.ones(n)
     for k in range(1, n):
         law[k] = law[:k] @ rates[:k, k]
-    return law / law.sum()
+    return np.asarray(law / law.sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

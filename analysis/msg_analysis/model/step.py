@@ -70,7 +70,7 @@ class StepModel:
 
     def listens(self) -> BoolArray:
         """(m, m): whether agent i uses the state of agent j != i in any graph."""
-        used = np.any(self.weights != 0.0, axis=0)
+        used: BoolArray = (self.weights != 0.0).any(axis=0)
         np.fill_diagonal(used, False)
         return used
 

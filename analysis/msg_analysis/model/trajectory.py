@@ -65,7 +65,7 @@ class Trajectory:
     @property
     def prefix(self) -> int:
         """Steps in the longest complete beginning: x(0..prefix) and g(0..prefix-1) are all there (-1: not even x(0))."""
-        whole = self.present.all(axis=1)
+        whole = np.asarray(self.present.all(axis=1))
         states = int(np.argmin(whole)) if not whole.all() else len(whole)
         known = self.modes >= 0
         modes = int(np.argmin(known)) if not known.all() else len(known)

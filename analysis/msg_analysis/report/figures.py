@@ -35,6 +35,7 @@ _STYLE = {
     "xtick.color": "#4b5563",
     "ytick.color": "#4b5563",
     "axes.grid": True,
+    "axes.axisbelow": True,
     "grid.color": "#e5e7eb",
     "grid.linewidth": 0.6,
     "legend.frameon": False,
@@ -44,6 +45,7 @@ _WIDTH = 9.1  # inches, of the report's text
 _NUMBERED = 8  # agents up to which heat maps show their numbers
 _SOJOURNS = 150  # sojourns that can be told apart in a figure
 _GRAPHS = 8  # graphs that are drawn
+_LABELLED = 40  # agents up to which the drawings show their numbers
 
 
 @contextmanager
@@ -127,7 +129,7 @@ def running_estimate(running: Mapping[str, FloatArray], predicted: float | None)
         low = min(np.min(mean[late]), np.min((predicted or mean[-1]) - 1.96 * error[late]))
         high = max(np.max(mean[late]), np.max((predicted or mean[-1]) + 1.96 * error[late]))
         margin = 0.08 * (high - low) or 1.0
-        axes.set_ylim(low - margin, high + margin)
+        axes.set_ylim(max(low - margin, 0), high + margin)  # an error is never negative
         figure.legend(loc="outside upper right", ncols=3)
     return text.getvalue()
 
@@ -249,7 +251,7 @@ def graphs(experiment: Experiment) -> str:
 
 def _draw(axes: Axes, graph: Graph, places: Mapping[int, FloatArray], leaders: set[int], colour: str) -> None:
     agents = graph.agents
-    size = float(np.clip(4200 / agents, 25, 260))
+    size = float(min(4200 / agents, 260)) if agents <= _LABELLED else 14.0
     network = nx.DiGraph() if not graph.symmetric else nx.Graph()
     network.add_nodes_from(range(agents))
     arcs = graph.edges if graph.symmetric else graph.arcs
@@ -265,11 +267,12 @@ def _draw(axes: Axes, graph: Graph, places: Mapping[int, FloatArray], leaders: s
     nx.draw_networkx_edges(
         network, places, ax=axes, edge_color=colour, width=widths, node_size=size, alpha=0.8, **arrows
     )
-    if agents <= 40:
+    if agents <= _LABELLED:
         names = {i: str(i + 1) for i in range(agents)}
         nx.draw_networkx_labels(network, places, names, ax=axes, font_size=8 if agents <= 20 else 5.5)
     axes.set_title(_shorten(graph.name), color=BLACK)
     axes.margins(0.12)
+    axes.set_aspect("equal")
 
 
 def _places(graph_list: Sequence[Graph]) -> Mapping[int, FloatArray]:
@@ -277,7 +280,7 @@ def _places(graph_list: Sequence[Graph]) -> Mapping[int, FloatArray]:
     union = nx.from_numpy_array(sum((g.adjacency + g.adjacency.T > 0) for g in graph_list) > 0)
     if max(degree for _, degree in union.degree) > max(4, len(union) / 2):
         places: Mapping[int, FloatArray] = nx.circular_layout(union)  # stars, complete graphs
-    elif nx.is_connected(union) and len(union) <= 50:
+    elif nx.is_connected(union) and len(union) <= 120:
         places = nx.kamada_kawai_layout(union)
     else:
         places = nx.spring_layout(union, seed=1, iterations=200)

@@ -133,7 +133,7 @@ def _explanation(document: dict[str, Any]) -> str:
     rejected = [test for test in tests if test["rejected"]]
     if not rejected:
         return f"None of {len(tests)} tests rejects the predicted law ({chance}, all tests together)."
-    named = ", ".join(f"{test['name']} (p = {_p_value(test['p_adjusted'])})" for test in rejected[:6])
+    named = ", ".join(f"{test['name']} (p {_p_value(test['p_adjusted'], '= ')})" for test in rejected[:6])
     more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
     return f"{len(rejected)} of {len(tests)} tests reject the predicted law: {named}{more}; {chance}."
 
@@ -150,13 +150,13 @@ def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
 def _number(value: float | None, digits: int = 4) -> str:
     if value is None:
         return "–"
-    return f"{value:.{digits}g}".replace("-", "−")
+    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
 
 
-def _p_value(p: float | None) -> str:
+def _p_value(p: float | None, equals: str = "") -> str:
     if p is None:
         return "not tested"
-    return "< 0.0001" if p < 1e-4 else f"{p:.4f}" if p < 0.01 else f"{p:.3f}"
+    return "< 0.0001" if p < 1e-4 else f"{equals}{p:.{4 if p < 0.01 else 3}f}"
 
 
 def _matrix(rows: list[list[float]] | None) -> Any:

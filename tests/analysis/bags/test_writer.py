@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import multiprocessing
 import os
+import resource
 import signal
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,8 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
-from msg_analysis.bags import writer as writer_module
 from msg_analysis.bags.cdr import StateCodec, encode_string, stamp_ns
+from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.schemas import network_topics
 from msg_analysis.bags.writer import BagWriter, recording_pid
 from msg_analysis.errors import BagError
@@ -166,15 +166,21 @@ def test_killed_recorder_is_not_taken_for_a_living_one(tmp_path: Path) -> None:
     assert recording_pid(tmp_path / "bag") is None
 
 
-def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bag = BagWriter(tmp_path / "bag", network_topics(1))
-
-    def full(*args: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(writer_module.Writer, "add_message", full)
-    with pytest.raises(BagError, match="No space left"):
-        _fill(bag)
-    bag.close()  # what is left to close is closed: no second error
-    assert (tmp_path / "bag" / ".recording").exists()
-    assert not (tmp_path / "bag" / "metadata.yaml").exists()
+def test_full_disk(tmp_path: Path) -> None:
+    bag = BagWriter(tmp_path / "bag", network_topics(1), record=json.dumps({"run": "abc"}))
+    file = tmp_path / "bag" / "bag_0.mcap"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (250_000, hard))  # like a full disk, for this process only
+    try:
+        with pytest.raises(BagError, match="cannot be written"):
+            _fill(bag, 10**5)
+        bag.close()  # what is left to close is closed: no second error
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert {path.name for path in file.parent.iterdir()} == {".recording", "bag_0.mcap"}
+    assert recording_pid(file.parent) is None
+    report = salvage_in_place(file.parent)
+    assert report.dropped_bytes > 0
+    assert report.kept_messages > 1000
+    with AnyReader([file.parent]) as reader:
+        assert reader.message_count == report.kept_messages

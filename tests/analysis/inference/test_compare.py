@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import uuid
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy import stats
 from msg_analysis.inference.compare import compare
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord
-from msg_analysis.model.trajectory import Completeness
+from msg_analysis.model.trajectory import Completeness, Trajectory
 from msg_analysis.model.twin import simulate
 from msg_analysis.theory.prediction import predict
 
@@ -66,8 +67,8 @@ CASES = {
 def test_calibration(case):
     """p-values of 60 true runs are uniform, intervals cover, verdicts agree.
 
-    Kolmogorov-Smirnov at 2e-4 for each of at most 11 tests, coverage and verdicts at 1e-4 by the binomial law:
-    a right program fails a case with probability below 0.3 %.
+    Kolmogorov-Smirnov at 2e-4 for each of at most 11 tests, coverage and verdicts at 1e-4 by the binomial
+    law: a right program fails a case with probability below 0.3 %.
     """
     experiment = golden(case if case in ("tracking", "discrete") else "line_ring", **CASES[case])
     results = [compare(simulate(experiment.with_run(seed=seed))) for seed in SEEDS]
@@ -80,6 +81,42 @@ def test_calibration(case):
     assert covered >= stats.binom.ppf(1e-4, len(results), 0.95)
     false_alarms = sum(result.verdict == "disagrees" for result in results)
     assert false_alarms <= stats.binom.isf(1e-4, len(results), 0.01)
+
+
+def simulate_air(experiment, seed):
+    """A run with noise on the air and lost messages, message by message, from the experiment file alone."""
+    random = np.random.default_rng(seed)
+    m, dt, noise, replicas = experiment.agents, experiment.run.dt, experiment.noise, experiment.run.replicas
+    adjacency = [graph.adjacency for graph in experiment.graph_list]
+    chain = experiment.chain
+    modes = [int(random.choice(chain.modes, p=chain.stationary))]
+    while len(modes) < experiment.steps:
+        modes.append(int(random.choice(chain.modes, p=chain.transition(dt)[modes[-1]])))
+    states = np.zeros((experiment.steps + 1, m, replicas))
+    for k, g in enumerate(modes):
+        x = states[k]
+        sent = x + noise.broadcast * random.standard_normal(x.shape)
+        heard = sent[None] + noise.link * random.standard_normal((m, m, replicas))
+        arrived = random.random((m, m, replicas)) >= noise.loss
+        pull = (adjacency[g][:, :, None] * arrived * (heard - x[:, None])).sum(axis=1)
+        process = experiment.noise_gain @ random.standard_normal(x.shape)
+        states[k + 1] = x + dt * pull + np.sqrt(dt) * process
+    record = RunRecord(uuid.UUID(int=seed), experiment, states[0])
+    count = states[:, :, 0].size
+    return Trajectory(record, states, np.array(modes), Completeness(count, count, 0))
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_calibration_with_noise_that_depends_on_the_graph(loss):
+    """60 runs; levels as in test_calibration. Lost messages leave the innovations untested."""
+    noise = {"process": 0.2, "broadcast": 0.3, "link": 0.2, "loss": loss}
+    air = changed(golden("air", duration=50, replicas=3, start="zero"), noise=noise)
+    results = [compare(simulate_air(air, seed)) for seed in SEEDS]
+    collected = [p_values(result) for result in results]
+    assert len(collected[0]) == (9 if loss == 0.0 else 6)
+    for name in collected[0]:
+        assert stats.kstest([p[name] for p in collected], "uniform").pvalue > 2e-4, name
+    assert sum(r.verdict == "disagrees" for r in results) <= stats.binom.isf(1e-4, len(results), 0.01)
 
 
 def test_standard_errors_hold_when_the_graph_hardly_ever_switches():
@@ -162,6 +199,17 @@ def test_document(short_run):
     assert document["continuous"]["system_error"] == pytest.approx(1.3594132029339856, rel=1e-8)
     assert len(document["batch_means"]["interval"]) == 2
     assert [test["rejected"] for test in document["tests"]] == [False] * 11
+
+
+def test_many_agents_get_no_joint_test_but_all_numbers(short_run, monkeypatch):
+    all_ = compare(short_run)
+    monkeypatch.setattr("msg_analysis.inference.martingale.MAX_JOINT", 5)
+    few = compare(short_run)
+    assert (few.covariance.chi2, few.covariance.dof, few.covariance.p) == (None, None, None)
+    assert "too many agents" in few.covariance.note
+    np.testing.assert_allclose(few.covariance.measured, all_.covariance.measured, rtol=1e-12)
+    assert few.system_error.z == pytest.approx(all_.system_error.z, rel=1e-9)
+    assert "covariance" not in p_values(few)
 
 
 def test_running_mean_ends_at_the_estimate(short_run):

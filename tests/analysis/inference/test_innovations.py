@@ -127,6 +127,11 @@ def test_a_direction_without_noise_must_stand_still():
     assert innovation_tests(quiet).p_covariance == 0.0
 
 
+@pytest.mark.parametrize("tiny", [1e-4, 1e-6, 1e-9])
+def test_hardly_any_noise_is_no_alarm(tiny):
+    assert innovation_tests(observe(noise={"process": [1.0, 1.0, tiny]})).p_covariance > 0.001
+
+
 def test_grounded_leaders_have_no_noise():
     leaders = {"agents": [1], "gain": float("inf"), "reference": 2.0}
     grounded = observe(leaders=leaders)

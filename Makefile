@@ -1,0 +1,71 @@
+# make demo and make test need python3 (3.11 or newer, with venv and headers), make and a C/C++ compiler; the rest is
+# installed into .venv, every package pinned with its hashes.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INTERFACES := ros_ws/src/msg_agents_interfaces
+EXPERIMENTS := ros_ws/src/msg_agents_bringup/experiments
+RUNS := runs
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+LOCAL := --no-index --no-deps --no-build-isolation
+
+.PHONY: help setup demo test test-fast lint format bench docs colcon lock clean
+
+help: ## Say what can be made
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+setup: $(VENV)/.packages ## Set up .venv with everything
+
+$(VENV)/.locked: requirements/lock.txt
+	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("error: %s is Python %d.%d: need 3.11 or newer, give PYTHON=..." % (sys.executable, *sys.version_info[:2]))'
+	@echo "Setting up $(VENV) (about two minutes, once)" >&2
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) install --require-hashes --requirement requirements/lock.txt
+	@touch $@
+
+$(VENV)/.interfaces: $(VENV)/.locked $(wildcard $(INTERFACES)/msg/*) $(INTERFACES)/CMakeLists.txt $(INTERFACES)/package.xml $(INTERFACES)/pyproject.toml
+	$(PIP) install $(LOCAL) --force-reinstall ./$(INTERFACES)
+	@touch $@
+
+$(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* msg_agents/setup.* analysis/package.xml msg_agents/package.xml)
+	$(PIP) install $(LOCAL) --editable analysis --editable msg_agents
+	@touch $@
+
+demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
+	$(BIN)/msg-agents run $(EXPERIMENTS)/line_ring.yaml --out $(RUNS)
+
+test: setup ## Run all tests
+	$(BIN)/python -m pytest
+
+test-fast: setup ## Run the tests that start no network
+	$(BIN)/python -m pytest -m "not integration"
+
+lint: setup ## Check style and types
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+format: setup ## Rewrite the code in the house style
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+bench: setup ## Measure speed side by side with the bare middleware
+	$(BIN)/python benchmarks/network.py
+
+docs: setup ## Build the documentation into site/
+	$(BIN)/mkdocs build --strict --quiet
+
+# Build the workspace as a ROS 2 user does. With ROS 2 from wheels, the virtual environment is the underlay.
+colcon: setup ## Build ros_ws with colcon on the wheels
+	rm -rf build/colcon
+	cd ros_ws && AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) PATH=$(CURDIR)/$(BIN):$$PATH \
+	  colcon --log-base ../build/colcon/log build --build-base ../build/colcon/build --install-base ../build/colcon/install
+
+lock: ## Pin the newest versions (needs uv)
+	cd requirements && uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --upgrade \
+	  --quiet --custom-compile-command "make lock" --output-file lock.txt runtime.in build.in dev.in
+
+clean: ## Remove all that was made, runs excepted
+	rm -rf $(VENV) build site .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -prune -exec rm -rf {} + ; rm -rf */*.egg-info

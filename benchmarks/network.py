@@ -1,0 +1,80 @@
+"""Lockstep speed of the demo network beside the bare middleware, in one run.
+
+Each round measures every configuration once, in turn, so that a drift of the machine hits all of them alike; the
+ratios are taken within a round and the median over the rounds is what counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import bare_loop
+from msg_agents.runner import run_network
+from msg_analysis.model.experiment import Experiment
+
+EXPERIMENT = Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml"
+RATIOS = {
+    "network / bare loop": ("network", "bare loop"),
+    "network / bare loop, both recorded": ("network, recorded", "bare loop, recorded"),
+    "network / network on SingleThreadedExecutor": ("network", "network on SingleThreadedExecutor"),
+}
+
+
+def network(steps: int, *, record: bool = False, executor: str = "events") -> float:
+    """Steps per second of the demo network, five agent processes and the switcher."""
+    experiment = Experiment.load(EXPERIMENT)
+    experiment = experiment.with_run(duration=steps * experiment.run.dt, processes="one_per_agent")
+    with tempfile.TemporaryDirectory() as directory:
+        out = Path(directory) if record else None
+        result = run_network(experiment, out, environment={"MSG_AGENTS_EXECUTOR": executor})
+    if result.failures:
+        raise SystemExit("\n".join(result.failures))
+    return result.rate
+
+
+def configurations(steps: int) -> dict[str, Callable[[], float]]:
+    """What is measured, by name."""
+    return {
+        "bare loop": lambda: bare_loop.measure(steps=steps),
+        "network": lambda: network(steps),
+        "bare loop, recorded": lambda: bare_loop.measure(steps=steps, recorder=True),
+        "network, recorded": lambda: network(steps, record=True),
+        "network on SingleThreadedExecutor": lambda: network(steps // 2, executor="single"),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=15000)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    rates: dict[str, list[float]] = {name: [] for name in configurations(arguments.steps)}
+    for number in range(arguments.rounds):
+        for name, measure in configurations(arguments.steps).items():
+            rates[name].append(measure())
+            print(f"round {number + 1}: {name}: {rates[name][-1]:.0f} steps/s", file=sys.stderr)
+    ratios = {
+        title: statistics.median(a / b for a, b in zip(rates[over], rates[under], strict=True))
+        for title, (over, under) in RATIOS.items()
+    }
+    if arguments.json:
+        print(json.dumps({"rates": rates, "ratios": ratios}))
+        return
+    print(f"5 agents in 5 processes, 16 replicas, {arguments.steps} steps, {arguments.rounds} rounds")
+    print(f"{'steps per second':44} {'median':>8} {'lowest':>8} {'highest':>8}")
+    for name, values in rates.items():
+        print(f"{name:44} {statistics.median(values):8.0f} {min(values):8.0f} {max(values):8.0f}")
+    print(f"{'ratio within a round':44} {'median':>8}")
+    for title, ratio in ratios.items():
+        print(f"{title:44} {ratio:8.2f}")
+
+
+if __name__ == "__main__":
+    main()

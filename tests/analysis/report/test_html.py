@@ -1,0 +1,173 @@
+"""The report: valid, self-contained, complete, and safe with any name."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import re
+import uuid
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from msg_analysis.errors import InputError
+from msg_analysis.inference.compare import Comparison, CovarianceTest, Estimate, compare
+from msg_analysis.inference.compare import Test as FamilyTest
+from msg_analysis.inference.innovations import InnovationTests
+from msg_analysis.inference.switching import SwitchingTest
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.record import RunRecord
+from msg_analysis.model.trajectory import Completeness, Trajectory
+from msg_analysis.report.html import write_report
+
+VOID = {"meta", "img", "link", "br", "hr", "input"}
+MakeComparison = Callable[..., Comparison]
+
+
+class Page(HTMLParser):
+    """Checks the nesting and keeps what tests ask for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.references: list[str] = []
+        self.text = ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.references += [value or "" for name, value in attrs if name in ("src", "href", "action", "data")]
+        if tag == "img":
+            assert dict(attrs)["alt"]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] != "style":
+            self.text += data
+
+
+def _trajectory(agents: int, steps: int, **names: str) -> Trajectory:
+    everybody = list(range(1, agents + 1))
+    experiment = Experiment.parse(
+        {
+            "name": "small",
+            "problem": "consensus",
+            "time": "continuous",
+            "graphs": {
+                "line": {"path": everybody},
+                "ring": {"cycle": everybody} if agents > 2 else {"path": everybody},
+            },
+            "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
+            "run": {"dt": 0.1, "duration": steps * 0.1, "replicas": 2, "start": "zero"},
+        }
+    )
+    if names:
+        graphs = tuple(dataclasses.replace(g, name=names.get(g.name, g.name)) for g in experiment.graph_list)
+        experiment = dataclasses.replace(experiment, graph_list=graphs)
+    rng = np.random.default_rng(0)
+    states = rng.standard_normal((steps + 1, agents, 2))
+    record = RunRecord(uuid.UUID(int=5), experiment, states[0])
+    modes = np.repeat(rng.integers(0, 2, steps // 4 + 1), 4)[:steps]
+    expected = (steps + 1) * agents
+    return Trajectory(record, states, modes, Completeness(expected, expected, 0))
+
+
+def _comparison(trajectory: Trajectory) -> Comparison:
+    """Made-up numbers, all of them there."""
+    agents = trajectory.states.shape[1]
+    rng = np.random.default_rng(1)
+    covariance = np.cov(rng.standard_normal((agents, 4 * agents)))
+    nodes = [Estimate(0.3 + i / 100, 0.31, 0.01, 0.5, 0.6, 1.0) for i in range(agents)]
+    tests = [FamilyTest("system error", 0.4, 1.0, rejected=False)]
+    tests += [FamilyTest(f"error of agent {i + 1}", 0.6, 1.0, rejected=False) for i in range(agents)]
+    time = np.linspace(0.1, 20, 50)
+    return Comparison(
+        trajectory=trajectory,
+        level=0.01,
+        steps=len(trajectory.modes),
+        system_error=Estimate(1.234567, 1.3, 0.05, -1.31, 0.19),
+        node_errors=nodes,
+        covariance=CovarianceTest(covariance, covariance * 1.01, 9.0, 10, 0.53),
+        innovations=InnovationTests(0.5, 0.5, None),
+        switching=SwitchingTest(np.array([[7, 1], [2, 9]]), np.array([[6.5, 1.5], [2.5, 8.5]]), 0.7),
+        continuous_error=1.25,
+        batch=(1.1, 1.4),
+        tests=tests,
+        running={"time": time, "system_error": 1.3 + 1 / time, "standard_error": 0.3 / np.sqrt(time)},
+    )
+
+
+def _page(comparison: Comparison, path: Path) -> Page:
+    write_report(comparison, comparison.trajectory, path)
+    text = path.read_text(encoding="utf-8")
+    assert len(text.encode()) < 2_000_000
+    page = Page(text)
+    assert all(reference.startswith("data:image/") for reference in page.references)
+    assert not re.search(r"url\(|@import|<script", text)
+    for reference in page.references:
+        ElementTree.fromstring(base64.b64decode(reference.partition(",")[2]))  # well-formed pictures
+    return page
+
+
+@pytest.mark.parametrize("agents", [2, 5, 100])
+def test_report(tmp_path: Path, agents: int) -> None:
+    comparison = _comparison(_trajectory(agents, 60))
+    page = _page(comparison, tmp_path / "report.html")
+    assert "The run agrees with the prediction." in page.text
+    assert str(comparison.trajectory.record.run) in page.text
+    assert "1.235" in page.text
+    assert "z = −1.31" in page.text
+    for i in range(agents):
+        assert f"{0.3 + i / 100:#.4g}" in page.text
+    assert page.tags.count("img") == 5
+    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_report_of_a_real_comparison(tmp_path: Path) -> None:
+    trajectory = _trajectory(3, 400)  # white noise is not what the law gives
+    page = _page(compare(trajectory), tmp_path / "report.html")
+    assert "The run disagrees with the prediction." in page.text
+    assert "reject the predicted law" in page.text
+    assert "p < 0.0001" in page.text
+
+
+@pytest.mark.parametrize("first_gap", [5, 250])
+def test_incomplete(tmp_path: Path, first_gap: int) -> None:
+    trajectory = _trajectory(3, 400)
+    trajectory.states[first_gap, 1] = np.nan
+    count = Completeness(expected=1203, received=1202, missing=1, refused={"torn file": 1})
+    trajectory = dataclasses.replace(trajectory, completeness=count)
+    page = _page(compare(trajectory), tmp_path / "report.html")
+    assert "No verdict: the data are incomplete." in page.text
+    assert "Missing: 1 of 1203 states" in page.text
+    assert ("Too little came" in page.text) == (first_gap == 5)
+    assert "set aside: torn file" in page.text
+
+
+def test_hostile_names(tmp_path: Path) -> None:
+    evil = "<script>alert(1)</script>$\\frac$&\"'"
+    trajectory = _trajectory(3, 60, line=evil)
+    trajectory.record.versions["<b>numpy"] = "</pre><img src=http://x>"
+    page = _page(_comparison(trajectory), tmp_path / "report.html")
+    assert evil in page.text
+    assert "script" not in page.tags
+
+
+def test_replaces_and_leaves_nothing_half_written(tmp_path: Path) -> None:
+    comparison = _comparison(_trajectory(2, 60))
+    (tmp_path / "report.html").write_text("old")
+    _page(comparison, tmp_path / "report.html")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(comparison, comparison.trajectory, tmp_path / "nowhere" / "report.html")
+    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
