@@ -17,13 +17,14 @@ from pathlib import Path
 
 import rclpy
 from mcap.writer import CompressionType, Writer
-from msg_agents.domain import free_domain
-from msg_agents.errors import RCLError
-from msg_agents.runner import node_environment
 from msg_agents_interfaces.msg import AgentState
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from msg_agents.domain import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.errors import RCLError
 
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0)
 FRAME = struct.Struct("<4xQI")  # CDR header, step, agent

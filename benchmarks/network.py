@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import bare_loop
+
 from msg_agents.runner import run_network
 from msg_analysis.model.experiment import Experiment
 

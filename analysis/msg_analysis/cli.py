@@ -37,9 +37,7 @@ def main() -> None:
 
 
 @main.command(
-    epilog=examples(
-        "msg-analysis predict line_ring.yaml", "msg-analysis predict line_ring.yaml --json | jq .emulated"
-    )
+    epilog=examples("msg-analysis predict line_ring.yaml", "msg-analysis predict line_ring.yaml --json | jq .emulated")
 )
 @_experiment
 @_json
@@ -65,16 +63,14 @@ def predict(experiment: Path, as_json: bool) -> None:
     )
 )
 @_experiment
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Bag directory to write; <name>_twin by default."
-)
+@click.option("--out", type=click.Path(path_type=Path), help="Bag directory to write; <name>_twin by default.")
 @click.option("--seed", type=int, help="Instead of run.seed.")
 @click.option("--duration", type=float, help="Instead of run.duration [units of simulated time].")
 def simulate(experiment: Path, out: Path | None, seed: int | None, duration: float | None) -> None:
     """Run EXPERIMENT without ROS and write its bag, whose name is printed."""
     from msg_analysis.bags.store import write_trajectory
     from msg_analysis.model.experiment import Experiment
-    from msg_analysis.model.twin import simulate as simulate_experiment
+    from msg_analysis.twin import simulate as simulate_experiment
 
     given = {key: value for key, value in {"seed": seed, "duration": duration}.items() if value is not None}
     loaded = Experiment.load(experiment).with_run(**given)
@@ -87,15 +83,11 @@ def simulate(experiment: Path, out: Path | None, seed: int | None, duration: flo
 
 
 @main.command(
-    epilog=examples(
-        "msg-analysis compare line_ring_twin", "msg-analysis compare line_ring_twin --report report.html"
-    )
+    epilog=examples("msg-analysis compare line_ring_twin", "msg-analysis compare line_ring_twin --report report.html")
 )
 @click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @_json
-@click.option(
-    "--report", type=click.Path(dir_okay=False, path_type=Path), help="Write a report (HTML) as well."
-)
+@click.option("--report", type=click.Path(dir_okay=False, path_type=Path), help="Write a report (HTML) as well.")
 @click.pass_context
 def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, report: Path | None) -> None:
     """Compare what the run in BAG did with what theory predicts.

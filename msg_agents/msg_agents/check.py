@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msg_analysis.model.trajectory import Trajectory
-from msg_analysis.model.twin import simulate
+from msg_analysis.twin import simulate
 
 
 @dataclass(frozen=True, slots=True)

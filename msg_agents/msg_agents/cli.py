@@ -53,9 +53,7 @@ def main() -> None:
 @click.option("--duration", type=float, help="Instead of run.duration, in units of simulated time.")
 @click.option("--pace", help="Instead of run.pace: lockstep.")
 @click.option("--processes", help="Instead of run.processes: auto, one_per_agent or a number.")
-@click.option(
-    "--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own."
-)
+@click.option("--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own.")
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
 def run(
@@ -103,9 +101,7 @@ def _show(result: RunResult, as_json: bool) -> None:
     """The result on stdout, and as result.json beside the bag."""
     from msg_agents.runner import REPORT_FILE, RESULT_FILE
 
-    document: dict[str, Any] = (
-        dict(result.comparison.to_json()) if result.comparison else {"verdict": "incomplete"}
-    )
+    document: dict[str, Any] = dict(result.comparison.to_json()) if result.comparison else {"verdict": "incomplete"}
     document |= {
         "bag": str(result.bag) if result.trajectory else None,
         "report": str(result.bag / REPORT_FILE) if result.bag and result.comparison else None,
@@ -195,7 +191,7 @@ def _newest_bag(directory: Path) -> Path:
 @click.argument("experiment", type=click.Path(path_type=Path))
 def prepare(experiment: Path) -> None:
     """Print the run record of a new run of EXPERIMENT: the file that the single nodes are started with."""
-    from msg_analysis.model.twin import new_record
+    from msg_analysis.twin import new_record
 
     what = _load(experiment)
     what.require_available()
@@ -285,9 +281,7 @@ def switcher(run_record: Path, *, readers: tuple[str, ...], status: int | None, 
 
 @main.command(epilog=examples("msg-agents recorder run.json --out runs/mine"))
 @_node_options
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="Directory of the bag; must not exist."
-)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Directory of the bag; must not exist.")
 def recorder(run_record: Path, *, out: Path, **options: Any) -> None:
     """Record the run in RUN_RECORD to a bag."""
     record = _load_record(run_record)
@@ -300,9 +294,7 @@ def recorder(run_record: Path, *, out: Path, **options: Any) -> None:
     _run_nodes(nodes, **options)
 
 
-def _run_nodes(
-    nodes: Callable[[], list[NetworkNode]], *, lifeline: int | None, discovery_timeout: float
-) -> None:
+def _run_nodes(nodes: Callable[[], list[NetworkNode]], *, lifeline: int | None, discovery_timeout: float) -> None:
     from msg_agents.process import hold_lifeline, run_nodes
 
     if lifeline is not None:
@@ -325,7 +317,5 @@ def _load_record(path: Path) -> RunRecord:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}): expected a run record from msg-agents prepare"
-        ) from error
+        raise InputError(f"{path}: cannot be read ({error}): expected a run record from msg-agents prepare") from error
     return RunRecord.from_json(text, str(path))

@@ -10,7 +10,6 @@ from rclpy.publisher import Publisher
 from rclpy.task import Future
 
 from msg_agents.errors import RCLError
-
 from msg_analysis.model.record import RunRecord
 
 EXPERIMENT_TOPIC = "experiment"
@@ -50,9 +49,7 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         """Count a message that is no part of this run; say so the first time."""
         self.refused[reason] += 1
         if self.refused[reason] == 1:
-            self.get_logger().warning(
-                f"refused a message on {topic}: {reason} (further ones are only counted)"
-            )
+            self.get_logger().warning(f"refused a message on {topic}: {reason} (further ones are only counted)")
 
     def publish(self, publisher: Publisher, data: bytes) -> None:
         """Publish serialized bytes, again and again until they go through.

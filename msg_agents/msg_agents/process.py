@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -87,6 +88,9 @@ def run_nodes(
         for node in nodes:
             spinner.add_node(node)
         _gate(nodes, discovery_timeout)
+        # All that stands now stands until the end: the garbage collector need not look at it again, at every step.
+        gc.collect()
+        gc.freeze()
         for node in nodes:
             node.begin()
         for node in nodes:
@@ -116,9 +120,7 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
         if not waiting:
             return
         if time.monotonic() > deadline:
-            missing = sorted(
-                {name for topics in awaited.values() for names in topics.values() for name in names}
-            )
+            missing = sorted({name for topics in awaited.values() for names in topics.values() for name in names})
             raise NotFoundError(
                 f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} had not found: "
                 f"{', '.join(missing)}. Are they running, in the same ROS_DOMAIN_ID "

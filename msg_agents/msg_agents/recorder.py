@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import struct
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
 from msg_agents_interfaces.msg import AgentState as AgentStateMsg
@@ -12,12 +13,15 @@ from std_msgs.msg import String
 
 from msg_agents.node import EXPERIMENT_TOPIC, GRAPH_TOPIC, NetworkNode, state_topic
 from msg_agents.qos import LOSSLESS
-from msg_analysis.bags.cdr import ActiveGraph, CdrError, StateFrame, stamp_ns
+from msg_analysis.bags.cdr import ActiveGraph, AgentState, CdrError, StateFrame, decode_string, stamp_ns
 from msg_analysis.bags.schemas import network_topics
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
+from msg_analysis.model.law import all_finite
 from msg_analysis.model.record import RunRecord
 
+Message = TypeVar("Message", AgentState, ActiveGraph)
+OTHER_RUN, OTHER_AGENT = "of another run", "of another agent than its topic"
 FLUSH_PERIOD = 1.0
 """s of wall time. What a killed recorder loses at most, where a chunk takes longer to fill."""
 
@@ -40,49 +44,76 @@ class Recorder(NetworkNode):
         self.bag = BagWriter(directory, topics, record=record.to_json())
         self._last = experiment.steps
         self._frame = StateFrame(self.run, experiment.run.replicas)
-        self._awaiting = experiment.agents + 2  # last states, last sojourn, experiment
+        # Topics whose last message (last state, last sojourn, experiment) has not come.
+        self._awaiting = {topic.name for topic in topics}
         self.create_subscription(String, EXPERIMENT_TOPIC, self._record_experiment, LOSSLESS, raw=True)
         self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._record_graph, LOSSLESS, raw=True)
         for agent in range(experiment.agents):
-            self.create_subscription(
-                AgentStateMsg, state_topic(agent), self._recorder(agent), LOSSLESS, raw=True
-            )
+            self.create_subscription(AgentStateMsg, state_topic(agent), self._recorder(agent), LOSSLESS, raw=True)
         self.create_timer(FLUSH_PERIOD, self._guarded(self.bag.flush))
 
     def finish(self, *, complete: bool) -> None:  # noqa: ARG002  an interrupted bag is closed just as well
         """Close the bag: it is complete only if the recorder saw the end of the run."""
-        self.bag.close(complete=self._awaiting == 0)
+        self.bag.close(complete=not self._awaiting)
 
     def _recorder(self, agent: int) -> Callable[[bytes], None]:
         """The callback for one agent's states: this is the hot path."""
         topic = self.resolve_topic_name(state_topic(agent))
+        decode = self._frame.decode
         write = self.bag.write
-        last = struct.pack("<Q", self._last)
-        frame_size = self._frame.size
+        last = self._last
 
         def record(data: bytes) -> None:
+            frame = decode(data)
+            if frame is None or frame[0] != agent + 1:  # not what the agents of this run send: have a closer look
+                message = self._decode(AgentState, data, topic)
+                if message is None:
+                    return
+                if message.agent != agent + 1:
+                    self.refuse(OTHER_AGENT, topic)
+                    return
             try:
                 write(topic, data, stamp_ns(data))
-            except (BagError, CdrError) as error:
+            except BagError as error:
                 self.fail(error)
                 return
-            # Bytes 44..52 of the agents' own layout are the step.
-            if data[44:52] == last and len(data) == frame_size:
-                self._came()
+            if frame is not None and frame[1] == last and all_finite(frame[3]):
+                self._came(topic)
 
         return record
 
     def _record_graph(self, data: bytes) -> None:
-        self._write(GRAPH_TOPIC, data, stamp_ns(data))
-        if ActiveGraph.decode(data).last_step == self._last - 1:
-            self._came()
+        graph = self._decode(ActiveGraph, data, GRAPH_TOPIC)
+        if graph is not None:
+            self._write(GRAPH_TOPIC, data, graph.stamp, last=graph.last_step == self._last - 1)
 
     def _record_experiment(self, data: bytes) -> None:
-        self._write(EXPERIMENT_TOPIC, data, 0)
-        self._came()
+        try:
+            run = json.loads(decode_string(data))["run"]
+        except (ValueError, KeyError, TypeError):  # CdrError and JSON's own among them
+            run = None
+        if run == str(self.record.run):
+            self._write(EXPERIMENT_TOPIC, data, 0, last=True)
+        else:
+            self.refuse(OTHER_RUN, EXPERIMENT_TOPIC)
 
-    def _write(self, topic: str, data: bytes, time: int) -> None:
-        self._guarded(lambda: self.bag.write(self.resolve_topic_name(topic), data, time))()
+    def _decode(self, kind: type[Message], data: bytes, topic: str) -> Message | None:
+        """The message, if it is one of this run. What is wrong with those of this run, the reader of the bag tells."""
+        try:
+            message = kind.decode(data)
+        except CdrError as error:
+            self.refuse(str(error), topic)
+            return None
+        if message.run != self.run:
+            self.refuse(OTHER_RUN, topic)
+            return None
+        return message
+
+    def _write(self, topic: str, data: bytes, time: int, *, last: bool) -> None:
+        name = self.resolve_topic_name(topic)
+        self._guarded(lambda: self.bag.write(name, data, time))()
+        if last:
+            self._came(name)
 
     def _guarded(self, action: Callable[[], None]) -> Callable[[], None]:
         def guarded() -> None:
@@ -93,7 +124,7 @@ class Recorder(NetworkNode):
 
         return guarded
 
-    def _came(self) -> None:
-        self._awaiting -= 1
-        if self._awaiting == 0 and not self.done.done():
+    def _came(self, topic: str) -> None:
+        self._awaiting.discard(topic)
+        if not self._awaiting and not self.done.done():
             self.done.set_result(None)

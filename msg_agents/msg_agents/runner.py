@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msg_agents.domain import free_domain
+from msg_agents.environment import node_environment
 from msg_agents.network import count_processes, plan_network
 from msg_agents.supervisor import Supervisor
 from msg_analysis.bags.reader import read_bag
@@ -23,7 +23,7 @@ from msg_analysis.bags.writer import RECORDING_MARKER
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.trajectory import Trajectory
-from msg_analysis.model.twin import new_record
+from msg_analysis.twin import new_record
 
 if TYPE_CHECKING:
     from msg_analysis.inference.compare import Comparison
@@ -55,37 +55,16 @@ class RunResult:
     comparison: Comparison | None = None
 
 
-def node_environment(domain: int) -> dict[str, str]:
-    """Environment of the processes of a run on this machine, where the user has not said otherwise.
-
-    Parameters
-    ----------
-    domain : ROS_DOMAIN_ID
-    """
-    defaults = {
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        # As fast as shared memory for messages of this size, and a killed process leaves no segment in /dev/shm.
-        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
-        # The arithmetic of one agent is far too small for threads, which would only fight for the cores.
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-    }
-    fixed = {
-        "ROS_DOMAIN_ID": str(domain),
-        "PYTHONUNBUFFERED": "1",
-        # ``python -m`` would look for msg_agents in the working directory first, and find our source tree's folder.
-        "PYTHONSAFEPATH": "1",
-    }
-    return {**defaults, **os.environ, **fixed}
-
-
-def bag_directory(experiment: Experiment, out: Path) -> Path:
-    """A directory for a new bag, <out>/<name>_<time>, that does not exist yet."""
+def make_bag_directory(experiment: Experiment, out: Path) -> Path:
+    """Make an empty directory for a new bag, <out>/<name>_<time>, which no other run can take any more."""
     stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
     candidate, number = out / stem, 2
-    while candidate.exists():
-        candidate, number = out / f"{stem}_{number}", number + 1
-    return candidate
+    while True:
+        try:
+            candidate.mkdir()
+            return candidate
+        except FileExistsError:
+            candidate, number = out / f"{stem}_{number}", number + 1
 
 
 def run_network(
@@ -118,7 +97,7 @@ def run_network(
     count_processes(experiment)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-    bag = bag_directory(experiment, out.absolute()) if out is not None else None
+    bag = make_bag_directory(experiment, out.absolute()) if out is not None else None
     result = RunResult(bag)
     workshop = Path(tempfile.mkdtemp(prefix="msg_agents_"))
     try:
@@ -136,10 +115,12 @@ def run_network(
                 _collect_failures(supervisor, result, interrupted)
         if bag is not None:
             _settle(bag, result)
-            if bag.exists():
-                shutil.copytree(workshop, bag / "log")
+            shutil.copytree(workshop, bag / "log")
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
+        if bag is not None:
+            with suppress(OSError):
+                bag.rmdir()  # if nothing came of it
     return result
 
 
@@ -182,18 +163,19 @@ def _settle(bag: Path, result: RunResult) -> None:
         if (bag / RECORDING_MARKER).exists():
             report = salvage_in_place(bag)
             result.failures.append(f"the bag was salvaged: {report.kept_messages} messages kept")
+        if result.failures and not any(bag.glob("*.mcap")):
+            result.failures.append("nothing was recorded: it ended before the recorder had made a bag")
+            return
         result.trajectory = read_bag(bag)
     except BagError as error:
         result.failures.append(str(error))
         return
     if result.failures:
         last = [
-            int(steps[-1]) if (steps := present.nonzero()[0]).size else -1
-            for present in result.trajectory.present.T
+            int(steps[-1]) if (steps := present.nonzero()[0]).size else -1 for present in result.trajectory.present.T
         ]
         result.failures.append(
-            "last recorded step: "
-            + ", ".join(f"agent {i + 1}: {k if k >= 0 else 'none'}" for i, k in enumerate(last))
+            "last recorded step: " + ", ".join(f"agent {i + 1}: {k if k >= 0 else 'none'}" for i, k in enumerate(last))
         )
 
 

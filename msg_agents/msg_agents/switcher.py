@@ -46,9 +46,7 @@ class Switcher(NetworkNode):
         self._steps = record.experiment.steps
         self._reached = [-1] * model.agents
         self._on_progress = on_progress
-        self._ahead: list[
-            int
-        ] = []  # first steps of the published sojourns that the slowest agent has not reached
+        self._ahead: list[int] = []  # first steps of the published sojourns that the slowest agent has not reached
         self._expected = [agent_name(i) for i in range(model.agents)] + readers
         self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LOSSLESS)
         self._graph = self.create_publisher(ActiveGraphMsg, GRAPH_TOPIC, LOSSLESS)

@@ -70,9 +70,7 @@ class Synchronizer(Generic[Value]):
         self._unplanned = 0  # first step whose graph is not known
         missing = {j for row in inputs for j in row} - self._buffers.keys()
         if missing:
-            raise ValueError(
-                f"agent {agent} uses {sorted(missing)}, who are not among its peers {sorted(peers)}"
-            )
+            raise ValueError(f"agent {agent} uses {sorted(missing)}, who are not among its peers {sorted(peers)}")
 
     def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
         """Take note of a sojourn of the graph.

@@ -48,7 +48,7 @@ def holder(domains: range, directory: Path) -> Iterator[tuple[subprocess.Popen[s
     """Another process that holds a domain."""
     code = HOLD.format(first=domains.start, end=domains.stop)
     environment = {**os.environ, "TMPDIR": str(directory)}
-    command = [sys.executable, "-c", code]
+    command = [sys.executable, "-P", "-c", code]
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
     ) as process:

@@ -51,12 +51,7 @@ def serial(case: Case) -> list[list[int]]:
     states = [[agent + 1 for agent in range(case.agents)]]
     for mode in modes:
         now = states[-1]
-        states.append(
-            [
-                law(now[i], i, mode, [(j, now[j]) for j in case.inputs[mode][i]])
-                for i in range(case.agents)
-            ]
-        )
+        states.append([law(now[i], i, mode, [(j, now[j]) for j in case.inputs[mode][i]]) for i in range(case.agents)])
     return states
 
 
@@ -203,9 +198,7 @@ def explore(case: Case) -> Iterator[Network]:
     ],
     ids=["pair that parts and meets", "directed pair that turns round", "three of whom one is always alone"],
 )
-def test_every_order_of_a_small_network(
-    agents: int, inputs: Inputs, path: list[Sojourn], window: int
-) -> None:
+def test_every_order_of_a_small_network(agents: int, inputs: Inputs, path: list[Sojourn], window: int) -> None:
     case = Case(agents, path[-1][3] + 1, window, inputs, path)
     expected = serial(case)
     ends = 0

@@ -71,9 +71,7 @@ def stamp_ns(data: bytes) -> int:
     try:
         seconds, nanoseconds = _STAMP[data[:2]].unpack_from(data)
     except (KeyError, struct.error) as error:
-        raise CdrError(
-            f"stamp: no CDR header and stamp in {bytes(data[:12]).hex(' ') or 'no bytes'}"
-        ) from error
+        raise CdrError(f"stamp: no CDR header and stamp in {bytes(data[:12]).hex(' ') or 'no bytes'}") from error
     return int(seconds) * _SECOND + int(nanoseconds)
 
 
@@ -108,9 +106,7 @@ class StateCodec:
         ValueError : state of another shape or type (its bytes would be a different message)
         """
         if state.shape != self._shape or state.dtype != np.float64:
-            raise ValueError(
-                f"state: {state.dtype} of shape {state.shape}, expected float64 of shape {self._shape}"
-            )
+            raise ValueError(f"state: {state.dtype} of shape {state.shape}, expected float64 of shape {self._shape}")
         seconds, nanoseconds = divmod(self._nanoseconds(step), _SECOND)
         fixed = (1, 0, self._run, self._agent, step, mode, 0, self._replicas)
         return _STATE.pack(LITTLE_ENDIAN, seconds, nanoseconds, *fixed) + state.tobytes()
@@ -158,9 +154,7 @@ class _Reader:
     def _take(self, size: int, alignment: int, what: str) -> int:
         start = self._at + (HEADER_SIZE - self._at) % alignment
         if start + size > len(self._data):
-            raise CdrError(
-                f"{self._kind}.{what}: needs {start + size} bytes, the message has {len(self._data)}"
-            )
+            raise CdrError(f"{self._kind}.{what}: needs {start + size} bytes, the message has {len(self._data)}")
         self._at = start + size
         return start
 
@@ -341,9 +335,7 @@ class ActiveGraph:
         weight = reader.array("f8", "weight")
         reader.end()
         if not len(source) == len(target) == len(weight):
-            raise CdrError(
-                f"ActiveGraph: {len(source)} sources, {len(target)} targets and {len(weight)} weights"
-            )
+            raise CdrError(f"ActiveGraph: {len(source)} sources, {len(target)} targets and {len(weight)} weights")
         arcs = tuple(zip(source.tolist(), target.tolist(), weight.tolist(), strict=True))
         return cls(stamp, run, sequence, mode, name, first, last, arcs, frame_id)
 

@@ -75,9 +75,7 @@ def bag_information(files: Sequence[FileCount], custom: Mapping[str, str]) -> di
     topics: dict[str, ChannelCount] = {}
     for file in files:
         for name, channel in file.channels.items():
-            total = topics.setdefault(
-                name, ChannelCount(name, channel.type_name, channel.type_hash, channel.qos)
-            )
+            total = topics.setdefault(name, ChannelCount(name, channel.type_name, channel.type_hash, channel.qos))
             total.messages += channel.messages
     start = min(file.start for file in files)
     return {
@@ -152,9 +150,7 @@ def read_metadata(directory: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise BagError(
-            f"{file}: cannot be read ({error}): move it away to read the .mcap files alone"
-        ) from error
+        raise BagError(f"{file}: cannot be read ({error}): move it away to read the .mcap files alone") from error
     information = document.get(_ROOT) if isinstance(document, dict) else None
     if not isinstance(information, dict):
         raise BagError(f"{file}: no {_ROOT} in it: expected the metadata of a ROS 2 bag")

@@ -81,8 +81,7 @@ def bag_files(path: Path) -> list[Path]:
     storage = information.get("storage_identifier")
     if storage != "mcap":
         raise BagError(
-            f"{path}: its storage is {storage}, expected mcap: record with `ros2 bag record -s mcap`, or "
-            f"convert it"
+            f"{path}: its storage is {storage}, expected mcap: record with `ros2 bag record -s mcap`, or convert it"
         )
     if str(information.get("compression_mode", "")).lower() == "message":
         raise BagError(
@@ -93,9 +92,7 @@ def bag_files(path: Path) -> list[Path]:
     files = [path / str(name) for name in information.get("relative_file_paths") or []]
     lost = [file.name for file in files if not file.is_file()]
     if lost or not files:
-        raise BagError(
-            f"{path}: {', '.join(lost) or 'every file'} of its metadata.yaml is missing: copy the whole bag"
-        )
+        raise BagError(f"{path}: {', '.join(lost) or 'every file'} of its metadata.yaml is missing: copy the whole bag")
     return files
 
 
@@ -173,12 +170,8 @@ def _choose(contents: _Contents, path: Path) -> RunRecord:
     with_states = [record for run, record in records.items() if counts.get(run)]
     candidates = with_states or list(records.values())
     if len(candidates) > 1:
-        listed = "; ".join(
-            f"{r.run} ({r.experiment.name}, {counts.get(r.run.bytes, 0)} states)" for r in candidates
-        )
-        raise BagError(
-            f"{path}: {len(candidates)} runs in one bag: {listed}: record each run into a bag of its own"
-        )
+        listed = "; ".join(f"{r.run} ({r.experiment.name}, {counts.get(r.run.bytes, 0)} states)" for r in candidates)
+        raise BagError(f"{path}: {len(candidates)} runs in one bag: {listed}: record each run into a bag of its own")
     return candidates[0]
 
 
@@ -226,9 +219,7 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
         refused={reason: count for reason, count in sorted(refused.items()) if count},
     )
     shape = (steps + 1, agents)
-    return Trajectory(
-        record, states.reshape(*shape, replicas), modes, completeness, agent_modes.reshape(shape)
-    )
+    return Trajectory(record, states.reshape(*shape, replicas), modes, completeness, agent_modes.reshape(shape))
 
 
 def _out_of_order(states: States, index: IntArray) -> int:

@@ -124,9 +124,7 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
         write_metadata(directory, bag_information(counts, _CUSTOM))
         (directory / RECORDING_MARKER).unlink(missing_ok=True)
     except OSError as error:
-        raise BagError(
-            f"{directory}: cannot be written ({error.strerror}): nothing was lost, try again"
-        ) from error
+        raise BagError(f"{directory}: cannot be written ({error.strerror}): nothing was lost, try again") from error
     finally:
         for copy in copies:
             copy.unlink(missing_ok=True)

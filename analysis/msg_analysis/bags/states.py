@@ -87,9 +87,7 @@ class StateColumns:
                 self._add_any(batch.message(int(chosen[index])), self._position + index)
         self._position += len(chosen)
 
-    def _add_fixed(
-        self, batch: Batch, chosen: IntArray, alike: IntArray, layout: np.dtype[np.void]
-    ) -> IntArray:
+    def _add_fixed(self, batch: Batch, chosen: IntArray, alike: IntArray, layout: np.dtype[np.void]) -> IntArray:
         """Take the messages of the fixed layout; the indices of the others come back."""
         start = batch.extent[chosen[alike], 0]
         data = np.frombuffer(batch.data, np.uint8)
@@ -148,9 +146,7 @@ class StateColumns:
         parts = self._columns.pop((run, replicas), []) or [empty]
         position = np.concatenate([part.position for part in parts])
         order = np.argsort(position, kind="stable")
-        columns = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("agent", "step", "mode")
-        )
+        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in ("agent", "step", "mode"))
         agent, step, mode = (column[order] for column in columns)
         state = np.concatenate([part.state for part in parts])
         if not np.array_equal(order, np.arange(len(order))):

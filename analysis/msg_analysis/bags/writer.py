@@ -40,7 +40,7 @@ class BagWriter:
 
     Parameters
     ----------
-    directory : of the bag; must not exist
+    directory : of the bag; must not exist, or be empty
     topics : what it will hold
     record : the run record as JSON; kept in the file as well, so that a torn bag still tells what run it is
         of
@@ -56,13 +56,14 @@ class BagWriter:
         self._custom: dict[str, str] = {}
         self._closed = False
         try:
-            self.directory.mkdir(parents=True)
+            # It may be there already, empty: whoever starts several runs at once reserves their names that way.
+            self.directory.mkdir(parents=True, exist_ok=True)
+            if any(self.directory.iterdir()):
+                raise FileExistsError
             self._stream: BinaryIO = (self.directory / self._file.name).open("xb")
             self._marker = (self.directory / RECORDING_MARKER).open("w", encoding="utf-8")
         except FileExistsError as error:
-            raise BagError(
-                f"{directory}: exists already: choose another name, or move it away first"
-            ) from error
+            raise BagError(f"{directory}: exists already: choose another name, or move it away first") from error
         except OSError as error:
             raise BagError(f"{directory}: cannot be made ({error.strerror}): choose another place") from error
         try:

@@ -234,15 +234,11 @@ def _estimates(means: TimeMeans) -> tuple[Estimate, list[Estimate]]:
     combinations = np.vstack([means.nodes.sum(axis=0), means.nodes])
     measured, predicted = combinations @ means.measured, combinations @ means.predicted
     errors = np.sqrt(np.einsum("aq,qr,ar->a", combinations, means.covariance, combinations).clip(0.0))
-    estimates = [
-        _estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)
-    ]
+    estimates = [_estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
     tested = [i for i, estimate in enumerate(estimates) if i > 0 and estimate.p is not None]
     adjusted = dict(zip(tested, holm(np.array([estimates[i].p for i in tested], dtype=float)), strict=True))
     nodes = [
-        Estimate(
-            e.measured, e.predicted, e.standard_error, e.z, e.p, float(adjusted[i]) if i in adjusted else None
-        )
+        Estimate(e.measured, e.predicted, e.standard_error, e.z, e.p, float(adjusted[i]) if i in adjusted else None)
         for i, e in enumerate(estimates)
         if i > 0
     ]
@@ -275,9 +271,7 @@ def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
 def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:
     """Mean of the system error up to some steps, denser at the beginning, and its standard error."""
     steps = len(means.system_series)
-    spaced = np.concatenate(
-        [np.geomspace(1, steps, RUNNING_POINTS // 2), np.linspace(1, steps, RUNNING_POINTS // 2)]
-    )
+    spaced = np.concatenate([np.geomspace(1, steps, RUNNING_POINTS // 2), np.linspace(1, steps, RUNNING_POINTS // 2)])
     counts = np.unique(np.rint(spaced).astype(int))
     return {
         "time": counts * dt,

@@ -110,9 +110,7 @@ def _pass(observation: Observation, directions: list[_Directions]) -> tuple[_Sum
     """One pass over the run: the sums of each graph, and the whiteness test."""
     step, n, m = observation.step, observation.step.modes, observation.step.agents
     consensus = observation.prediction.experiment.problem == "consensus"
-    sums = _Sums(
-        np.zeros(n, np.int64), np.zeros((n, m, m)), np.zeros((n, m, m + 1)), np.zeros((n, m + 1, m + 1))
-    )
+    sums = _Sums(np.zeros(n, np.int64), np.zeros((n, m, m)), np.zeros((n, m, m + 1)), np.zeros((n, m + 1, m + 1)))
     # Graphs may differ in the number of noisy directions; the strongest ones that all have are iid N(0, I) in
     # any case.
     whitened = _Whiteness(min(len(d.whitener) for d in directions))
@@ -190,9 +188,7 @@ def _covariance_p(step: StepModel, directions: list[_Directions], sums: _Sums) -
     noise is the same in every graph, else per graph and added up. With too few samples for a determinant: the
     exact chi-square of the total size.
     """
-    groups = (
-        [list(range(step.modes))] if (step.noise == step.noise[0]).all() else [[g] for g in range(step.modes)]
-    )
+    groups = [list(range(step.modes))] if (step.noise == step.noise[0]).all() else [[g] for g in range(step.modes)]
     statistic, dof = 0.0, 0.0
     for group in groups:
         whitener = directions[group[0]].whitener

@@ -35,9 +35,7 @@ class Observation:
     def of(cls, trajectory: Trajectory, prediction: Prediction) -> Observation:
         """Everything before the first gap."""
         steps = trajectory.prefix
-        return cls(
-            prediction, trajectory.states[: steps + 1], trajectory.modes[:steps], trajectory.record.start
-        )
+        return cls(prediction, trajectory.states[: steps + 1], trajectory.modes[:steps], trajectory.record.start)
 
     @property
     def step(self) -> StepModel:

@@ -11,10 +11,10 @@ from msg_analysis.model.chain import stationary_law
 from msg_analysis.types import FloatArray, IntArray
 
 PATHS = 9999
-MAX_JUMPS = 100_000_000
+MAX_JUMPS = 10_000_000
 """Jumps simulated at most; longer runs make do with fewer paths."""
 MIN_EXPECTED = 25.0
-"""Per cell, for Pearson's law: with 5, twice too many p-values fall below 0.01 (measured on slow two-state chains)."""
+"""Expected count of every possible transition from which on the chi-square law is used."""
 SEED = 20_240_229
 
 
@@ -37,9 +37,10 @@ class SwitchingTest:
 def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
     """Test a path of the graph against its chain.
 
-    Pearson's chi-square when every possible transition is expected often enough; else the likelihood-
-    ratio statistic against its law over simulated paths of the same length from the same first graph (fixed
-    seed), with a gamma fit where none of them is as extreme.
+    Likelihood-ratio statistic G. Its law is chi-square when every possible transition is expected often
+    enough; else it is simulated: paths of the same length from the same first graph (fixed seed), with a
+    gamma fit where none of them is as extreme. With two graphs and 6 expected switches each way, 2.3 % of
+    Pearson's p-values would be below 0.01 and 0.7 % below 0.001; of these, 0.9 % and 0.15 % (20 000 paths).
 
     Parameters
     ----------
@@ -57,10 +58,10 @@ def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
         return SwitchingTest(counts, expected, 0.0)
     if dof == 0:
         return SwitchingTest(counts, expected, None)
-    # Judged by what the chain leads to expect, not by what happened: a choice that depends on the data is a bias.
+    # Judged by what the chain leads to expect, not by what happened: a choice made from the data is a bias.
     usual = (len(modes) - 1) * stationary_law(transition)[:, None] * transition
     if usual[transition > 0.0].min() >= MIN_EXPECTED:
-        chi2 = float(((counts - expected)[possible] ** 2 / expected[possible]).sum())
+        chi2 = float(likelihood_ratio(counts, transition))
         return SwitchingTest(counts, expected, float(stats.chi2.sf(chi2, dof)))
     return SwitchingTest(counts, expected, _simulated_p(counts, transition, int(modes[0])))
 

@@ -26,9 +26,7 @@ class AgentLaw:
         self.agent = agent
         self.step = 0
         self.state: FloatArray = record.start[agent].copy()
-        self._noise = ProcessNoise(
-            record.experiment.run.seed, model.noise_gain, record.experiment.run.replicas
-        )
+        self._noise = ProcessNoise(record.experiment.run.seed, model.noise_gain, record.experiment.run.replicas)
         self._block = self._noise.block(agent, 0)
         modes = range(model.modes)
         self._inputs = [[int(j) for j in model.inputs(mode, agent)] for mode in modes]

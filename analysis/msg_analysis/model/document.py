@@ -67,17 +67,13 @@ def read_yaml(path: Path) -> Any:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: byte {error.start}: not UTF-8 text: expected an experiment file (YAML)"
-        ) from error
+        raise InputError(f"{path}: byte {error.start}: not UTF-8 text: expected an experiment file (YAML)") from error
     try:
         return yaml.load(text, _StrictLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise InputError(
-            f"{path}: {line}{', '.join(filter(None, (error.context, error.problem)))}"
-        ) from error
+        raise InputError(f"{path}: {line}{', '.join(filter(None, (error.context, error.problem)))}") from error
     except (yaml.YAMLError, ValueError) as error:
         raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
     except RecursionError as error:

@@ -259,9 +259,7 @@ class _Sections:
             leaders_good = not found
             self.problems += found
         if self.values["graphs"] and self.values["switching"] and time:
-            self.chain, found = validation.chain_of(
-                self.values["switching"], list(self.values["graphs"]), time
-            )
+            self.chain, found = validation.chain_of(self.values["switching"], list(self.values["graphs"]), time)
             self.problems += found
         whole_steps = False
         if run and time:
@@ -331,11 +329,7 @@ class _Sections:
     def _build_graphs(self) -> None:
         assert self.agents is not None
         graphs: dict[str, GraphSpec] = self.values["graphs"]
-        found = [
-            line for name, spec in graphs.items() for line in topology.link_problems(name, spec, self.agents)
-        ]
+        found = [line for name, spec in graphs.items() for line in topology.link_problems(name, spec, self.agents)]
         self.problems += found
         if not found:
-            self.graphs = tuple(
-                topology.build_graph(name, spec, self.agents) for name, spec in graphs.items()
-            )
+            self.graphs = tuple(topology.build_graph(name, spec, self.agents) for name, spec in graphs.items())

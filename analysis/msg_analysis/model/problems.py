@@ -32,9 +32,7 @@ class ExperimentError(InputError):
         if len(self.problems) == 1:
             text = f"{source}: {self.problems[0]}"
         else:
-            text = f"{source}: {len(self.problems)} problems" + "".join(
-                f"\n  {line}" for line in self.problems
-            )
+            text = f"{source}: {len(self.problems)} problems" + "".join(f"\n  {line}" for line in self.problems)
         super().__init__(text)
 
 
@@ -113,9 +111,7 @@ def translate(error: ErrorDetails) -> str:
             _did_you_mean(location[-1], known) or "remove it",
         )
     wanted = _EXPECTED.get(kind)
-    text = (
-        wanted.format(**{k: _plain(v) for k, v in error.get("ctx", {}).items()}) if wanted else error["msg"]
-    )
+    text = wanted.format(**{k: _plain(v) for k, v in error.get("ctx", {}).items()}) if wanted else error["msg"]
     options = re.findall(r"'(\w+)'", text) if kind == "literal_error" else []
     return problem(key, show(value), text, _did_you_mean(value, options) or example)
 

@@ -93,7 +93,5 @@ class RunRecord:
             raise InputError(f"{source}: not a run record ({type(error).__name__}: {error})") from error
         expected = (experiment.agents, experiment.run.replicas)
         if start.shape != expected or not np.isfinite(start).all():
-            raise InputError(
-                f"{source}: start has shape {start.shape}, expected finite numbers of shape {expected}"
-            )
+            raise InputError(f"{source}: start has shape {start.shape}, expected finite numbers of shape {expected}")
         return record

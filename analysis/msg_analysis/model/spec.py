@@ -121,12 +121,8 @@ class GraphSpec(_Section):
 
     model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 1})
 
-    path: list[Label] | None = Field(
-        None, min_length=2, description="agents along a line", examples=[[1, 2, 3]]
-    )
-    cycle: list[Label] | None = Field(
-        None, min_length=3, description="agents around a ring", examples=[[1, 2, 3]]
-    )
+    path: list[Label] | None = Field(None, min_length=2, description="agents along a line", examples=[[1, 2, 3]])
+    cycle: list[Label] | None = Field(None, min_length=3, description="agents around a ring", examples=[[1, 2, 3]])
     edges: Links | None = Field(
         None,
         description="undirected: [i, j] or [i, j, weight], weight 1 by default",
@@ -185,12 +181,8 @@ class NoiseSpec(_Section):
     process: Annotated[
         float | list[float] | list[list[float]],
         PlainValidator(_process, json_schema_input_type=NonNegative | list[NonNegative] | Matrix),
-    ] = Field(
-        1.0, description="noise gain: a number, one per agent, or the matrix F with Q = F F^T", examples=[1.0]
-    )
-    broadcast: NonNegative = Field(
-        0.0, description="standard deviation added to each published value", examples=[0.0]
-    )
+    ] = Field(1.0, description="noise gain: a number, one per agent, or the matrix F with Q = F F^T", examples=[1.0])
+    broadcast: NonNegative = Field(0.0, description="standard deviation added to each published value", examples=[0.0])
     link: NonNegative = Field(0.0, description="standard deviation added by each receiver", examples=[0.0])
     loss: Annotated[Number, Field(ge=0, lt=1)] = Field(
         0.0, description="probability that a directed message is ignored in a step", examples=[0.0]
@@ -217,21 +209,15 @@ class RunSpec(_Section):
         description="simulated time of a step; 0.05 by default, always 1 in discrete time",
         examples=[0.05],
     )
-    duration: Positive = Field(
-        100.0, description="simulated time units, a whole number of steps", examples=[400.0]
-    )
-    replicas: Count = Field(
-        1, description="independent copies of every state under the same graphs", examples=[16]
-    )
+    duration: Positive = Field(100.0, description="simulated time units, a whole number of steps", examples=[400.0])
+    replicas: Count = Field(1, description="independent copies of every state under the same graphs", examples=[16])
     seed: Annotated[int, Field(strict=True, ge=0)] = Field(
         0, description="of everything random in the run", examples=[7]
     )
     start: Annotated[
         str | list[float],
         PlainValidator(_start, json_schema_input_type=Literal["stationary", "zero"] | list[Number]),
-    ] = Field(
-        "stationary", description="'stationary', 'zero' or one value per agent", examples=["stationary"]
-    )
+    ] = Field("stationary", description="'stationary', 'zero' or one value per agent", examples=["stationary"])
     pace: Literal["lockstep", "realtime"] = Field(
         "lockstep",
         description="lockstep: as fast as it goes, deterministic; realtime: every agent on its own timer",

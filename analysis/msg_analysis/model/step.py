@@ -112,9 +112,7 @@ def build_step_model(experiment: Experiment) -> StepModel:
     for mode, a in enumerate(coupling):
         per_link = np.diag((a**2).sum(axis=1))
         noise[mode] += (1 - loss) * experiment.noise.link**2 * per_link
-        noise[mode] += experiment.noise.broadcast**2 * (
-            (1 - loss) ** 2 * a @ a.T + loss * (1 - loss) * per_link
-        )
+        noise[mode] += experiment.noise.broadcast**2 * ((1 - loss) ** 2 * a @ a.T + loss * (1 - loss) * per_link)
     lost = loss * coupling
     mean = weights - lost
     mean[:, range(agents), range(agents)] += lost.sum(axis=2)

@@ -58,18 +58,14 @@ def link_problems(name: str, spec: GraphSpec, agents: int) -> list[str]:
     largest = largest_label(spec)
     if largest > agents:
         return [
-            problem(
-                key, f"agent {largest}", f"expected agents 1 to {agents}", "correct it, or raise `agents`"
-            ),
+            problem(key, f"agent {largest}", f"expected agents 1 to {agents}", "correct it, or raise `agents`"),
         ]
     found = []
     seen: set[tuple[int, int]] = set()
     for i, j, _ in links(spec, agents):
         pair = (i, j) if kind == "arcs" else (min(i, j), max(i, j))
         if i == j:
-            found.append(
-                problem(key, show([i, j]), f"agent {i} is linked with itself", "remove the self-loop")
-            )
+            found.append(problem(key, show([i, j]), f"agent {i} is linked with itself", "remove the self-loop"))
         elif pair in seen:
             text = "arc" if kind == "arcs" else "edge (edges have no direction)"
             found.append(problem(key, show([i, j]), f"expected every {text} once", "remove the duplicate"))

@@ -25,9 +25,7 @@ LONGEST_DURATION = 2**31 - 1
 _MATRICES_PER_GRAPH = 6  # adjacency, W, its coupling, N, the variance of loss, and the product that makes N
 
 
-def chain_of(
-    switching: SwitchingSpec, names: Sequence[str], time: Time
-) -> tuple[MarkovChain | None, list[str]]:
+def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tuple[MarkovChain | None, list[str]]:
     """The chain that the file describes, and what is wrong with it (then the chain is None).
 
     Rows are scaled to sum to 0 (or 1) to the last bit, within the tolerance that the check allows.
@@ -105,9 +103,7 @@ def _from_matrix(
     if len(rows) != n or any(len(row) != n for row in rows):
         shape = f"{len(rows)} rows of {' or '.join(sorted({str(len(row)) for row in rows})) or 'no'} entries"
         wanted = f"expected {n} x {n}, one row and column for each graph"
-        return None, [
-            problem(f"switching.{key}", shape, wanted, "rows and columns are the graphs in file order")
-        ]
+        return None, [problem(f"switching.{key}", shape, wanted, "rows and columns are the graphs in file order")]
     matrix = np.array(rows, dtype=float)
     found = []
     for i, j in np.ndindex(n, n):
@@ -146,9 +142,7 @@ def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> l
         if len(reached) < chain.modes:
             lost = ", ".join(names[mode] for mode in range(chain.modes) if mode not in reached)
             text = f"{lost} cannot be reached from {names[source]}"
-            return [
-                problem(key, text, "expected an ergodic chain", "let every graph lead to every other one")
-            ]
+            return [problem(key, text, "expected an ergodic chain", "let every graph lead to every other one")]
     level = nx.single_source_shortest_path_length(jumps, 0)
     period = math.gcd(*(level[i] + 1 - level[j] for i, j in jumps.edges))
     text = f"the chain has period {period}"
@@ -161,9 +155,7 @@ def connection_problems(graphs: Sequence[Graph], leaders: LeadersSpec | None) ->
     Disagreement (deviation from the reference) is mean-square stable only if the union has an agent (leaders)
     from which every other one is reached.
     """
-    union = nx.from_numpy_array(
-        np.sum([graph.adjacency for graph in graphs], axis=0).T, create_using=nx.DiGraph
-    )
+    union = nx.from_numpy_array(np.sum([graph.adjacency for graph in graphs], axis=0).T, create_using=nx.DiGraph)
     if leaders is not None:
         sources = {label - 1 for label in leaders.agents}
         reached = sources.union(*(nx.descendants(union, source) for source in sources))
@@ -178,9 +170,7 @@ def connection_problems(graphs: Sequence[Graph], leaders: LeadersSpec | None) ->
         return []
     start = "a leader" if leaders is not None else f"agent{_list(sorted(sources))}"
     text = f"agent{_list(lost)} cannot be reached from {start} in the union of all graphs"
-    return [
-        problem("graphs", text, "expected a union that connects everybody", "add an edge, or lower `agents`")
-    ]
+    return [problem("graphs", text, "expected a union that connects everybody", "add an edge, or lower `agents`")]
 
 
 def _list(agents: Sequence[int], longest: int = 8) -> str:
@@ -225,16 +215,12 @@ def leader_problems(problem_kind: str, leaders: LeadersSpec | None, agents: int 
         return [problem("leaders", "missing", wanted, "for example leaders: {agents: [1], gain: 1.0}")]
     found = []
     for label in sorted(label for label in set(leaders.agents) if leaders.agents.count(label) > 1):
-        found.append(
-            problem("leaders.agents", f"agent {label} twice", "expected every leader once", "remove one")
-        )
+        found.append(problem("leaders.agents", f"agent {label} twice", "expected every leader once", "remove one"))
     if agents is None:
         return found
     for label in leaders.agents:
         if label > agents:
-            found.append(
-                problem("leaders.agents", f"agent {label}", f"expected agents 1 to {agents}", "correct it")
-            )
+            found.append(problem("leaders.agents", f"agent {label}", f"expected agents 1 to {agents}", "correct it"))
     if math.isinf(leaders.gain) and len(set(leaders.agents)) >= agents:
         wanted = "expected at least one agent that follows"
         found.append(problem("leaders.agents", "everybody, with gain inf", wanted, "remove a leader"))
@@ -292,9 +278,7 @@ def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
         found.append(problem("run.duration", run.duration, wanted, "lower run.duration"))
     if isinstance(run.start, list) and agents is not None and len(run.start) != agents:
         wanted = f"expected one value for each of the {agents} agents"
-        found.append(
-            problem("run.start", f"{len(run.start)} values", wanted, "give as many as there are agents")
-        )
+        found.append(problem("run.start", f"{len(run.start)} values", wanted, "give as many as there are agents"))
     return found
 
 

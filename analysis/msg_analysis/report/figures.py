@@ -118,9 +118,7 @@ def running_estimate(running: Mapping[str, FloatArray], predicted: float | None)
         axes = figure.subplots()
         if predicted is not None:
             band = (predicted - 1.96 * error, predicted + 1.96 * error)
-            axes.fill_between(
-                time, *band, color=SKY, alpha=0.3, lw=0, label="predicted ± 1.96 standard errors"
-            )
+            axes.fill_between(time, *band, color=SKY, alpha=0.3, lw=0, label="predicted ± 1.96 standard errors")
             axes.axhline(predicted, color=BLACK, lw=1.2, label="predicted")
         axes.plot(time, mean, color=BLUE, lw=1.5, label="mean up to this time")
         axes.set(xlabel="simulated time", ylabel="system error", xlim=(0, time[-1]))
@@ -151,9 +149,7 @@ def covariances(measured: FloatArray | None, predicted: FloatArray) -> str:
         axes = figure.subplots(1, len(panels), squeeze=False)[0]
         for panel, (title, matrix) in zip(axes, panels, strict=True):
             extent = (0.5, agents + 0.5, agents + 0.5, 0.5)
-            image = panel.imshow(
-                matrix, cmap="PuOr_r", vmin=-limit, vmax=limit, extent=extent, interpolation="nearest"
-            )
+            image = panel.imshow(matrix, cmap="PuOr_r", vmin=-limit, vmax=limit, extent=extent, interpolation="nearest")
             panel.set_title(title)
             panel.grid(visible=False)
             panel.spines[:].set_visible(False)

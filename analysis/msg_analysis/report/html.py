@@ -116,9 +116,7 @@ def _explanation(document: dict[str, Any]) -> str:
     tests, completeness, level = document["tests"], document["completeness"], document["level"]
     if document["verdict"] == "incomplete":
         lost = [
-            f"{completeness['missing']} of {completeness['expected']} states"
-            if completeness["missing"]
-            else "",
+            f"{completeness['missing']} of {completeness['expected']} states" if completeness["missing"] else "",
             f"the graph of {completeness['missing_modes']} steps" if completeness["missing_modes"] else "",
         ]
         numbers = (
@@ -127,9 +125,7 @@ def _explanation(document: dict[str, Any]) -> str:
             else "Too little came before the first gap for any number."
         )
         return f"Missing: {' and '.join(filter(None, lost))}. {numbers}"
-    chance = (
-        f"a run that follows the predicted law would be called a disagreement with a chance of {level:.2g}"
-    )
+    chance = f"a run that follows the predicted law would be called a disagreement with a chance of {level:.2g}"
     rejected = [test for test in tests if test["rejected"]]
     if not rejected:
         return f"None of {len(tests)} tests rejects the predicted law ({chance}, all tests together)."

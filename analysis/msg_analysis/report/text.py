@@ -125,17 +125,13 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     """
     run = document["run"]
     facts = _facts(console, document["name"])
-    facts.add_row(
-        "problem", f"{document['problem']} of {document['agents']} agents in {document['time']} time"
-    )
+    facts.add_row("problem", f"{document['problem']} of {document['agents']} agents in {document['time']} time")
     if document["leaders"]:
         leaders = document["leaders"]
         text = f"{_names(leaders['agents'])}, gain {leaders['gain']}, reference {leaders['reference']}"
         facts.add_row("leaders", text)
     facts.add_row("noise", ", ".join(f"{key} {_short(value)}" for key, value in document["noise"].items()))
-    facts.add_row(
-        "steps", f"{run['steps']} of {_number(run['dt'])}, {_number(run['duration'])} units of time"
-    )
+    facts.add_row("steps", f"{run['steps']} of {_number(run['dt'])}, {_number(run['duration'])} units of time")
     facts.add_row("stability limit of a step", _number(document["stability_limit"]))
     facts.add_row("copies (replicas)", str(run["replicas"]))
     facts.add_row("seed", str(run["seed"]))
@@ -160,11 +156,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
         )
     console.print(graphs)
     switching = document["switching"]
-    title = (
-        "Rates from graph to graph"
-        if document["time"] == "continuous"
-        else "Probabilities from graph to graph"
-    )
+    title = "Rates from graph to graph" if document["time"] == "continuous" else "Probabilities from graph to graph"
     names = [graph["name"] for graph in document["graphs"]]
     if 1 < len(names) <= _ROWS:
         chain = _table(console, title, "from / to", *names)
@@ -190,9 +182,7 @@ def print_bag(document: dict[str, Any], console: Console) -> None:
     facts.add_row("agents, replicas", f"{document['agents']}, {document['replicas']}")
     facts.add_row("steps", f"{document['steps']}, {_number(document['simulated_time'])} units of time")
     state = "complete" if count["complete"] else "incomplete"
-    facts.add_row(
-        "states", f"{state}: {count['received']} of {count['expected']}, {count['missing']} missing"
-    )
+    facts.add_row("states", f"{state}: {count['received']} of {count['expected']}, {count['missing']} missing")
     facts.add_row("came twice, out of order", f"{count['duplicates']}, {count['out_of_order']}")
     facts.add_row("steps without a graph", str(count["missing_modes"]))
     for reason, number in count["refused"].items():
@@ -269,7 +259,4 @@ def _names(values: Sequence[Any], longest: int = 12) -> str:
 def _links(graph: dict[str, Any]) -> str:
     """``1-2, 2-3 (0.5)`` of edges, ``1>2`` of arcs (2 listens to 1)."""
     sign, links = ("-", graph["edges"]) if graph["edges"] is not None else (">", graph["arcs"])
-    return (
-        _names([f"{i}{sign}{j}" + (f" ({weight:g})" if weight != 1 else "") for i, j, weight in links])
-        or "none"
-    )
+    return _names([f"{i}{sign}{j}" + (f" ({weight:g})" if weight != 1 else "") for i, j, weight in links]) or "none"

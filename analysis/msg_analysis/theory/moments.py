@@ -151,9 +151,7 @@ def step_operators(system: JumpSystem) -> FloatArray:
     operators = np.stack([symmetric.congruence(w) for w in system.matrices])
     if system.loss_variance is not None:
         lift = system.lift
-        entering = symmetric.pack(
-            lift[:, :, None] * lift[:, None, :]
-        )  # (m, p): e_i e_i^T in reduced coordinates
+        entering = symmetric.pack(lift[:, :, None] * lift[:, None, :])  # (m, p): e_i e_i^T in reduced coordinates
         differences = lift[:, None, :] - lift[None, :, :]
         for mode, variance in enumerate(system.loss_variance):
             seen = np.einsum("ij,ija,ijb->iab", variance, differences, differences)

@@ -32,9 +32,7 @@ def typestore() -> Any:
 def make_run() -> Callable[..., Trajectory]:
     """A trajectory with random states; no theory in it."""
 
-    def make(
-        agents: int = 3, steps: int = 40, replicas: int = 2, seed: int = 0, name: str = "small"
-    ) -> Trajectory:
+    def make(agents: int = 3, steps: int = 40, replicas: int = 2, seed: int = 0, name: str = "small") -> Trajectory:
         everybody = list(range(1, agents + 1))
         experiment = Experiment.parse(
             {

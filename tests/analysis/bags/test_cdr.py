@@ -112,9 +112,7 @@ def test_state_against_rosbags(
     state: list[float],
     little: bool,
 ) -> None:
-    message = AgentState(
-        step % 10**15, RUN, agent, step, mode, np.array(state), np.array(heard, np.uint64), frame
-    )
+    message = AgentState(step % 10**15, RUN, agent, step, mode, np.array(state), np.array(heard, np.uint64), frame)
     _same(AgentState.decode(_oracle(typestore, message, little)), message)
     if little:
         assert message.encode() == _oracle(typestore, message)

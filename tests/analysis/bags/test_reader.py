@@ -34,9 +34,7 @@ def _state(run: Trajectory, k: int, i: int, /, **changes: Any) -> AgentState:
 def _messages(run: Trajectory, namespace: str = "") -> list[Message]:
     """What a faithful recorder would have: the experiment, a sojourn every four steps, the states."""
     steps, agents, _ = run.states.shape
-    out: list[Message] = [
-        (f"{namespace}/experiment", "std_msgs/msg/String", encode_string(run.record.to_json()), 0)
-    ]
+    out: list[Message] = [(f"{namespace}/experiment", "std_msgs/msg/String", encode_string(run.record.to_json()), 0)]
     for number, first in enumerate(range(0, steps - 1, 4)):
         graph = run.record.experiment.graph_list[run.modes[first]]
         data = ActiveGraph(
@@ -47,9 +45,7 @@ def _messages(run: Trajectory, namespace: str = "") -> list[Message]:
     for k in range(steps):
         for i in range(agents):
             state = _state(run, k, i)
-            out.append(
-                (f"{namespace}/agent_{i + 1}/state", AGENT_STATE.full_name, state.encode(), state.stamp)
-            )
+            out.append((f"{namespace}/agent_{i + 1}/state", AGENT_STATE.full_name, state.encode(), state.stamp))
     return out
 
 
@@ -128,9 +124,7 @@ def test_namespace_foreign_topics_and_split_files(tmp_path: Path, make_run: Make
     _same(read_bag(tmp_path / "bag"), run)
 
 
-def test_states_with_frame_and_heard_and_in_big_endian(
-    tmp_path: Path, make_run: MakeRun, typestore: Any
-) -> None:
+def test_states_with_frame_and_heard_and_in_big_endian(tmp_path: Path, make_run: MakeRun, typestore: Any) -> None:
     run = make_run(steps=8)
     messages = _messages(run)
     kind = AGENT_STATE.full_name
@@ -212,9 +206,7 @@ def test_order_does_not_matter(tmp_path: Path, make_run: MakeRun) -> None:
 def test_first_of_contradicting_copies_counts(tmp_path: Path, make_run: MakeRun) -> None:
     run = make_run()
     messages = _messages(run)
-    messages.append(
-        ("/agent_1/state", AGENT_STATE.full_name, _state(run, 4, 0, state=np.zeros(2)).encode(), 5)
-    )
+    messages.append(("/agent_1/state", AGENT_STATE.full_name, _state(run, 4, 0, state=np.zeros(2)).encode(), 5))
     found = read_bag(_mcap(tmp_path / "x.mcap", messages))
     _same(found, run)
     assert found.completeness.refused == {"contradicts an earlier copy": 1}
@@ -285,9 +277,7 @@ def test_metadata_that_cannot_be_used(tmp_path: Path, changes: dict[str, Any], e
         "compression_mode": "",
         "relative_file_paths": ["a"],
     }
-    (tmp_path / "metadata.yaml").write_text(
-        yaml.safe_dump({"rosbag2_bagfile_information": information | changes})
-    )
+    (tmp_path / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": information | changes}))
     with pytest.raises(BagError, match=expected):
         read_bag(tmp_path)
     (tmp_path / "metadata.yaml").write_text("a: [")

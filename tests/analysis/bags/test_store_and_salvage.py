@@ -97,9 +97,7 @@ def test_store_never_overwrites(tmp_path: Path, make_run: MakeRun) -> None:
     assert (tmp_path / "bag" / "bag_0.mcap").read_bytes() == before
 
 
-def test_a_failed_store_leaves_nothing(
-    tmp_path: Path, make_run: MakeRun, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_store_leaves_nothing(tmp_path: Path, make_run: MakeRun, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*args: Any) -> None:
         raise BagError("no space")
 

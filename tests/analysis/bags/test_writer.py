@@ -121,6 +121,14 @@ def test_never_overwrites(tmp_path: Path) -> None:
         BagWriter(tmp_path / "bag" / "thesis.txt" / "bag", network_topics(1))
 
 
+def test_an_empty_directory_is_a_reserved_name(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    BagWriter(tmp_path / "bag", network_topics(1)).close()
+    assert (tmp_path / "bag" / "metadata.yaml").exists()
+    with pytest.raises(BagError, match="exists already"):
+        BagWriter(tmp_path / "bag", network_topics(1))
+
+
 def test_bag_in_progress_is_recognised(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "bag", network_topics(1))
     assert recording_pid(tmp_path / "bag") == os.getpid()

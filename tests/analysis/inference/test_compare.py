@@ -13,8 +13,8 @@ from msg_analysis.inference.compare import compare
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.trajectory import Completeness, Trajectory
-from msg_analysis.model.twin import simulate
 from msg_analysis.theory.prediction import predict
+from msg_analysis.twin import simulate
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
 SEEDS = range(100, 160)
@@ -75,9 +75,7 @@ def test_calibration(case):
     collected = [p_values(result) for result in results]
     for name in collected[0]:
         assert stats.kstest([p[name] for p in collected], "uniform").pvalue > 2e-4, name
-    covered = sum(
-        r.system_error.interval[0] <= r.system_error.predicted <= r.system_error.interval[1] for r in results
-    )
+    covered = sum(r.system_error.interval[0] <= r.system_error.predicted <= r.system_error.interval[1] for r in results)
     assert covered >= stats.binom.ppf(1e-4, len(results), 0.95)
     false_alarms = sum(result.verdict == "disagrees" for result in results)
     assert false_alarms <= stats.binom.isf(1e-4, len(results), 0.01)

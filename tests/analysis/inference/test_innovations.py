@@ -9,8 +9,8 @@ from msg_analysis.inference import innovations as module
 from msg_analysis.inference.innovations import innovation_tests, innovations, quadratic_form
 from msg_analysis.inference.observation import Observation
 from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.twin import simulate
 from msg_analysis.theory.prediction import predict
+from msg_analysis.twin import simulate
 
 
 def observe(**changes):
@@ -156,9 +156,7 @@ def test_quadratic_form_ignores_dependent_and_dead_entries():
     random = np.random.default_rng(1)
     a = random.standard_normal((3, 3))
     covariance, v = a @ a.T, random.standard_normal(3)
-    mix = (
-        np.vstack([np.eye(3), [[1.0, 1.0, 0.0]], np.zeros((1, 3))]) * np.array([1, 1e6, 1e-3, 5, 1])[:, None]
-    )
+    mix = np.vstack([np.eye(3), [[1.0, 1.0, 0.0]], np.zeros((1, 3))]) * np.array([1, 1e6, 1e-3, 5, 1])[:, None]
     chi2, dof = quadratic_form(mix @ v, mix @ covariance @ mix.T)
     assert dof == 3
     assert chi2 == pytest.approx(v @ scipy.linalg.solve(covariance, v), rel=1e-8)

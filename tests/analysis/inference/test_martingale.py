@@ -8,8 +8,8 @@ import pytest
 from msg_analysis.inference.martingale import expected_mean, time_means
 from msg_analysis.inference.observation import Observation
 from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.twin import simulate
 from msg_analysis.theory.prediction import predict
+from msg_analysis.twin import simulate
 
 
 def experiment(start="stationary", **run):

@@ -160,9 +160,7 @@ def test_rates_are_the_generator() -> None:
 def test_rows_within_the_tolerance_are_made_exact() -> None:
     third = 0.333333333333
     graphs = {name: {"path": [1, 2, 3]} for name in "abc"}
-    experiment = small(
-        graphs=graphs, time="discrete", switching={"transition": [[third, third, 1 - 2 * third]] * 3}
-    )
+    experiment = small(graphs=graphs, time="discrete", switching={"transition": [[third, third, 1 - 2 * third]] * 3})
     assert experiment.chain.matrix.sum(axis=1) == pytest.approx(1.0, abs=1e-15)
 
 
@@ -304,9 +302,7 @@ def documents(draw: st.DrawFn) -> dict[str, Any]:
         st.just({"grid": [1, m]}),
     ]
     others = draw(st.lists(st.one_of(kinds), max_size=3))
-    graphs = {"line": {"path": list(range(1, m + 1))}} | {
-        f"graph {i}": graph for i, graph in enumerate(others)
-    }
+    graphs = {"line": {"path": list(range(1, m + 1))}} | {f"graph {i}": graph for i, graph in enumerate(others)}
     discrete = draw(st.booleans())
     number = st.floats(0, 1e3)
     document: dict[str, Any] = {

@@ -376,9 +376,7 @@ def test_stability_limit_of_leaders() -> None:
     gains = np.array([math.inf, 0, 0])
     assert validation.stability_limit(star, gains) == 2.0  # followers alone: Z = I
     z = star.laplacian + np.diag([4.0, 0, 0])
-    assert validation.stability_limit(star, np.array([4.0, 0, 0])) == pytest.approx(
-        2 / np.linalg.eigvalsh(z)[-1]
-    )
+    assert validation.stability_limit(star, np.array([4.0, 0, 0])) == pytest.approx(2 / np.linalg.eigvalsh(z)[-1])
     assert validation.stability_limit(Graph("none", np.zeros((3, 3))), np.zeros(3)) == math.inf
 
 

@@ -126,9 +126,7 @@ def test_experiment_explained() -> None:
     assert line["algebraic_connectivity"] == pytest.approx(2 - 2**0.5)  # of a path of four
     assert ring["algebraic_connectivity"] == pytest.approx(2.0)  # of a ring of four
     shares = [1, 0.25, 0.125]  # detailed balance: share times rate is equal both ways
-    assert [graph["stationary"] for graph in document["graphs"]] == pytest.approx(
-        [s / sum(shares) for s in shares]
-    )
+    assert [graph["stationary"] for graph in document["graphs"]] == pytest.approx([s / sum(shares) for s in shares])
     assert document["memory"]["states"] == 1001 * 4 * 2 * 8
     output = shown(text.print_experiment, document)
     for part in (

@@ -106,9 +106,7 @@ def test_continuous_steady_state_is_the_papers(seed, m, n, directed):
 @MODELS
 @given(seeds, st.integers(2, 5), st.integers(1, 3), st.booleans(), st.booleans())
 def test_discrete_steady_state_with_noise_and_loss_that_depend_on_the_graph(seed, m, n, directed, loss):
-    system, w, noise = consensus(
-        np.random.default_rng(seed), m, n, time="discrete", directed=directed, loss=loss
-    )
+    system, w, noise = consensus(np.random.default_rng(seed), m, n, time="discrete", directed=directed, loss=loss)
     measured = system.lifted(MomentSolver(system).steady())
     np.testing.assert_allclose(measured, brute_discrete(system, w, noise), rtol=1e-8, atol=1e-9)
 
@@ -126,9 +124,7 @@ def test_one_graph_is_scipys_lyapunov_and_stein(seed, m):
 
 
 @MODELS
-@given(
-    seeds, st.integers(2, 5), st.integers(1, 4), st.sampled_from(["continuous", "discrete"]), st.booleans()
-)
+@given(seeds, st.integers(2, 5), st.integers(1, 4), st.sampled_from(["continuous", "discrete"]), st.booleans())
 def test_dual_gives_the_same_error_as_primal(seed, m, n, time, loss):
     random = np.random.default_rng(seed)
     system, _, _ = consensus(random, m, n, time=time, directed=True, loss=loss and time == "discrete")
@@ -203,9 +199,7 @@ def test_fast_switching_is_the_averaged_graph(rate):
     mean = np.einsum("i,iab->ab", slow.stationary, slow.matrices)
     oracle = scipy.linalg.solve_continuous_lyapunov(mean, slow.noise[0])
     solver = MomentSolver(fast)
-    np.testing.assert_allclose(
-        solver.steady().sum(axis=0), oracle, rtol=max(10 / rate, 1e-11), atol=10 / rate
-    )
+    np.testing.assert_allclose(solver.steady().sum(axis=0), oracle, rtol=max(10 / rate, 1e-11), atol=10 / rate)
     dual = solver.dual(np.eye(4)[None])[0]
     assert np.einsum("i,iab,iab->", fast.stationary, dual, fast.noise) == pytest.approx(
         np.trace(oracle), rel=max(10 / rate, 1e-11)
@@ -214,9 +208,7 @@ def test_fast_switching_is_the_averaged_graph(rate):
 
 def test_slow_switching_is_the_mean_of_the_graphs_held_for_ever():
     system, _, _ = consensus(np.random.default_rng(7), 5, 3)
-    slow = JumpSystem(
-        "continuous", system.matrices, system.noise, system.chain * 1e-9, system.stationary, system.lift
-    )
+    slow = JumpSystem("continuous", system.matrices, system.noise, system.chain * 1e-9, system.stationary, system.lift)
     alone = [MomentSolver(held(slow, i)).steady()[0] for i in range(3)]
     oracle = np.tensordot(slow.stationary, np.stack(alone), axes=1)
     np.testing.assert_allclose(MomentSolver(slow).steady().sum(axis=0), oracle, rtol=1e-7)
@@ -228,9 +220,7 @@ def test_disconnected_graphs_with_connected_union():
     z = np.array([[[1.0, -1, 0], [-1, 1, 0], [0, 0, 0]], [[0, 0, 0], [0, 1, -1], [0, -1, 1]]])
     noise = np.stack([np.eye(3)] * 2)
     gamma = np.array([[-1.0, 1.0], [1.0, -1.0]])
-    system = JumpSystem(
-        "continuous", lift.T @ z @ lift, lift.T @ noise @ lift, gamma, np.array([0.5, 0.5]), lift
-    )
+    system = JumpSystem("continuous", lift.T @ z @ lift, lift.T @ noise @ lift, gamma, np.array([0.5, 0.5]), lift)
     measured = system.lifted(MomentSolver(system).steady())
     np.testing.assert_allclose(measured, brute_continuous(system, z, noise), rtol=1e-9)
     with pytest.raises(InputError, match="union of the graphs"):
@@ -238,9 +228,7 @@ def test_disconnected_graphs_with_connected_union():
 
 
 def test_unstable_steps_are_refused():
-    system = JumpSystem(
-        "discrete", np.array([[[1.1]]]), np.ones((1, 1, 1)), np.ones((1, 1)), np.ones(1), np.eye(1)
-    )
+    system = JumpSystem("discrete", np.array([[[1.1]]]), np.ones((1, 1, 1)), np.ones((1, 1)), np.ones(1), np.eye(1))
     with pytest.raises(InputError, match="grow without bound"):
         MomentSolver(system).steady()
 

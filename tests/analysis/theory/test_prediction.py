@@ -37,9 +37,7 @@ def assert_contains(document, golden, path=""):
     if isinstance(golden, dict):
         for key, value in golden.items():
             assert_contains(document[key], value, f"{path}.{key}")
-    elif (
-        golden is None or isinstance(golden, str) or (isinstance(golden, list) and isinstance(golden[0], str))
-    ):
+    elif golden is None or isinstance(golden, str) or (isinstance(golden, list) and isinstance(golden[0], str)):
         assert document == golden, path
     else:
         scale = np.abs(golden).max()

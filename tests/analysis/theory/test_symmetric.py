@@ -28,12 +28,8 @@ def test_pack_and_unpack_are_inverse_and_keep_the_inner_product(random, d):
 def test_congruence_and_lyapunov(random, d):
     c, _ = symmetric_matrices(random, d)
     w = random.standard_normal((d, d))
-    np.testing.assert_allclose(
-        symmetric.congruence(w) @ symmetric.pack(c), symmetric.pack(w @ c @ w.T), atol=1e-12
-    )
-    np.testing.assert_allclose(
-        symmetric.lyapunov(w) @ symmetric.pack(c), symmetric.pack(w @ c + c @ w.T), atol=1e-12
-    )
+    np.testing.assert_allclose(symmetric.congruence(w) @ symmetric.pack(c), symmetric.pack(w @ c @ w.T), atol=1e-12)
+    np.testing.assert_allclose(symmetric.lyapunov(w) @ symmetric.pack(c), symmetric.pack(w @ c + c @ w.T), atol=1e-12)
 
 
 def test_adjoint_is_the_transpose(random):

@@ -15,6 +15,7 @@ from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import StepModel, build_step_model
 from msg_analysis.model.streams import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.model.trajectory import Completeness, Trajectory
+from msg_analysis.theory.prediction import stationary_start_factor
 from msg_analysis.types import FloatArray, IntArray
 
 
@@ -31,12 +32,8 @@ def draw_start(experiment: Experiment, model: StepModel, first_mode: int) -> Flo
         return np.zeros((experiment.agents, replicas))
     if start != "stationary":
         return np.repeat(np.array(start, dtype=float)[:, None], replicas, axis=1)
-    from msg_analysis.theory.prediction import stationary_start_factor
-
     factor = stationary_start_factor(model, experiment.problem, first_mode)
-    sources = [
-        normals(experiment.run.seed, Stream.START, j, 0, (replicas,)) for j in range(experiment.agents)
-    ]
+    sources = [normals(experiment.run.seed, Stream.START, j, 0, (replicas,)) for j in range(experiment.agents)]
     deviations = np.array([weighted_sum([float(w) for w in row], sources) for row in factor])
     return deviations + model.reference
 
@@ -74,14 +71,10 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
     states[0] = record.start
     for k, state in enumerate(_states(experiment, model, modes, record.start), start=1):
         states[k] = state
-    return Trajectory(
-        record, states, modes, Completeness(expected := states.shape[0] * states.shape[1], expected, 0)
-    )
+    return Trajectory(record, states, modes, Completeness(expected := states.shape[0] * states.shape[1], expected, 0))
 
 
-def _states(
-    experiment: Experiment, model: StepModel, modes: IntArray, start: FloatArray
-) -> Iterator[FloatArray]:
+def _states(experiment: Experiment, model: StepModel, modes: IntArray, start: FloatArray) -> Iterator[FloatArray]:
     """x(1), x(2), ... of a path of graphs."""
     noise = ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas)
     rows = [_padded_rows(model, mode) for mode in range(model.modes)]

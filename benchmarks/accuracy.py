@@ -1,0 +1,183 @@
+"""How accurate the predicted second moments are, and how long they take: the table of docs/accuracy.md.
+
+Every row compares the dense solver with another route to the same numbers: the paper's formulas in full
+Kronecker form, which share the experiment's graphs and chain with the solver and nothing else; resistances
+from networkx; certainties printed in the paper. The last column is the largest difference between two
+covariances (or numbers), over their largest entry. Prints Markdown; takes a few seconds on one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TypeVar
+
+import networkx as nx
+import numpy as np
+import scipy.linalg
+from threadpoolctl import threadpool_limits
+
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.theory.prediction import predict
+from msg_analysis.types import FloatArray
+
+Result = TypeVar("Result")
+
+PAPER = {(1.0, 1.0): 0.73561, (0.1, 1.0): 0.53439, (1.0, 0.1): 0.94031}
+"""System certainty of example 1 by the rates line -> ring and ring -> line, times 0.5; to five digits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table."""
+
+    case: str
+    oracle: str
+    seconds: float
+    oracle_seconds: float | None
+    difference: float
+
+
+def random_experiment(seed: int, agents: int, graphs: int, *, rate: float = 1.0, dt: float = 0.02) -> Experiment:
+    """Connected random graphs with random weights, correlated noise, and rates of about the given size."""
+    random = np.random.default_rng(seed)
+    documents = {}
+    for mode in range(graphs):
+        links = [[i, i + 1, float(random.uniform(0.2, 1.5))] for i in range(1, agents)]
+        links += [
+            [i, j, float(random.uniform(0.2, 1.5))]
+            for i in range(1, agents + 1)
+            for j in range(i + 2, agents + 1)
+            if random.random() < 2.0 / agents
+        ]
+        documents[f"graph_{mode + 1}"] = {"edges": links}
+    switching = {}
+    if graphs > 1:
+        rates = random.uniform(0.2, 2.0, (graphs, graphs)) * rate
+        np.fill_diagonal(rates, 0.0)
+        switching = {"generator": (rates - np.diag(rates.sum(axis=1))).tolist()}
+    return Experiment.parse(
+        {
+            "name": "accuracy",
+            "graphs": documents,
+            "switching": switching,
+            "noise": {"process": random.standard_normal((agents, agents)).tolist()},
+            "run": {"dt": dt, "duration": 1000 * dt},
+        }
+    )
+
+
+def kronecker_continuous(experiment: Experiment) -> FloatArray:
+    """(m, m) covariance by Proposition 3 of the paper as printed, its n m^2 matrix inverted by pinv."""
+    m, n, chain = experiment.agents, experiment.chain.modes, experiment.chain
+    projector, eye = np.eye(m) - 1 / m, np.eye(m)
+    laplacians = [projector @ graph.laplacian @ projector for graph in experiment.graph_list]
+    matrix = scipy.linalg.block_diag(*[np.kron(z, eye) + np.kron(eye, z) for z in laplacians])
+    matrix -= np.kron(chain.matrix.T, np.kron(projector, projector))
+    noise = projector @ experiment.noise_gain @ experiment.noise_gain.T @ projector
+    right = np.concatenate([share * noise.ravel() for share in chain.stationary])
+    solution = np.linalg.pinv(matrix, rcond=1e-11) @ right
+    return np.asarray(solution.reshape(n, m, m).sum(axis=0))
+
+
+def kronecker_emulated(experiment: Experiment) -> FloatArray:
+    """(m, m) covariance of the run's Euler steps by the unreduced discrete equations."""
+    m, n, dt = experiment.agents, experiment.chain.modes, experiment.step_length
+    projector = np.eye(m) - 1 / m
+    steps = [projector @ (np.eye(m) - dt * graph.laplacian) for graph in experiment.graph_list]
+    transition = scipy.linalg.expm(experiment.chain.matrix * dt)
+    noise = (dt * projector @ experiment.noise_gain @ experiment.noise_gain.T @ projector).ravel()
+    share = experiment.chain.stationary
+    matrix = np.eye(n * m * m)
+    right = np.zeros((n, m * m))
+    for j, step in enumerate(steps):
+        operator = np.kron(step, step)
+        for i in range(n):
+            matrix[i * m * m : (i + 1) * m * m, j * m * m : (j + 1) * m * m] -= transition[j, i] * operator
+            right[i] += transition[j, i] * share[j] * noise
+    return np.asarray(np.linalg.solve(matrix, right.ravel()).reshape(n, m, m).sum(axis=0))
+
+
+def timed(function: Callable[[Experiment], Result], experiment: Experiment) -> tuple[Result, float]:
+    """What a function says about an experiment, and the seconds that it took."""
+    began = time.perf_counter()
+    result = function(experiment)
+    return result, time.perf_counter() - began
+
+
+def difference(measured: FloatArray, oracle: FloatArray) -> float:
+    """Largest difference over the largest entry."""
+    return float(np.abs(measured - oracle).max() / np.abs(oracle).max())
+
+
+def brute_force(largest: int) -> Iterator[Row]:
+    """Random networks against the Kronecker forms."""
+    for agents, graphs, rate in ((5, 2, 1.0), (10, 3, 1.0), (10, 3, 1e-4), (10, 3, 1e4), (20, 3, 1.0)):
+        if agents > largest:
+            continue
+        experiment = random_experiment(agents, agents, graphs, rate=rate)
+        prediction, seconds = timed(predict, experiment)
+        case = f"{agents} agents, {graphs} graphs, rates ~ {rate:g}"
+        assert prediction.continuous is not None
+        paper, paper_seconds = timed(kronecker_continuous, experiment)
+        steps, steps_seconds = timed(kronecker_emulated, experiment)
+        error = difference(prediction.continuous.covariance, paper)
+        yield Row(f"{case}, continuous", "Proposition 3, pinv", seconds, paper_seconds, error)
+        error = difference(prediction.emulated.covariance, steps)
+        yield Row(f"{case}, steps", "unreduced discrete equations", seconds, steps_seconds, error)
+
+
+def resistances() -> Iterator[Row]:
+    """One graph and unit noise: E is the Kirchhoff index over 2 m."""
+    for name, graph in (
+        ("path of 30", nx.path_graph(30)),
+        ("ring of 30", nx.cycle_graph(30)),
+        ("star of 30", nx.star_graph(29)),
+        ("grid of 5 x 6", nx.convert_node_labels_to_integers(nx.grid_2d_graph(5, 6))),
+    ):
+        links = [[i + 1, j + 1] for i, j in graph.edges]
+        experiment = Experiment.parse({"name": "one", "graphs": {"g": {"edges": links}}, "run": {"dt": 0.01}})
+        prediction, seconds = timed(predict, experiment)
+        assert prediction.continuous is not None
+        kirchhoff = nx.effective_graph_resistance(graph) / (2 * len(graph))
+        error = difference(np.array([prediction.continuous.system_error]), np.array([kirchhoff]))
+        yield Row(f"one graph, {name}: E", "networkx, resistance", seconds, None, error)
+
+
+def printed() -> Iterator[Row]:
+    """Example 1 of the paper: as good as its five digits."""
+    for (forth, back), certainty in PAPER.items():
+        experiment = Experiment.parse(
+            {
+                "name": "example_1",
+                "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
+                "switching": {"rates": {"line": {"ring": forth}, "ring": {"line": back}}, "scale": 0.5},
+            }
+        )
+        prediction, seconds = timed(predict, experiment)
+        assert prediction.continuous is not None
+        error = difference(np.array([1.0 / prediction.continuous.system_error]), np.array([certainty]))
+        yield Row(f"example 1, rates {forth:g} and {back:g}: 1/E", "the paper, 5 digits", seconds, None, error)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--largest", type=int, default=20, help="agents of the largest brute-force case")
+    arguments = parser.parse_args()
+    print("| case | compared with | solver [s] | other [s] | relative difference |")
+    print("|---|---|---:|---:|---:|")
+    with threadpool_limits(1):
+        for rows in (brute_force(arguments.largest), resistances(), printed()):
+            for row in rows:
+                other = "" if row.oracle_seconds is None else f"{row.oracle_seconds:.3g}"
+                print(
+                    f"| {row.case} | {row.oracle} | {row.seconds:.3g} | {other} | {row.difference:.1e} |",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()

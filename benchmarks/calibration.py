@@ -1,0 +1,110 @@
+"""How often the comparison is right: the tables of docs/statistics.md.
+
+Simulates many runs with the offline twin and compares each with its prediction. Runs that follow their law
+say how often intervals cover and how often "disagrees" is a false alarm; runs whose law differs a little from
+the one that their record claims say what the tests see. Prints Markdown; about five minutes on one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from msg_analysis.inference.compare import Comparison, compare
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.record import RunRecord
+from msg_analysis.twin import simulate
+
+LINE, RING = [[1, 2], [2, 3], [3, 4], [4, 5]], [[1, 2], [2, 3], [3, 4], [4, 5], [5, 1]]
+
+
+def line_ring(*, rate: float = 0.5, noise: float = 1.0, weight: float = 1.0, **run: Any) -> Mapping[str, Any]:
+    """The demo experiment; ``weight`` is that of the edge between the agents 1 and 2 of the ring."""
+    ring = [[1, 2, weight], *RING[1:]]
+    return {
+        "name": "line_ring",
+        "graphs": {"line": {"edges": LINE}, "ring": {"edges": ring}},
+        "switching": {"generator": [[-rate, rate], [rate, -rate]]},
+        "noise": {"process": noise},
+        "run": {"dt": 0.05, "duration": 100.0, "replicas": 4} | run,
+    }
+
+
+TRUE = {
+    "rate 0.5, 100 units, 4 replicas": line_ring(),
+    "rate 0.5, 400 units, 1 replica": line_ring(duration=400.0, replicas=1),
+    "rate 0.02, 400 units, 1 replica": line_ring(rate=0.02, duration=400.0, replicas=1),
+    "rate 0.02, 400 units, start at zero": line_ring(rate=0.02, duration=400.0, replicas=1, start="zero"),
+}
+LONG = {"duration": 400.0, "replicas": 16}
+FALSE = {
+    "all noise 1 % larger": line_ring(noise=1.01, **LONG),
+    "one of the ring's edges 5 % weaker": line_ring(weight=0.95, **LONG),
+    "switching at 0.6 instead of 0.5": line_ring(rate=0.6, **LONG),
+    "switching at 0.75 instead of 0.5": line_ring(rate=0.75, **LONG),
+}
+
+
+def comparisons(true: Experiment, claimed: Experiment, runs: int) -> Iterator[Comparison]:
+    """Compare runs of one experiment with the prediction of another, or of the same one."""
+    for seed in range(runs):
+        trajectory = simulate(true.with_run(seed=seed))
+        record = trajectory.record
+        claim = RunRecord(record.run, claimed.with_run(seed=seed), record.start)
+        yield compare(dataclasses.replace(trajectory, record=claim))
+
+
+def print_calibration(runs: int) -> None:
+    """Runs that follow their law."""
+    print("| line/ring | martingale interval covers | batch means cover | false alarms |")
+    print("|---|---:|---:|---:|")
+    for name, document in TRUE.items():
+        experiment = Experiment.parse(document)
+        covered = batches = alarms = 0
+        for comparison in comparisons(experiment, experiment, runs):
+            predicted = comparison.system_error.predicted
+            low, high = comparison.system_error.interval
+            assert predicted is not None
+            assert low is not None
+            assert high is not None
+            assert comparison.batch is not None
+            covered += low <= predicted <= high
+            batches += comparison.batch[0] <= predicted <= comparison.batch[1]
+            alarms += comparison.verdict == "disagrees"
+        shares = " | ".join(f"{100 * count / runs:.1f} %" for count in (covered, batches, alarms))
+        print(f"| {name} | {shares} |", flush=True)
+
+
+def print_power(runs: int) -> None:
+    """Runs that do not."""
+    print("\n| what is wrong | found | by (share of the runs) |")
+    print("|---|---:|---|")
+    claimed = Experiment.parse(line_ring(**LONG))
+    for name, document in FALSE.items():
+        found = 0
+        by: Counter[str] = Counter()
+        for comparison in comparisons(Experiment.parse(document), claimed, runs):
+            rejected = {test.name.partition(" of agent")[0] for test in comparison.tests if test.rejected}
+            found += bool(rejected)
+            by.update(rejected)
+        tests = ", ".join(f"{test} {100 * count / runs:.0f} %" for test, count in by.most_common()) or "-"
+        print(f"| {name} | {100 * found / runs:.0f} % | {tests} |", flush=True)
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description="Coverage, false alarms and power of the comparison.")
+    parser.add_argument("--runs", type=int, default=400, help="runs per line of the first table")
+    arguments = parser.parse_args()
+    with threadpool_limits(1):
+        print_calibration(arguments.runs)
+        print_power(max(1, arguments.runs // 8))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""The environment of the processes of a run on one machine."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+LOOPBACK_PROFILE = Path(__file__).with_name("loopback.xml")
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
+
+
+def node_environment(domain: int) -> dict[str, str]:
+    """Ours with what the nodes need; where the user has chosen another discovery range or profile, that stays.
+
+    Parameters
+    ----------
+    domain : ROS_DOMAIN_ID
+    """
+    environment = {
+        # The arithmetic of one agent is far too small for threads, which would only fight for the cores.
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        **os.environ,
+        "ROS_DOMAIN_ID": str(domain),
+        "PYTHONUNBUFFERED": "1",
+        # ``python -m`` would look for msg_agents in the working directory first, and find our source tree's folder.
+        "PYTHONSAFEPATH": "1",
+    }
+    local = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST") == "LOCALHOST"
+    if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
+        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SYSTEM_DEFAULT"  # as the profile says
+        environment.update(dict.fromkeys(PROFILE_VARIABLES, str(LOOPBACK_PROFILE)))
+    return environment

@@ -1,0 +1,189 @@
+"""Networks of real processes, and the means to see what became of each of them.
+
+Every process that a test starts, however indirectly, carries the test's mark in its environment. So a test can find a
+child of a child, and no test ends well while any process of it is left.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+pytest.importorskip("rclpy")
+
+from msg_agents.runner import RunResult, run_network
+from msg_analysis.model.experiment import Experiment
+
+MARK = "MSG_AGENTS_TEST"
+PROGRAM = Path(sys.executable).with_name("msg-agents")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker(pytest.mark.integration)
+
+
+def document(**changes: Any) -> dict[str, Any]:
+    """Five agents on a line and a ring; ``run`` is merged, other keys are replaced."""
+    run = {"dt": 0.05, "duration": 15, "replicas": 2, "seed": 7} | changes.pop("run", {})
+    return {
+        "name": "net",
+        "problem": "consensus",
+        "time": "continuous",
+        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
+        "switching": {"generator": [[-1, 1], [1, -1]]},
+        **changes,
+        "run": run,
+    }
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process of the test, told from a later one with the same number by the time of its start."""
+
+    pid: int
+    born: str
+    command: tuple[str, ...]
+
+    @property
+    def kind(self) -> str:
+        """Command of msg-agents that it runs: agent, switcher, recorder, run, ..."""
+        for program in ("msg_agents", str(PROGRAM)):
+            if program in self.command:
+                return self.command[self.command.index(program) + 1]
+        return self.command[0] if self.command else ""
+
+    @property
+    def agent(self) -> int:
+        """The first of its agents."""
+        return int(self.command[self.command.index("--agent") + 1])
+
+    @property
+    def alive(self) -> bool:
+        return _born(self.pid) == self.born
+
+    def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
+        if self.alive:
+            os.kill(self.pid, number)
+
+
+def _born(pid: int) -> str | None:
+    """Start time of a living process; None for one that has ended, reaped or not."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    return None if fields[0] in "ZX" else fields[19]
+
+
+@dataclass(frozen=True)
+class Network:
+    """What a test does with its processes."""
+
+    mark: str
+    directory: Path
+
+    def processes(self, *kinds: str) -> list[Process]:
+        """Living processes of this test, of all kinds or only of some."""
+        found = []
+        wanted = f"{MARK}={self.mark}".encode()
+        for entry in Path("/proc").iterdir():
+            if not entry.name.isdigit():
+                continue
+            try:
+                if wanted not in (entry / "environ").read_bytes().split(b"\0"):
+                    continue
+                command = (entry / "cmdline").read_bytes().decode().rstrip("\0").split("\0")
+            except OSError:
+                continue
+            born = _born(int(entry.name))
+            if born is not None:
+                found.append(Process(int(entry.name), born, tuple(command)))
+        return [process for process in found if not kinds or process.kind in kinds]
+
+    def nodes(self) -> list[Process]:
+        """The processes of the network itself."""
+        return self.processes("agent", "switcher", "recorder")
+
+    def shared_memory(self) -> set[Path]:
+        """Segments of Fast DDS that the nodes have mapped, each node its own and those of its peers.
+
+        Ports (``fastrtps_port...``) are not counted: the whole machine shares them.
+        """
+        found: set[str] = set()
+        for node in self.nodes():
+            with contextlib.suppress(OSError):
+                maps = Path(f"/proc/{node.pid}/maps").read_text()
+                found |= set(re.findall(r"/dev/shm/fastrtps_[0-9a-f]{16}\b", maps))
+        return {Path(name) for name in found}
+
+    def start(self, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
+        """Start ``msg-agents`` with these arguments."""
+        return subprocess.Popen(
+            [str(PROGRAM), *(str(argument) for argument in arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"NO_COLOR": "1", **environment},
+        )
+
+    @staticmethod
+    def experiment(**changes: Any) -> Experiment:
+        """See ``document``."""
+        return Experiment.parse(document(**changes))
+
+    def file(self, name: str = "net.yaml", **changes: Any) -> Path:
+        """An experiment file."""
+        path = self.directory / name
+        path.write_text(yaml.safe_dump(document(**changes)))
+        return path
+
+    def run(self, what: Experiment, out: str = "runs", **options: Any) -> RunResult:
+        """A whole run from this process, without comparison and report."""
+        return run_network(what, self.directory / out, **options)
+
+    def recorded_bytes(self, out: str = "runs") -> int:
+        """Size of what has been recorded so far."""
+        return sum(file.stat().st_size for file in (self.directory / out).glob("*/*.mcap"))
+
+    @staticmethod
+    def wait_for(condition: Callable[[], Any], seconds: float, what: str) -> Any:
+        """Poll until the condition is true; its value."""
+        deadline = time.monotonic() + seconds
+        while not (value := condition()):
+            assert time.monotonic() < deadline, f"not within {seconds:g} s: {what}"
+            time.sleep(0.02)
+        return value
+
+    def wait_until_moving(self, out: str = "runs") -> None:
+        """The run is in the middle: what is there of the bag is more than its head."""
+        self.wait_for(lambda: self.recorded_bytes(out) > 50_000, 60, "recorded states")
+
+
+@pytest.fixture
+def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network]:
+    mark = uuid.uuid4().hex
+    monkeypatch.setenv(MARK, mark)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTDDS_BUILTIN_TRANSPORTS"):
+        monkeypatch.delenv(name, raising=False)
+    network = Network(mark, tmp_path)
+    yield network
+    left = network.processes()
+    for process in left:
+        process.kill()
+    assert not left, "processes outlived the test"

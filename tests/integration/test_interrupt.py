@@ -1,0 +1,68 @@
+"""A run that the user ends: in order, with a valid bag, and nothing left behind."""
+
+from __future__ import annotations
+
+import signal
+from typing import Any
+
+import pytest
+import yaml
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from msg_agents.check import check
+from msg_analysis.bags.reader import read_bag
+
+LONG = {"duration": 10_000, "replicas": 1, "processes": 2}  # 200,000 steps: no test waits for them
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_in_the_middle(network: Any, number: signal.Signals) -> None:
+    run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs", "--json")
+    network.wait_until_moving()
+    used = network.shared_memory()
+    run.send_signal(number)
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert network.processes() == []
+    assert not [file for file in used if file.exists()]
+    assert f"ended by {number.name}" in stderr
+    assert "last recorded step: agent 1: " in stderr
+    assert "Traceback" not in stderr
+    assert stdout.count("\n") == 1  # one JSON object
+
+    (bag,) = (network.directory / "runs").iterdir()
+    custom = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]["custom_data"]
+    assert custom["complete"] == "false"
+    assert "salvaged" not in custom
+    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        count = sum(1 for connection, *_ in reader.messages() if connection.topic.endswith("/state"))
+    trajectory = read_bag(bag)
+    assert trajectory.completeness.received == count > 0
+    assert not trajectory.completeness.complete
+    assert check(trajectory).difference is None
+
+
+def test_before_anything_has_begun(network: Any) -> None:
+    """While the processes start and look for each other."""
+    run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs")
+    network.wait_for(network.nodes, 60, "a child")
+    run.send_signal(signal.SIGINT)
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert "ended by SIGINT" in stderr
+    assert "Traceback" not in stderr
+    assert network.processes() == []
+
+
+def test_a_killed_runner_takes_everybody_along(network: Any) -> None:
+    run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs")
+    network.wait_until_moving()
+    assert {process.kind for process in network.nodes()} == {"agent", "switcher", "recorder"}
+    run.kill()
+    run.communicate(timeout=60)
+    network.wait_for(lambda: network.processes() == [], 10, "the end of every child")
+    (bag,) = (network.directory / "runs").iterdir()
+    trajectory = read_bag(bag)  # its recorder had the time to close it
+    assert trajectory.completeness.received > 0
+    assert check(trajectory).difference is None

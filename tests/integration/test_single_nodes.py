@@ -1,0 +1,83 @@
+"""The single nodes, as another launcher would start them."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msg_agents.check import check
+from msg_agents.domain import free_domain
+from msg_analysis.bags.reader import read_bag
+
+
+@pytest.fixture
+def run_file(network: Any) -> Path:
+    prepare = network.start("prepare", network.file())
+    stdout, stderr = prepare.communicate(timeout=60)
+    assert prepare.returncode == 0, stderr
+    file = network.directory / "run.json"
+    file.write_text(stdout)
+    return Path(file)
+
+
+def test_started_by_hand(network: Any, run_file: Path) -> None:
+    """In any order, with the environment that ROS has by default but for the domain."""
+    bag = network.directory / "mine"
+    await_recorder = ("--await", "recorder")
+    with free_domain() as domain:
+        nodes: list[subprocess.Popen[str]] = [
+            network.start(*command, ROS_DOMAIN_ID=str(domain))
+            for command in (
+                ("switcher", run_file, *await_recorder),
+                ("agent", run_file, "--agent", "5", *await_recorder),
+                ("recorder", run_file, "--out", bag),
+                ("agent", run_file, *(p for i in "2413" for p in ("--agent", i)), *await_recorder),
+            )
+        ]
+        for node in nodes:
+            stdout, stderr = node.communicate(timeout=90)
+            assert (node.returncode, stdout) == (0, ""), stderr
+    trajectory = read_bag(bag)
+    assert trajectory.completeness.complete
+    assert check(trajectory).difference is None
+
+
+@pytest.mark.parametrize(
+    ("command", "missing"),
+    [
+        (("agent", "--agent", "1", "--await", "recorder"), ["agent_2", "agent_5", "recorder"]),
+        (("switcher",), [f"agent_{i}" for i in range(1, 6)]),
+    ],
+    ids=["agent", "switcher"],
+)
+def test_alone(network: Any, run_file: Path, command: tuple[str, ...], missing: list[str]) -> None:
+    """Nobody comes: exit code 2 (something is wrong with what was started), naming everyone who is missing."""
+    kind, *options = command
+    with free_domain() as domain:
+        node = network.start(kind, run_file, *options, "--discovery-timeout", "3", ROS_DOMAIN_ID=str(domain))
+        stdout, stderr = node.communicate(timeout=60)
+    assert (node.returncode, stdout) == (2, ""), stderr
+    error = re.search(r"^error: after 3 s (.*) had not found: (.*?)\. Are they running", stderr, re.MULTILINE)
+    assert error, stderr
+    assert error[2].split(", ") == missing
+    assert f"ROS_DOMAIN_ID ({domain})" in stderr
+    assert "Traceback" not in stderr
+
+
+def test_a_missing_agent_is_named_by_the_others(network: Any, run_file: Path) -> None:
+    with free_domain() as domain:
+        nodes = [
+            network.start(*command, "--discovery-timeout", "8", ROS_DOMAIN_ID=str(domain))
+            for command in (
+                ("switcher", run_file),
+                ("agent", run_file, *(p for i in "1235" for p in ("--agent", i))),
+            )
+        ]
+        texts = [node.communicate(timeout=60)[1] for node in nodes]
+    assert [node.returncode for node in nodes] == [2, 2], texts
+    for text in texts:
+        assert "had not found: agent_4. Are they running" in text
