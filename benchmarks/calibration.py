@@ -20,15 +20,18 @@ from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord
 from msg_analysis.twin import simulate
 
-LINE, RING = [[1, 2], [2, 3], [3, 4], [4, 5]], [[1, 2], [2, 3], [3, 4], [4, 5], [5, 1]]
 
-
-def line_ring(*, rate: float = 0.5, noise: float = 1.0, weight: float = 1.0, **run: Any) -> Mapping[str, Any]:
-    """The demo experiment; ``weight`` is that of the edge between the agents 1 and 2 of the ring."""
-    ring = [[1, 2, weight], *RING[1:]]
+def line_ring(
+    *, rate: float = 0.5, noise: float = 1.0, edge: float = 1.0, ring: float = 1.0, **run: Any
+) -> Mapping[str, Any]:
+    """The demo experiment, with weights of the ring's edge 1-2 and of all its edges."""
+    weights = [ring * edge, ring, ring, ring, ring]
     return {
         "name": "line_ring",
-        "graphs": {"line": {"edges": LINE}, "ring": {"edges": ring}},
+        "graphs": {
+            "line": {"path": [1, 2, 3, 4, 5]},
+            "ring": {"edges": [[i + 1, (i + 1) % 5 + 1, weight] for i, weight in enumerate(weights)]},
+        },
         "switching": {"generator": [[-rate, rate], [rate, -rate]]},
         "noise": {"process": noise},
         "run": {"dt": 0.05, "duration": 100.0, "replicas": 4} | run,
@@ -44,7 +47,9 @@ TRUE = {
 LONG = {"duration": 400.0, "replicas": 16}
 FALSE = {
     "all noise 1 % larger": line_ring(noise=1.01, **LONG),
-    "one of the ring's edges 5 % weaker": line_ring(weight=0.95, **LONG),
+    "one of the ring's edges 5 % weaker": line_ring(edge=0.95, **LONG),
+    "one of the ring's edges 20 % weaker": line_ring(edge=0.8, **LONG),
+    "all of the ring's edges 5 % weaker": line_ring(ring=0.95, **LONG),
     "switching at 0.6 instead of 0.5": line_ring(rate=0.6, **LONG),
     "switching at 0.75 instead of 0.5": line_ring(rate=0.75, **LONG),
 }

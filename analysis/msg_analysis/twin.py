@@ -85,7 +85,7 @@ def _states(experiment: Experiment, model: StepModel, modes: IntArray, start: Fl
         if within == 0:
             block = np.stack([noise.block(i, k // STEPS_PER_BLOCK) for i in range(model.agents)], axis=1)
         weights, inputs = rows[mode]
-        state = step(weights, [state[j] for j in inputs], offsets[mode], block[within])
+        state = step(weights, [state[j] for j in inputs], block[within] + offsets[mode])
         yield state
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ def plan(agents: int, processes: Any, bag: Path | None = Path("/bag")) -> list[P
 def numbers(process: ProcessPlan) -> list[int]:
     """Agents as the command line names them."""
     words = process.arguments
-    return [int(value) for option, value in zip(words, words[1:], strict=False) if option == "--agent"]
+    return [int(value) for option, value in pairwise(words) if option == "--agent"]
 
 
 @given(st.integers(2, 60), st.integers(1, MOST_PROCESSES))

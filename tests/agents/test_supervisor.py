@@ -17,8 +17,8 @@ pytest.importorskip("rclpy")
 
 from msg_agents import supervisor as module
 from msg_agents.domain import free_domain
+from msg_agents.environment import node_environment
 from msg_agents.network import ProcessPlan
-from msg_agents.runner import node_environment
 from msg_agents.supervisor import Child, Supervisor
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.twin import new_record
@@ -188,7 +188,7 @@ PARENT = """
 import sys, time
 from pathlib import Path
 from msg_agents.network import ProcessPlan
-from msg_agents.runner import node_environment
+from msg_agents.environment import node_environment
 from msg_agents.supervisor import Supervisor
 directory = Path(sys.argv[1])
 run_file = str(directory / "run.json")

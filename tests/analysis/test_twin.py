@@ -51,7 +51,7 @@ def experiment(case: str, **run: object) -> Experiment:
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("replicas", [1, 3])
 def test_equals_a_loop_over_numbers_to_the_last_bit(case: str, replicas: int) -> None:
-    """x_i(k+1) = sum_j W_ij x_j(k) + offset_i + noise_i(k), one Python float after the other."""
+    """x_i(k+1) = sum_j W_ij x_j(k) + (noise_i(k) + offset_i), one Python float after the other."""
     setup = experiment(case, replicas=replicas)
     trajectory = simulate(setup)
     model = build_step_model(setup)
@@ -77,7 +77,7 @@ def test_equals_a_loop_over_numbers_to_the_last_bit(case: str, replicas: int) ->
                             sources[j, block] = random.standard_normal(shape)
                         term = float(model.noise_gain[i, j]) * float(sources[j, block][within, r])
                         noise = term if noise is None else noise + term
-                row.append((total + float(model.offsets[mode, i])) + (noise or 0.0))
+                row.append(total + ((noise or 0.0) + float(model.offsets[mode, i])))
             following.append(row)
         x = following
         assert x == trajectory.states[k + 1].tolist(), k

@@ -120,15 +120,12 @@ class Network:
         return self.processes("agent", "switcher", "recorder")
 
     def shared_memory(self) -> set[Path]:
-        """Segments of Fast DDS that the nodes have mapped, each node its own and those of its peers.
-
-        Ports (``fastrtps_port...``) are not counted: the whole machine shares them.
-        """
+        """Files of Fast DDS in shared memory that the nodes have mapped: a killed node would leave them behind."""
         found: set[str] = set()
         for node in self.nodes():
             with contextlib.suppress(OSError):
                 maps = Path(f"/proc/{node.pid}/maps").read_text()
-                found |= set(re.findall(r"/dev/shm/fastrtps_[0-9a-f]{16}\b", maps))
+                found |= set(re.findall(r"/dev/shm/fastrtps\w+", maps))
         return {Path(name) for name in found}
 
     def start(self, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
@@ -179,8 +176,9 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
-    for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTDDS_BUILTIN_TRANSPORTS"):
-        monkeypatch.delenv(name, raising=False)
+    for name in list(os.environ):
+        if name.startswith(("ROS_DOMAIN", "ROS_AUTOMATIC", "ROS_STATIC", "FASTDDS_", "FASTRTPS_")):
+            monkeypatch.delenv(name)
     network = Network(mark, tmp_path)
     yield network
     left = network.processes()

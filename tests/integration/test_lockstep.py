@@ -75,7 +75,7 @@ def test_the_other_executor(network: Any, executor: str) -> None:
 
 
 def test_two_runs_at_the_same_time(network: Any) -> None:
-    """Of the same experiment, into the same directory, in the same second: they neither hear nor overwrite each other."""
+    """Of one experiment, into one directory, in the same second: they neither hear nor overwrite each other."""
     file, out = network.file(run={"processes": 1}), network.directory / "runs"
     runs = [network.start("run", file, "--out", out, "--seed", seed) for seed in ("1", "2")]
     for run in runs:

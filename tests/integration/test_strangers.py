@@ -15,8 +15,8 @@ import pytest
 
 from msg_agents.check import check
 from msg_agents.domain import free_domain
+from msg_agents.environment import node_environment
 from msg_agents.network import ProcessPlan, plan_network
-from msg_agents.runner import node_environment
 from msg_agents.supervisor import Supervisor
 from msg_analysis.bags.cdr import ActiveGraph, AgentState, Progress, encode_string
 from msg_analysis.bags.reader import read_bag

@@ -129,15 +129,15 @@ class StateFrame:
     def decode(self, data: bytes) -> tuple[int, int, int, FloatArray] | None:
         """(agent, step, mode, state), or None where the bytes are not of this run and layout.
 
-        None means: ask :meth:`AgentState.decode`, which tells what it is. ``state`` (replicas,) is a
-        read-only view of the message, not aligned.
+        None means: ask :meth:`AgentState.decode`, which tells what it is. ``state`` (replicas,) is read-only.
         """
         if len(data) != self.size:
             return None
         header, fixed, agent, step, mode, heard, replicas = _STATE_FIXED.unpack_from(data)
         if fixed != self._fixed or heard or replicas != self._replicas or header != LITTLE_ENDIAN:
             return None
-        return agent, step, mode, np.frombuffer(data, np.float64, replicas, _STATE.size)
+        # A slice is a copy, but an aligned one: arithmetic on it is so much faster that the copy pays at once.
+        return agent, step, mode, np.frombuffer(data[_STATE.size :])
 
 
 class _Reader:

@@ -27,11 +27,11 @@ class AgentLaw:
         self.step = 0
         self.state: FloatArray = record.start[agent].copy()
         self._noise = ProcessNoise(record.experiment.run.seed, model.noise_gain, record.experiment.run.replicas)
-        self._block = self._noise.block(agent, 0)
         modes = range(model.modes)
         self._inputs = [[int(j) for j in model.inputs(mode, agent)] for mode in modes]
         self._weights = [[float(w) for w in model.weights[mode, agent, self._inputs[mode]]] for mode in modes]
         self._offsets = [float(offset) for offset in model.offsets[:, agent]]
+        self._drives = self._draw(0)
 
     def neighbours(self, mode: int) -> list[int]:
         """The other agents, ascending, whose states this agent uses under a mode (index from 0)."""
@@ -51,8 +51,13 @@ class AgentLaw:
         """
         within = self.step % STEPS_PER_BLOCK
         if within == 0 and self.step:
-            self._block = self._noise.block(self.agent, self.step // STEPS_PER_BLOCK)
+            self._drives = self._draw(self.step // STEPS_PER_BLOCK)
         values = [self.state if j == self.agent else heard[j] for j in self._inputs[mode]]
-        self.state = step(self._weights[mode], values, self._offsets[mode], self._block[within])
+        self.state = step(self._weights[mode], values, self._drives[mode][within])
         self.step += 1
         return self.state
+
+    def _draw(self, block: int) -> list[FloatArray]:
+        """For each mode, (STEPS_PER_BLOCK, replicas) noise plus offset in the steps of a block."""
+        noise = self._noise.block(self.agent, block)
+        return [noise + offset if offset else noise for offset in self._offsets]

@@ -29,24 +29,17 @@ def weighted_sum(weights: Sequence[float | FloatArray], values: Sequence[FloatAr
     return total
 
 
-def step(
-    weights: Sequence[float | FloatArray],
-    values: Sequence[FloatArray],
-    offset: float | FloatArray,
-    noise: FloatArray,
-) -> FloatArray:
-    """x_i(k+1) = sum_j W_ij x_j(k) + offset_i + noise_i(k).
+def step(weights: Sequence[float | FloatArray], values: Sequence[FloatArray], drive: FloatArray) -> FloatArray:
+    """x_i(k+1) = sum_j W_ij x_j(k) + drive_i(k).
 
     Parameters
     ----------
     weights : the non-zero W_ij of row i, j ascending (for many rows at once: columns, padded with zeros)
     values : the matching x_j(k), each one entry per replica
-    offset : what a reference adds to the row
-    noise : like one of the values
+    drive : noise_i(k) + offset_i, the offset being what a reference adds to the row; like one of the values
     """
     total = weighted_sum(weights, values)
-    total += offset
-    total += noise
+    total += drive
     return total
 
 
