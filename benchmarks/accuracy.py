@@ -70,7 +70,7 @@ def random_experiment(seed: int, agents: int, graphs: int, *, rate: float = 1.0,
 
 
 def kronecker_continuous(experiment: Experiment) -> FloatArray:
-    """(m, m) covariance by Proposition 3 of the paper as printed, its n m^2 matrix inverted by pinv."""
+    """(m, m) covariance by the paper's steady-state formula as printed, its n m^2 matrix inverted by pinv."""
     m, n, chain = experiment.agents, experiment.chain.modes, experiment.chain
     projector, eye = np.eye(m) - 1 / m, np.eye(m)
     laplacians = [projector @ graph.laplacian @ projector for graph in experiment.graph_list]
@@ -124,7 +124,7 @@ def brute_force(largest: int) -> Iterator[Row]:
         paper, paper_seconds = timed(kronecker_continuous, experiment)
         steps, steps_seconds = timed(kronecker_emulated, experiment)
         error = difference(prediction.continuous.covariance, paper)
-        yield Row(f"{case}, continuous", "Proposition 3, pinv", seconds, paper_seconds, error)
+        yield Row(f"{case}, continuous", "the paper's formula, pinv", seconds, paper_seconds, error)
         error = difference(prediction.emulated.covariance, steps)
         yield Row(f"{case}, steps", "unreduced discrete equations", seconds, steps_seconds, error)
 

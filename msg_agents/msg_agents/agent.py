@@ -9,10 +9,10 @@ from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
 from msg_agents_interfaces.msg import AgentState as AgentStateMsg
 from msg_agents_interfaces.msg import Progress as ProgressMsg
 
-from msg_agents.node import GRAPH_TOPIC, PROGRESS_TOPIC, NetworkNode, agent_name, state_topic
+from msg_agents.node import GRAPH_TOPIC, OTHER_RUN, PROGRESS_TOPIC, NetworkNode, agent_name, state_topic
 from msg_agents.qos import LOSSLESS
 from msg_agents.synchronizer import Synchronizer
-from msg_analysis.bags.cdr import ActiveGraph, CdrError, Progress, StateCodec, StateFrame, StepClock
+from msg_analysis.bags.cdr import ActiveGraph, CdrError, StateCodec, StateFrame
 from msg_analysis.model.agent import AgentLaw
 from msg_analysis.model.law import all_finite
 from msg_analysis.model.record import RunRecord
@@ -20,7 +20,6 @@ from msg_analysis.model.step import StepModel
 from msg_analysis.types import FloatArray
 
 PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages
-OTHER_RUN = "of another run, agent or layout"
 NOT_FINITE = "a state that is not finite"
 
 
@@ -49,7 +48,6 @@ class Agent(NetworkNode):
         )
         self._codec = StateCodec(self.run, agent + 1, experiment.run.replicas, experiment.step_length)
         self._frame = StateFrame(self.run, experiment.run.replicas)
-        self._clock = StepClock(experiment.step_length)
         self._expected = [agent_name(j) for j in peers] + readers
         self._next_progress = 0.0
         self._states = self.create_publisher(AgentStateMsg, state_topic(agent), LOSSLESS)
@@ -57,6 +55,7 @@ class Agent(NetworkNode):
         self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._receive_graph, LOSSLESS, raw=True)
         for j in peers:
             self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), LOSSLESS, raw=True)
+        self.leave_at_end()
         self._begun = False
 
     def awaited(self) -> dict[str, list[str]]:
@@ -70,11 +69,6 @@ class Agent(NetworkNode):
         self.publish(self._states, self._codec.encode(0, 0, self._law.state))
         self._report()
         self._advance()
-
-    def finish(self, *, complete: bool) -> None:
-        """See NetworkNode."""
-        if complete:
-            self.wait_until_read(self._states, self._progress)
 
     def waiting_for(self) -> str:
         """What keeps the agent from its next step."""
@@ -125,11 +119,7 @@ class Agent(NetworkNode):
             self.publish(self._states, self._codec.encode(law.step, mode + 1, state))
             if time.monotonic() >= self._next_progress or synchronizer.finished:
                 self._report()
-                if synchronizer.finished:
-                    self.done.set_result(None)
 
     def _report(self) -> None:
-        step = self._law.step
-        message = Progress(self._clock.nanoseconds(step), self.run, self._law.agent + 1, step)
-        self.publish(self._progress, message.encode())
+        self.publish(self._progress, self.progress(self._law.agent + 1, self._law.step))
         self._next_progress = time.monotonic() + PROGRESS_PERIOD

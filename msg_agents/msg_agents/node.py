@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections import Counter
 
-from rclpy.duration import Duration
+from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
 
 from msg_agents.errors import RCLError
+from msg_agents.qos import LOSSLESS
+from msg_analysis.bags.cdr import CdrError, Progress, StepClock
 from msg_analysis.model.record import RunRecord
 
 EXPERIMENT_TOPIC = "experiment"
 GRAPH_TOPIC = "graph"
 PROGRESS_TOPIC = "progress"
-ACK_SLICE = 0.5  # s between two looks at whether the process was told to stop
+END_TOPIC = "end"
+NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
+OTHER_RUN = "of another run, agent or layout"
 
 
 def agent_name(agent: int) -> str:
@@ -42,6 +46,7 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         super().__init__(name, start_parameter_services=False, enable_rosout=False)
         self.record = record
         self.run = record.run.bytes
+        self._step_clock = StepClock(record.experiment.step_length)
         self.done: Future = Future()
         self.refused: Counter[str] = Counter()
 
@@ -80,11 +85,33 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         if not self.done.done():
             self.done.set_exception(error)
 
-    def wait_until_read(self, *publishers: Publisher) -> None:
-        """Wait until every reader has everything: what a process has not delivered when it exits is lost."""
-        for publisher in publishers:
-            while self.context.ok() and not publisher.wait_for_all_acked(Duration(seconds=ACK_SLICE)):
-                pass
+    def leave_at_end(self) -> None:
+        """Be done when the switcher says that everybody is.
+
+        Whoever leaves earlier may take with it what others still need: unread messages, or the acknowledgements that
+        they wait for.
+        """
+        self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LOSSLESS, raw=True)
+
+    def _receive_end(self, data: bytes) -> None:
+        if self.decode_progress(data, END_TOPIC) and not self.done.done():
+            self.done.set_result(None)
+
+    def decode_progress(self, data: bytes, topic: str) -> Progress | None:
+        """A Progress message of this run; None (and counted) if it is no such thing."""
+        try:
+            progress = Progress.decode(data)
+        except CdrError as error:
+            self.refuse(str(error), topic)
+            return None
+        if progress.run != self.run or progress.agent > self.record.experiment.agents:
+            self.refuse(OTHER_RUN, topic)
+            return None
+        return progress
+
+    def progress(self, agent: int, step: int) -> bytes:
+        """A Progress message: number of the agent from 1 (or NOT_AN_AGENT), and step."""
+        return Progress(self._step_clock.nanoseconds(step), self.run, agent, step).encode()
 
     def missing_readers(self, publisher: Publisher, expected: list[str]) -> list[str]:
         """Names of the expected nodes that do not read a topic of ours yet."""

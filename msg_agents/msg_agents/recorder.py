@@ -9,9 +9,10 @@ from typing import TypeVar
 
 from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
 from msg_agents_interfaces.msg import AgentState as AgentStateMsg
+from msg_agents_interfaces.msg import Progress as ProgressMsg
 from std_msgs.msg import String
 
-from msg_agents.node import EXPERIMENT_TOPIC, GRAPH_TOPIC, NetworkNode, state_topic
+from msg_agents.node import EXPERIMENT_TOPIC, GRAPH_TOPIC, NOT_AN_AGENT, PROGRESS_TOPIC, NetworkNode, state_topic
 from msg_agents.qos import LOSSLESS
 from msg_analysis.bags.cdr import ActiveGraph, AgentState, CdrError, StateFrame, decode_string, stamp_ns
 from msg_analysis.bags.schemas import network_topics
@@ -50,6 +51,8 @@ class Recorder(NetworkNode):
         self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._record_graph, LOSSLESS, raw=True)
         for agent in range(experiment.agents):
             self.create_subscription(AgentStateMsg, state_topic(agent), self._recorder(agent), LOSSLESS, raw=True)
+        self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LOSSLESS)
+        self.leave_at_end()
         self.create_timer(FLUSH_PERIOD, self._guarded(self.bag.flush))
 
     def finish(self, *, complete: bool) -> None:  # noqa: ARG002  an interrupted bag is closed just as well
@@ -125,6 +128,7 @@ class Recorder(NetworkNode):
         return guarded
 
     def _came(self, topic: str) -> None:
-        self._awaiting.discard(topic)
-        if not self._awaiting and not self.done.done():
-            self.done.set_result(None)
+        if topic in self._awaiting:
+            self._awaiting.remove(topic)
+            if not self._awaiting:
+                self.publish(self._progress, self.progress(NOT_AN_AGENT, self._last))

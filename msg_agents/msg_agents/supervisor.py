@@ -47,7 +47,8 @@ class Child:
     def failure(self) -> str | None:
         """How it ended, if not well, in words."""
         code = self.process.poll()
-        if code is None or code == 0:
+        # A process that has done its part and hangs in the middleware's farewell ends itself by an alarm.
+        if code is None or code in (0, -signal.SIGALRM):
             return None
         if code < 0:
             return f"killed by {signal.Signals(-code).name}"

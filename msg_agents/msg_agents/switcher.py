@@ -6,11 +6,21 @@ from collections.abc import Callable, Sequence
 
 from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
 from msg_agents_interfaces.msg import Progress as ProgressMsg
+from rclpy.duration import Duration
 from std_msgs.msg import String
 
-from msg_agents.node import EXPERIMENT_TOPIC, GRAPH_TOPIC, PROGRESS_TOPIC, NetworkNode, agent_name
+from msg_agents.network import RECORDER
+from msg_agents.node import (
+    END_TOPIC,
+    EXPERIMENT_TOPIC,
+    GRAPH_TOPIC,
+    NOT_AN_AGENT,
+    PROGRESS_TOPIC,
+    NetworkNode,
+    agent_name,
+)
 from msg_agents.qos import LOSSLESS
-from msg_analysis.bags.cdr import ActiveGraph, CdrError, Progress, StepClock, encode_string
+from msg_analysis.bags.cdr import ActiveGraph, encode_string
 from msg_analysis.model.path import Sojourn, sojourns
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import StepModel
@@ -18,6 +28,9 @@ from msg_analysis.model.step import StepModel
 AHEAD = 1000
 """Sojourns that are published before the slowest agent reaches them. Enough never to be waited for; bounded, so that a
 long run keeps little in memory, and below the 5,000 messages that a late reader is given."""
+
+
+FAREWELL = 4.0  # s; more than the 3 s between two heartbeats of Fast DDS
 
 
 class Switcher(NetworkNode):
@@ -41,15 +54,16 @@ class Switcher(NetworkNode):
     ) -> None:
         super().__init__("switcher", record=record)
         self._graphs = record.experiment.graph_list
-        self._clock = StepClock(record.experiment.step_length)
         self._path = sojourns(record.experiment, model.initial)
         self._steps = record.experiment.steps
         self._reached = [-1] * model.agents
+        self._recorded = RECORDER not in readers
         self._on_progress = on_progress
         self._ahead: list[int] = []  # first steps of the published sojourns that the slowest agent has not reached
         self._expected = [agent_name(i) for i in range(model.agents)] + readers
         self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LOSSLESS)
         self._graph = self.create_publisher(ActiveGraphMsg, GRAPH_TOPIC, LOSSLESS)
+        self._end = self.create_publisher(ProgressMsg, END_TOPIC, LOSSLESS)
         self.create_subscription(ProgressMsg, PROGRESS_TOPIC, self._receive, LOSSLESS, raw=True)
 
     def awaited(self) -> dict[str, list[str]]:
@@ -63,23 +77,22 @@ class Switcher(NetworkNode):
         self._keep_ahead()
 
     def finish(self, *, complete: bool) -> None:
-        """See NetworkNode."""
+        """See NetworkNode. Nobody needs anything but the end any more, and who has left has had it."""
         if complete:
-            self.wait_until_read(self._experiment, self._graph)
+            self._end.wait_for_all_acked(Duration(seconds=FAREWELL))
 
     def _receive(self, data: bytes) -> None:
-        try:
-            progress = Progress.decode(data)
-        except CdrError as error:
-            self.refuse(str(error), PROGRESS_TOPIC)
+        progress = self.decode_progress(data, PROGRESS_TOPIC)
+        if progress is None:
             return
-        if progress.run != self.run or not 1 <= progress.agent <= len(self._reached):
-            self.refuse("of another run or agent", PROGRESS_TOPIC)
-            return
-        self._reached[progress.agent - 1] = max(progress.step, self._reached[progress.agent - 1])
+        if progress.agent == NOT_AN_AGENT:
+            self._recorded = self._recorded or progress.step == self._steps
+        else:
+            self._reached[progress.agent - 1] = max(progress.step, self._reached[progress.agent - 1])
         self._on_progress(self._reached)
         self._keep_ahead()
-        if min(self._reached) >= self._steps and not self.done.done():
+        if self._recorded and min(self._reached) >= self._steps and not self.done.done():
+            self.publish(self._end, self.progress(NOT_AN_AGENT, self._steps))
             self.done.set_result(None)
 
     def _keep_ahead(self) -> None:
@@ -95,7 +108,7 @@ class Switcher(NetworkNode):
     def _message(self, sojourn: Sojourn) -> ActiveGraph:
         graph = self._graphs[sojourn.mode]
         return ActiveGraph(
-            stamp=self._clock.nanoseconds(sojourn.first_step),
+            stamp=self._step_clock.nanoseconds(sojourn.first_step),
             run=self.run,
             sequence=sojourn.sequence,
             mode=sojourn.mode + 1,
