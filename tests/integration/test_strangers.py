@@ -39,8 +39,8 @@ from msg_agents.qos import LOSSLESS
 AGENTS = 5
 rclpy.init()
 node = rclpy.create_node("stranger", enable_rosout=False)
-kinds = {"graph": ActiveGraph, "progress": Progress, "experiment": String}
-readers = {"graph": AGENTS + 1, "progress": 1, "experiment": 1}
+kinds = {"graph": ActiveGraph, "progress": Progress, "end": Progress, "experiment": String}
+readers = {"graph": AGENTS + 1, "progress": 1, "end": AGENTS + 1, "experiment": 1}
 publishers = {}
 for line in Path(sys.argv[1]).read_text().splitlines():
     topic, data = line.split()
@@ -110,13 +110,14 @@ def graph(run: bytes, **changes: Any) -> Forgery:
 
 
 def test_another_run_of_the_same_experiment(network: Any, run_beside: Any) -> None:
-    """Complete and well-formed, but of another run: its states, its graph, its progress, its record."""
+    """Complete and well-formed, but of another run: its states, its graph, its progress, its record, its end."""
     record = new_record(network.experiment(run={"processes": 2}))
     other = new_record(network.experiment(run={"processes": 2, "seed": 8}))
     run = other.run.bytes
     forged = [("experiment", encode_string(other.to_json())), graph(run)]
     forged += [message for agent in range(1, 6) for message in states(run, agent)]
-    forged += [("progress", Progress(0, run, agent, STEPS).encode()) for agent in range(1, 6)]
+    forged += [("progress", Progress(0, run, agent, STEPS).encode()) for agent in range(6)]
+    forged += [("end", Progress(0, run, 0, STEPS).encode())]
     trajectory, logs = run_beside(record, forged)
     assert trajectory.completeness.complete
     assert trajectory.record.run == record.run
@@ -138,12 +139,12 @@ def test_nonsense(network: Any, run_beside: Any) -> None:
         b"\xff" * 200,
         b"\x00\x01\x00\x00" + b"\xff" * 96,
     ]
-    topics = ["agent_1/state", "agent_3/state", "graph", "progress", "experiment"]
+    topics = ["agent_1/state", "agent_3/state", "graph", "progress", "end", "experiment"]
     forged = [(topic, data) for topic in topics for data in garbage if data]
     forged += states(run, 1, replicas=3) + states(run, 2, replicas=1)
     forged += [("agent_4/state", data) for _, data in states(run, 5)[:10]]  # on another agent's topic
     forged += [graph(run, sequence=7), graph(run, first_step=5), graph(run, first_step=9, last_step=3)]
-    forged += [("progress", Progress(0, run, agent, STEPS).encode()) for agent in (0, 6, 2**32 - 1)]
+    forged += [("progress", Progress(0, run, agent, STEPS).encode()) for agent in (6, 2**32 - 1)]
     forged += [("experiment", encode_string(text)) for text in ("", "{}", "[1]", '{"run": 1}', "hello")]
     trajectory, _ = run_beside(record, forged)
     assert trajectory.completeness.received == trajectory.completeness.expected
