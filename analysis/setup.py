@@ -32,6 +32,7 @@ setup(
         "rich",
         "scipy",
         "threadpoolctl",
+        "zstandard",
     ],
     entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli:main"]},
 )

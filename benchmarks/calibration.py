@@ -2,7 +2,7 @@
 
 Simulates many runs with the offline twin and compares each with its prediction. Runs that follow their law
 say how often intervals cover and how often "disagrees" is a false alarm; runs whose law differs a little from
-the one that their record claims say what the tests see. Prints Markdown; about five minutes on one core.
+the one that their record claims say what the tests see. Prints Markdown; about eight minutes on one core.
 """
 
 from __future__ import annotations

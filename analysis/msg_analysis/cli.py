@@ -13,17 +13,11 @@ from typing import TYPE_CHECKING
 import click
 
 import msg_analysis
-from msg_analysis.console import CommandGroup, examples, print_json
+from msg_analysis.console import CommandGroup, examples, print_json, result_console
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-
-def _console() -> Console:
-    from rich.console import Console
-
-    return Console(highlight=False, markup=False)
+    pass
 
 
 _json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
@@ -54,7 +48,7 @@ def predict(experiment: Path, as_json: bool) -> None:
     else:
         from msg_analysis.report.text import print_prediction
 
-        print_prediction(document, _console())
+        print_prediction(document, result_console())
 
 
 @main.command(
@@ -112,7 +106,7 @@ def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, repor
     else:
         from msg_analysis.report.text import print_comparison
 
-        print_comparison(comparison.to_json(), _console())
+        print_comparison(comparison.to_json(), result_console())
     context.exit(comparison.exit_code)
 
 
@@ -132,7 +126,7 @@ def info(source: Path, as_json: bool) -> None:
     if as_json:
         print_json(document)
     else:
-        show(document, _console())
+        show(document, result_console())
 
 
 @main.command(epilog=examples("msg-analysis schema > experiment.schema.json"))

@@ -6,11 +6,14 @@ import json
 import math
 import os
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from msg_analysis.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -49,6 +52,18 @@ def complain(text: str) -> None:
 def examples(*lines: str) -> str:
     """Epilog of a command's help."""
     return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def result_console() -> Console:
+    """The rich console for tables on stdout."""
+    from rich.console import Console
+
+    class ResultConsole(Console):
+        def on_broken_pipe(self) -> None:
+            # Rich would exit with 1, which says that a run disagrees with the prediction.
+            raise BrokenPipeError
+
+    return ResultConsole(highlight=False, markup=False)
 
 
 def print_json(document: dict[str, Any]) -> None:

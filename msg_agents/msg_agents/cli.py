@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import msg_agents
-from msg_analysis.console import CommandGroup, examples
+from msg_analysis.console import CommandGroup, examples, result_console
 
 if TYPE_CHECKING:
     from msg_agents.node import NetworkNode
@@ -115,11 +115,9 @@ def _show(result: RunResult, as_json: bool) -> None:
         click.echo(json.dumps(document))
         return
     if result.comparison is not None:
-        from rich.console import Console
-
         from msg_analysis.report.text import print_comparison
 
-        print_comparison(document, Console())
+        print_comparison(document, result_console())
         click.echo(f"bag:    {document['bag']}\nreport: {document['report']}")
     if result.rate:
         click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")

@@ -6,7 +6,6 @@ import faulthandler
 import gc
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -151,8 +150,3 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
         if not rclpy.ok():
             raise ExternalShutdownException
         time.sleep(GATE_POLL)
-
-
-def complain(text: str) -> None:
-    """One line on stderr."""
-    print(f"error: {text}", file=sys.stderr, flush=True)

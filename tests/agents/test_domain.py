@@ -30,7 +30,7 @@ with domain.free_domain() as held:
 @pytest.fixture(autouse=True)
 def _own_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Locks of our own, so that runs on the same machine neither disturb the tests nor are disturbed."""
-    monkeypatch.setattr(domain.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
 
 
 def unused(count: int) -> range:
@@ -112,7 +112,7 @@ def test_lock_files_of_another_user_do_not_use_up_the_domains(
 ) -> None:
     shared = Path(tempfile.mkdtemp(dir="/tmp"))  # pytest's own directories are closed to others
     request.addfinalizer(lambda: shutil.rmtree(shared))
-    monkeypatch.setattr(domain.tempfile, "gettempdir", lambda: str(shared))
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(shared))
     monkeypatch.setattr(domain, "DOMAINS", unused(1))
     shared.chmod(0o1777)  # as /tmp is; Linux guards files of others in such directories
     with free_domain() as held:

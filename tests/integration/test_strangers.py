@@ -105,7 +105,13 @@ def states(run: bytes, agent: int, *, replicas: int = 2, value: float = 9.0) -> 
 
 
 def graph(run: bytes, **changes: Any) -> Forgery:
-    fields = {"sequence": 0, "mode": 2, "name": "ring", "first_step": 0, "last_step": STEPS - 1} | changes
+    fields: dict[str, Any] = {
+        "sequence": 0,
+        "mode": 2,
+        "name": "ring",
+        "first_step": 0,
+        "last_step": STEPS - 1,
+    } | changes
     return "graph", ActiveGraph(stamp=0, run=run, **fields).encode()
 
 

@@ -64,7 +64,7 @@ class Trajectory:
 
     @property
     def prefix(self) -> int:
-        """Steps in the longest complete beginning: x(0..prefix) and g(0..prefix-1) are all there (-1: not even x(0))."""
+        """Steps in the longest complete beginning: x(0..prefix), g(0..prefix-1) are there (-1: not even x(0))."""
         whole = np.asarray(self.present.all(axis=1))
         states = int(np.argmin(whole)) if not whole.all() else len(whole)
         known = self.modes >= 0

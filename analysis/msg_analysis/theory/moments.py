@@ -79,7 +79,7 @@ class MomentSolver:
         return self._system
 
     def steady(self) -> FloatArray:
-        """(n, d, d): C_i = E[y y^T; mode i] in the steady state (Proposition 3 of the paper)."""
+        """(n, d, d): C_i = E[y y^T; mode i] in the steady state (the paper's second-moment propositions)."""
         system = self._system
         weighted = symmetric.pack(system.stationary[:, None, None] * system.noise)
         right = weighted.copy() if system.time == "continuous" else system.chain.T @ weighted
