@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.stats
+
 from msg_analysis.model.agent import AgentLaw
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.step import build_step_model

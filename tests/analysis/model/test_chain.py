@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
+
 from msg_analysis.model.chain import MarkovChain, stationary_law
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.path import mode_path, sojourns
@@ -89,7 +92,7 @@ def test_sojourns_cover_every_step_once() -> None:
     assert [s.sequence for s in found] == list(range(len(found)))
     assert found[0].first_step == 0
     assert found[-1].last_step == 499
-    assert all(a.last_step + 1 == b.first_step for a, b in zip(found, found[1:], strict=False))
+    assert all(a.last_step + 1 == b.first_step for a, b in itertools.pairwise(found))
     assert all(s.first_step <= s.last_step for s in found)
 
 
