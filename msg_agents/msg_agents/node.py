@@ -64,7 +64,8 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         """
         while True:
             try:
-                publisher.publish(data)
+                # What Publisher.publish comes down to for bytes, without taking hold of the handle each time.
+                publisher.handle.publish_raw(data)
                 return
             except RCLError:
                 if not self.context.ok():

@@ -9,7 +9,7 @@ is furthest behind is ahead of nobody, and all that it waits for has been publis
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -68,6 +68,9 @@ class Synchronizer(Generic[Value]):
         self._known: deque[_Known] = deque()
         self._sequence = 0
         self._unplanned = 0  # first step whose graph is not known
+        self._mode = 0  # of the next step, if its graph is known
+        self._needed: tuple[int, ...] = ()  # by the next step
+        self._missing = 1  # of them; never 0 while the graph is not known
         missing = {j for row in inputs for j in row} - self._buffers.keys()
         if missing:
             raise ValueError(f"agent {agent} uses {sorted(missing)}, who are not among its peers {sorted(peers)}")
@@ -84,6 +87,8 @@ class Synchronizer(Generic[Value]):
         self._sequence += 1
         self._unplanned = last_step + 1
         self._known.append(_Known(mode, last_step))
+        if len(self._known) == 1:
+            self._plan()
         return None
 
     def offer(self, agent: int, step: int, value: Value) -> str | None:
@@ -107,38 +112,61 @@ class Synchronizer(Generic[Value]):
         buffer[step] = value
         if step > self._newest[agent]:
             self._newest[agent] = step
+        if step == self.step and agent in self._needed:
+            self._missing -= 1
         return None
 
     def ready(self) -> bool:
         """Whether the next step can be made now."""
-        step = self.step
-        if step >= self.steps or not self._known:
-            return False
-        if step > self._limit:
-            self._limit = min(self._newest.values()) + self._window
-            if step > self._limit:
-                return False
-        buffers = self._buffers
-        return all(step in buffers[j] for j in self._inputs[self._known[0].mode])
+        return not self._missing and (self.step <= self._limit or self._within_window())
 
-    def take(self) -> tuple[int, Mapping[int, Value]]:
-        """Make the step that is ready: move on to x(step + 1).
+    def inputs(self) -> tuple[int, list[Value]]:
+        """What the step that is ready needs.
 
         Returns
         -------
-        mode and the states x_j(step) of the agents that the row of this mode uses, and of nobody else
+        mode and the states x_j(step), j ascending, of the agents that the row of this mode uses, and of nobody else
         """
+        step, buffers = self.step, self._buffers
+        return self._mode, [buffers[j][step] for j in self._needed]
+
+    def advance(self) -> None:
+        """The step that was ready has been made: move on to x(step + 1)."""
         step = self.step
-        known = self._known[0]
-        inputs = self._inputs[known.mode]
-        taken = {j: self._buffers[j].pop(step) for j in inputs}
-        if len(inputs) < len(self._buffers):  # what was sent by agents that this graph does not connect
-            for buffer in self._buffers.values():
-                buffer.pop(step, None)
+        for buffer in self._buffers.values():
+            buffer.pop(step, None)
         self.step = step + 1
-        if known.last <= step:
+        if self._known[0].last <= step:
             self._known.popleft()
-        return known.mode, taken
+        self._plan()
+
+    def withdraw(self, index: int) -> int:
+        """Forget the index-th of the ``inputs``, which turned out unfit, and wait for another one.
+
+        Returns
+        -------
+        the agent that it was said to come from
+        """
+        agent = self._needed[index]
+        del self._buffers[agent][self.step]
+        self._missing += 1
+        return agent
+
+    def _plan(self) -> None:
+        """Find out whom the next step needs, and count who of them has not been heard."""
+        if not self._known or self.step >= self.steps:
+            self._needed, self._missing = (), 1
+            return
+        self._mode = self._known[0].mode
+        self._needed = self._inputs[self._mode]
+        self._missing = 0
+        for j in self._needed:
+            if self.step not in self._buffers[j]:
+                self._missing += 1
+
+    def _within_window(self) -> bool:
+        self._limit = min(self._newest.values()) + self._window
+        return self.step <= self._limit
 
     @property
     def finished(self) -> bool:

@@ -104,10 +104,12 @@ class Network:
             assert node.learn(*self.graphs[target].popleft()) is None
         else:
             step = node.step
-            mode, heard = node.take()
-            assert list(heard) == self.case.inputs[mode][target], "uses others than the row of this mode"
+            mode, values = node.inputs()
+            used = self.case.inputs[mode][target]
+            assert len(values) == len(used), "uses others than the row of this mode"
+            node.advance()
             assert node.step == step + 1
-            self._publish(target, law(self.states[target][-1], target, mode, list(heard.items())))
+            self._publish(target, law(self.states[target][-1], target, mode, list(zip(used, values, strict=True))))
         self.check_bounds()
 
     def check_bounds(self) -> None:
@@ -208,6 +210,14 @@ def test_every_order_of_a_small_network(agents: int, inputs: Inputs, path: list[
     assert ends == 1  # all orders meet in one end, with every queue empty
 
 
+def make_step(node: Synchronizer[str]) -> tuple[int, list[str]]:
+    """What the step that is ready uses."""
+    assert node.ready()
+    taken = node.inputs()
+    node.advance()
+    return taken
+
+
 def pair(window: int = 2, steps: int = 10) -> Synchronizer[str]:
     """Agent 1 of a pair with a third one around who is never heard."""
     return Synchronizer(agent=0, steps=steps, inputs=[[1], []], peers=[1], window=window)
@@ -233,12 +243,12 @@ def test_refused_states_change_nothing(agent: int, step: int, reason: str) -> No
     node = pair()
     node.learn(0, 0, 0, 9)
     assert node.offer(1, 0, "zero") is None
-    assert node.take() == (0, {1: "zero"})
+    assert make_step(node) == (0, ["zero"])
     assert node.offer(1, 1, "one") is None
     before = everything(node)
     assert node.offer(agent, step, "forged") == reason
     assert everything(node) == before
-    assert node.take() == (0, {1: "one"})
+    assert make_step(node) == (0, ["one"])
 
 
 @pytest.mark.parametrize(
@@ -265,7 +275,7 @@ def test_the_farthest_possible_step_is_taken() -> None:
 def test_a_peer_without_a_link_still_holds_back() -> None:
     node = pair(window=1)
     node.learn(0, 1, 0, 9)  # a graph in which nobody is heard
-    node.take()  # with nothing heard: x(1) is one step ahead of a peer that has not even begun
+    make_step(node)  # with nothing heard: x(1) is one step ahead of a peer that has not even begun
     assert not node.ready()
     assert node.waiting_for() == "agents too far behind: 2"
     assert node.offer(1, 0, "0") is None  # of no use any more, but it shows that the peer moves
@@ -277,7 +287,7 @@ def test_a_peer_without_a_link_still_holds_back() -> None:
 def test_alone() -> None:
     node: Synchronizer[str] = Synchronizer(agent=0, steps=3, inputs=[[]], peers=[], window=0)
     node.learn(0, 0, 0, 2)
-    assert [node.take() for _ in range(3)] == [(0, {})] * 3
+    assert [make_step(node) for _ in range(3)] == [(0, [])] * 3
     assert node.finished
     assert not node.ready()
 
@@ -291,8 +301,21 @@ def test_waiting_for() -> None:
     assert node.waiting_for() == "step 0 of agent 3"
     node.offer(2, 0, "c")
     assert node.waiting_for() == "nothing"
-    node.take()
+    make_step(node)
     assert node.waiting_for() == "nothing, it has finished"
+
+
+def test_withdrawn_values_are_waited_for_again() -> None:
+    node: Synchronizer[str] = Synchronizer(agent=1, steps=2, inputs=[[0, 2]], peers=[0, 2], window=3)
+    node.learn(0, 0, 0, 1)
+    node.offer(0, 0, "a")
+    node.offer(2, 0, "unfit")
+    assert node.withdraw(1) == 2
+    assert not node.ready()
+    assert node.waiting_for() == "step 0 of agent 3"
+    assert node.offer(2, 0, "c") is None
+    assert node.ready()
+    assert make_step(node) == (0, ["a", "c"])
 
 
 def test_inputs_must_be_peers() -> None:

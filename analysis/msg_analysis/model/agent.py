@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from msg_analysis.model.law import step
 from msg_analysis.model.noise import ProcessNoise
 from msg_analysis.model.record import RunRecord
@@ -29,6 +27,7 @@ class AgentLaw:
         self._noise = ProcessNoise(record.experiment.run.seed, model.noise_gain, record.experiment.run.replicas)
         modes = range(model.modes)
         self._inputs = [[int(j) for j in model.inputs(mode, agent)] for mode in modes]
+        self._own = [inputs.index(agent) for inputs in self._inputs]
         self._weights = [[float(w) for w in model.weights[mode, agent, self._inputs[mode]]] for mode in modes]
         self._offsets = [float(offset) for offset in model.offsets[:, agent]]
         self._drives = self._draw(0)
@@ -37,25 +36,28 @@ class AgentLaw:
         """The other agents, ascending, whose states this agent uses under a mode (index from 0)."""
         return [j for j in self._inputs[mode] if j != self.agent]
 
-    def advance(self, mode: int, heard: Mapping[int, FloatArray]) -> FloatArray:
-        """Move from x(k) to x(k+1).
+    def advance(self, mode: int, heard: list[FloatArray]) -> FloatArray:
+        """Compute x(k+1); ``commit`` makes it the state.
 
         Parameters
         ----------
         mode : index of g(k) from 0
-        heard : x_j(k), (replicas,), of each of the mode's neighbours
+        heard : x_j(k), (replicas,), of the mode's neighbours, ascending
 
         Returns
         -------
         (replicas,) x(k+1)
         """
-        within = self.step % STEPS_PER_BLOCK
-        if within == 0 and self.step:
-            self._drives = self._draw(self.step // STEPS_PER_BLOCK)
-        values = [self.state if j == self.agent else heard[j] for j in self._inputs[mode]]
-        self.state = step(self._weights[mode], values, self._drives[mode][within])
+        before = self._own[mode]
+        values = [*heard[:before], self.state, *heard[before:]]
+        return step(self._weights[mode], values, self._drives[mode][self.step % STEPS_PER_BLOCK])
+
+    def commit(self, state: FloatArray) -> None:
+        """Go on from what ``advance`` returned."""
+        self.state = state
         self.step += 1
-        return self.state
+        if self.step % STEPS_PER_BLOCK == 0:
+            self._drives = self._draw(self.step // STEPS_PER_BLOCK)
 
     def _draw(self, block: int) -> list[FloatArray]:
         """For each mode, (STEPS_PER_BLOCK, replicas) noise plus offset in the steps of a block."""

@@ -23,9 +23,11 @@ def weighted_sum(weights: Sequence[float | FloatArray], values: Sequence[FloatAr
     weights : numbers, or arrays that broadcast against the values
     values : arrays of one shape, at least one
     """
-    total = weights[0] * values[0]
-    for weight, value in zip(weights[1:], values[1:], strict=True):
-        total += weight * value
+    terms = zip(values, weights, strict=True)
+    value, weight = next(terms)
+    total = value * weight
+    for value, weight in terms:
+        total += value * weight
     return total
 
 
