@@ -25,6 +25,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from msg_agents.domain import free_domain
 from msg_agents.environment import node_environment
 from msg_agents.errors import RCLError
+from msg_agents.process import prefer_throughput
 
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0)
 FRAME = struct.Struct("<4xQI")  # CDR header, step, agent
@@ -70,6 +71,8 @@ class Agent:
 
 
 def run_agents(arguments: argparse.Namespace) -> None:
+    if arguments.batch:
+        prefer_throughput()
     rclpy.init()
     payload = bytes(68 + 8 * arguments.replicas - FRAME.size)
     mine = range(arguments.worker, arguments.agents, arguments.processes)
@@ -93,6 +96,8 @@ def run_agents(arguments: argparse.Namespace) -> None:
 
 
 def run_recorder(arguments: argparse.Namespace) -> None:
+    if arguments.batch:
+        prefer_throughput()
     rclpy.init()
     node = bare_node("recorder")
     with tempfile.TemporaryDirectory() as directory, (Path(directory) / "bare.mcap").open("wb") as stream:
@@ -122,12 +127,19 @@ def run_recorder(arguments: argparse.Namespace) -> None:
 
 
 def measure(
-    *, agents: int = 5, processes: int = 5, steps: int = 8000, recorder: bool = False, replicas: int = 16
+    *,
+    agents: int = 5,
+    processes: int = 5,
+    steps: int = 8000,
+    recorder: bool = False,
+    replicas: int = 16,
+    batch: bool = False,
 ) -> float:
     """Steps per second of the slowest process, in the environment that the real network gives its processes."""
     common = f"--agents {agents} --processes {processes} --steps {steps} --replicas {replicas}"
     roles = [f"--worker {w}" for w in range(processes)] + (["--worker -1"] if recorder else [])
     command = [sys.executable, __file__, *common.split(), *(["--recorder"] if recorder else [])]
+    command += ["--batch"] if batch else []
     with free_domain() as domain:
         children = [
             subprocess.Popen(
@@ -152,6 +164,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8000)
     parser.add_argument("--replicas", type=int, default=16)
     parser.add_argument("--recorder", action="store_true")
+    parser.add_argument("--batch", action="store_true", help="batch scheduling, which the real network chooses itself")
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.worker is None:
@@ -161,6 +174,7 @@ def main() -> None:
             steps=arguments.steps,
             recorder=arguments.recorder,
             replicas=arguments.replicas,
+            batch=arguments.batch,
         )
         print(f"{rate:.0f} steps/s")
     elif arguments.worker < 0:

@@ -2,6 +2,9 @@
 
 Each round measures every configuration once, in turn, so that a drift of the machine hits all of them alike; the
 ratios are taken within a round and the median over the rounds is what counts.
+
+The network's processes ask the scheduler for throughput (SCHED_BATCH), which the bare loop does only where it says so:
+against the plain one, the choice counts for the network; against the other one, what the network costs shows.
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ EXPERIMENT = Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experime
 RATIOS = {
     "network / bare loop": ("network", "bare loop"),
     "network / bare loop, both recorded": ("network, recorded", "bare loop, recorded"),
+    "network / bare loop with batch scheduling": ("network", "bare loop, batch"),
+    "the same, both recorded": ("network, recorded", "bare loop, batch, recorded"),
     "network / network on SingleThreadedExecutor": ("network", "network on SingleThreadedExecutor"),
 }
 
@@ -46,6 +51,8 @@ def configurations(steps: int) -> dict[str, Callable[[], float]]:
         "network": lambda: network(steps),
         "bare loop, recorded": lambda: bare_loop.measure(steps=steps, recorder=True),
         "network, recorded": lambda: network(steps, record=True),
+        "bare loop, batch": lambda: bare_loop.measure(steps=steps, batch=True),
+        "bare loop, batch, recorded": lambda: bare_loop.measure(steps=steps, recorder=True, batch=True),
         "network on SingleThreadedExecutor": lambda: network(steps // 2, executor="single"),
     }
 

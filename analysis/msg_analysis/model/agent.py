@@ -59,7 +59,7 @@ class AgentLaw:
         if self.step % STEPS_PER_BLOCK == 0:
             self._drives = self._draw(self.step // STEPS_PER_BLOCK)
 
-    def _draw(self, block: int) -> list[FloatArray]:
-        """For each mode, (STEPS_PER_BLOCK, replicas) noise plus offset in the steps of a block."""
+    def _draw(self, block: int) -> list[list[FloatArray]]:
+        """For each mode, the noise plus offset, (replicas,), of every step of a block."""
         noise = self._noise.block(self.agent, block)
-        return [noise + offset if offset else noise for offset in self._offsets]
+        return [list(noise + offset) for offset in self._offsets]
