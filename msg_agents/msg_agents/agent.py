@@ -13,7 +13,6 @@ from msg_agents.node import GRAPH_TOPIC, OTHER_RUN, PROGRESS_TOPIC, NetworkNode,
 from msg_agents.qos import LOSSLESS
 from msg_agents.synchronizer import Synchronizer
 from msg_analysis.bags.cdr import ActiveGraph, CdrError, StateCodec, StateFrame
-from msg_analysis.errors import InputError
 from msg_analysis.model.agent import AgentLaw
 from msg_analysis.model.law import all_finite
 from msg_analysis.model.record import RunRecord
@@ -85,7 +84,8 @@ class Agent(NetworkNode):
             if frame is None or frame[0] != peer + 1:
                 self.refuse(OTHER_RUN, topic)
                 return
-            reason = offer(peer, frame[1], frame[3])
+            state = frame[3]
+            reason = offer(peer, frame[1], state) if all_finite(state) else NOT_FINITE
             if reason:
                 self.refuse(reason, topic)
             elif ready():
@@ -114,24 +114,10 @@ class Agent(NetworkNode):
         while synchronizer.ready():
             mode, heard = synchronizer.inputs()
             state = law.advance(mode, heard)
-            if not all_finite(state):
-                self._withdraw(heard)
-                continue
             synchronizer.advance()
-            law.commit(state)
             self.publish(self._states, self._codec.encode(law.step, mode + 1, state))
             if time.monotonic() >= self._next_progress or synchronizer.finished:
                 self._report()
-
-    def _withdraw(self, heard: list[FloatArray]) -> None:
-        """Refuse the inputs that are not finite. Looked for when a step came out so: once a step, not a message."""
-        unfit = [index for index, state in enumerate(heard) if not all_finite(state)]
-        for index in unfit:
-            self.refuse(NOT_FINITE, state_topic(self._synchronizer.withdraw(index)))
-        if not unfit:
-            raise InputError(
-                f"agent {self._law.agent + 1}: x({self._law.step + 1}) is not finite: the states have diverged"
-            )
 
     def _report(self) -> None:
         self.publish(self._progress, self.progress(self._law.agent + 1, self._law.step))

@@ -140,18 +140,6 @@ class Synchronizer(Generic[Value]):
             self._known.popleft()
         self._plan()
 
-    def withdraw(self, index: int) -> int:
-        """Forget the index-th of the ``inputs``, which turned out unfit, and wait for another one.
-
-        Returns
-        -------
-        the agent that it was said to come from
-        """
-        agent = self._needed[index]
-        del self._buffers[agent][self.step]
-        self._missing += 1
-        return agent
-
     def _plan(self) -> None:
         """Find out whom the next step needs, and count who of them has not been heard."""
         if not self._known or self.step >= self.steps:

@@ -305,19 +305,6 @@ def test_waiting_for() -> None:
     assert node.waiting_for() == "nothing, it has finished"
 
 
-def test_withdrawn_values_are_waited_for_again() -> None:
-    node: Synchronizer[str] = Synchronizer(agent=1, steps=2, inputs=[[0, 2]], peers=[0, 2], window=3)
-    node.learn(0, 0, 0, 1)
-    node.offer(0, 0, "a")
-    node.offer(2, 0, "unfit")
-    assert node.withdraw(1) == 2
-    assert not node.ready()
-    assert node.waiting_for() == "step 0 of agent 3"
-    assert node.offer(2, 0, "c") is None
-    assert node.ready()
-    assert make_step(node) == (0, ["a", "c"])
-
-
 def test_inputs_must_be_peers() -> None:
     with pytest.raises(ValueError, match=r"uses \[3\]"):
         Synchronizer(agent=0, steps=1, inputs=[[1, 3]], peers=[1])

@@ -37,7 +37,7 @@ class AgentLaw:
         return [j for j in self._inputs[mode] if j != self.agent]
 
     def advance(self, mode: int, heard: list[FloatArray]) -> FloatArray:
-        """Compute x(k+1); ``commit`` makes it the state.
+        """Move from x(k) to x(k+1).
 
         Parameters
         ----------
@@ -50,14 +50,11 @@ class AgentLaw:
         """
         before = self._own[mode]
         values = [*heard[:before], self.state, *heard[before:]]
-        return step(self._weights[mode], values, self._drives[mode][self.step % STEPS_PER_BLOCK])
-
-    def commit(self, state: FloatArray) -> None:
-        """Go on from what ``advance`` returned."""
-        self.state = state
+        self.state = step(self._weights[mode], values, self._drives[mode][self.step % STEPS_PER_BLOCK])
         self.step += 1
         if self.step % STEPS_PER_BLOCK == 0:
             self._drives = self._draw(self.step // STEPS_PER_BLOCK)
+        return self.state
 
     def _draw(self, block: int) -> list[list[FloatArray]]:
         """For each mode, the noise plus offset, (replicas,), of every step of a block."""
