@@ -101,7 +101,9 @@ def _show(result: RunResult, as_json: bool) -> None:
     """The result on stdout, and as result.json beside the bag."""
     from msg_agents.runner import REPORT_FILE, RESULT_FILE
 
-    document: dict[str, Any] = dict(result.comparison.to_json()) if result.comparison else {"verdict": "incomplete"}
+    document: dict[str, Any] = {"verdict": "incomplete" if result.failures else None}  # None: nothing was to be judged
+    if result.comparison is not None:
+        document = dict(result.comparison.to_json())
     document |= {
         "bag": str(result.bag) if result.trajectory else None,
         "report": str(result.bag / REPORT_FILE) if result.bag and result.comparison else None,
