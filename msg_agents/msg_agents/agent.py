@@ -68,10 +68,6 @@ class Agent(NetworkNode):
         self._report()
         self._advance()
 
-    def waiting_for(self) -> str:
-        """What keeps the agent from its next step."""
-        return self._synchronizer.waiting_for()
-
     def _receiver(self, peer: int) -> Callable[[bytes], None]:
         """The callback for one peer's states: this is the hot path."""
         decode = self._frame.decode
