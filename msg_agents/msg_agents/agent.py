@@ -10,14 +10,13 @@ from msg_agents_interfaces.msg import AgentState as AgentStateMsg
 from msg_agents_interfaces.msg import Progress as ProgressMsg
 
 from msg_agents.node import GRAPH_TOPIC, OTHER_RUN, PROGRESS_TOPIC, NetworkNode, agent_name, state_topic
-from msg_agents.qos import LOSSLESS
+from msg_agents.qos import LATCHED, STREAM
 from msg_agents.synchronizer import Synchronizer
 from msg_analysis.bags.cdr import ActiveGraph, CdrError, StateCodec, StateFrame
 from msg_analysis.model.agent import AgentLaw
-from msg_analysis.model.law import all_finite
+from msg_analysis.model.payload import all_finite
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import StepModel
-from msg_analysis.types import FloatArray
 
 PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages
 NOT_FINITE = "a state that is not finite"
@@ -40,7 +39,7 @@ class Agent(NetworkNode):
         self._law = AgentLaw(record, model, agent)
         listens = model.listens()
         peers = [j for j in range(model.agents) if listens[agent, j] or listens[j, agent]]
-        self._synchronizer: Synchronizer[FloatArray] = Synchronizer(
+        self._synchronizer: Synchronizer[bytes] = Synchronizer(
             agent=agent,
             steps=experiment.steps,
             inputs=[self._law.neighbours(mode) for mode in range(model.modes)],
@@ -50,11 +49,11 @@ class Agent(NetworkNode):
         self._frame = StateFrame(self.run, experiment.run.replicas)
         self._expected = [agent_name(j) for j in peers] + readers
         self._next_progress = 0.0
-        self._states = self.create_publisher(AgentStateMsg, state_topic(agent), LOSSLESS)
-        self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LOSSLESS)
-        self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._receive_graph, LOSSLESS, raw=True)
+        self._states = self.create_publisher(AgentStateMsg, state_topic(agent), STREAM)
+        self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
+        self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._receive_graph, LATCHED, raw=True)
         for j in peers:
-            self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), LOSSLESS, raw=True)
+            self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), STREAM, raw=True)
         self.leave_at_end()
 
     def awaited(self) -> dict[str, list[str]]:
@@ -64,19 +63,19 @@ class Agent(NetworkNode):
 
     def begin(self) -> None:
         """Publish x(0)."""
-        self.publish(self._states, self._codec.encode(0, 0, self._law.state))
+        self.publish(self._states, self._codec.wrap(0, 0, self._law.state))
         self._report()
         self._advance()
 
     def _receiver(self, peer: int) -> Callable[[bytes], None]:
         """The callback for one peer's states: this is the hot path."""
-        decode = self._frame.decode
+        unwrap = self._frame.unwrap
         offer = self._synchronizer.offer
         ready = self._synchronizer.ready
         topic = state_topic(peer)
 
         def receive(data: bytes) -> None:
-            frame = decode(data)
+            frame = unwrap(data)
             if frame is None or frame[0] != peer + 1:
                 self.refuse(OTHER_RUN, topic)
                 return
@@ -111,7 +110,7 @@ class Agent(NetworkNode):
             mode, heard = synchronizer.inputs()
             state = law.advance(mode, heard)
             synchronizer.advance()
-            self.publish(self._states, self._codec.encode(law.step, mode + 1, state))
+            self.publish(self._states, self._codec.wrap(law.step, mode + 1, state))
             if time.monotonic() >= self._next_progress or synchronizer.finished:
                 self._report()
 

@@ -7,10 +7,11 @@ from collections import Counter
 from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 
 from msg_agents.errors import RCLError
-from msg_agents.qos import LOSSLESS
+from msg_agents.qos import LATCHED
 from msg_analysis.bags.cdr import CdrError, Progress, StepClock
 from msg_analysis.model.record import RunRecord
 
@@ -92,7 +93,7 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         Whoever leaves earlier may take with it what others still need: unread messages, or the acknowledgements that
         they wait for.
         """
-        self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LOSSLESS, raw=True)
+        self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LATCHED, raw=True)
 
     def _receive_end(self, data: bytes) -> None:
         if self.decode_progress(data, END_TOPIC) and not self.done.done():
@@ -116,8 +117,13 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
 
     def missing_readers(self, publisher: Publisher, expected: list[str]) -> list[str]:
         """Names of the expected nodes that do not read a topic of ours yet."""
-        found = {info.node_name for info in self.get_subscriptions_info_by_topic(publisher.topic_name)}
+        readers = self.get_subscriptions_info_by_topic(publisher.topic_name)
+        found = {reader.node_name for reader in readers}
         missing = [name for name in expected if name not in found]
-        if not missing and publisher.get_subscription_count() < len(expected):
+        # Strangers who ask for less than is offered are matched too: all must be, for ours to be among them. Those who
+        # ask for history of a topic that keeps none never will be.
+        latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        matching = sum(latched or r.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL for r in readers)
+        if not missing and publisher.get_subscription_count() < matching:
             return ["(matching)"]
         return missing

@@ -13,12 +13,12 @@ from msg_agents_interfaces.msg import Progress as ProgressMsg
 from std_msgs.msg import String
 
 from msg_agents.node import EXPERIMENT_TOPIC, GRAPH_TOPIC, NOT_AN_AGENT, PROGRESS_TOPIC, NetworkNode, state_topic
-from msg_agents.qos import LOSSLESS
+from msg_agents.qos import LATCHED, STREAM
 from msg_analysis.bags.cdr import ActiveGraph, AgentState, CdrError, StateFrame, decode_string, stamp_ns
 from msg_analysis.bags.schemas import network_topics
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
-from msg_analysis.model.law import all_finite
+from msg_analysis.model.payload import all_finite
 from msg_analysis.model.record import RunRecord
 
 Message = TypeVar("Message", AgentState, ActiveGraph)
@@ -51,11 +51,11 @@ class Recorder(NetworkNode):
         self._pending: list[tuple[int, bytes]] = []  # states collected and not yet written, with their agents
         # Topics whose last message (last state, last sojourn, experiment) has not come.
         self._awaiting = {topic.name for topic in topics}
-        self.create_subscription(String, EXPERIMENT_TOPIC, self._record_experiment, LOSSLESS, raw=True)
-        self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._record_graph, LOSSLESS, raw=True)
+        self.create_subscription(String, EXPERIMENT_TOPIC, self._record_experiment, LATCHED, raw=True)
+        self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._record_graph, LATCHED, raw=True)
         for agent in range(experiment.agents):
-            self.create_subscription(AgentStateMsg, state_topic(agent), self._collector(agent), LOSSLESS, raw=True)
-        self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LOSSLESS)
+            self.create_subscription(AgentStateMsg, state_topic(agent), self._collector(agent), STREAM, raw=True)
+        self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
         self.leave_at_end()
         self.create_timer(WRITE_PERIOD, self._guarded(self._write_states))
         self.create_timer(FLUSH_PERIOD, self._guarded(self.bag.flush))
@@ -78,10 +78,10 @@ class Recorder(NetworkNode):
 
     def _write_states(self) -> None:
         """Write what has been collected. Many at once: that needs a fraction of the time that one by one would."""
-        decode, write, last = self._frame.decode, self.bag.write, self._last
+        unwrap, write, last = self._frame.unwrap, self.bag.write, self._last
         for agent, data in self._pending:
             topic = self._topics[agent]
-            frame = decode(data)
+            frame = unwrap(data)
             if frame is None or frame[0] != agent + 1:  # not what the agents of this run send: have a closer look
                 message = self._decode(AgentState, data, topic)
                 if message is None:

@@ -19,7 +19,7 @@ from msg_agents.node import (
     NetworkNode,
     agent_name,
 )
-from msg_agents.qos import LOSSLESS
+from msg_agents.qos import LATCHED
 from msg_analysis.bags.cdr import ActiveGraph, encode_string
 from msg_analysis.model.path import Sojourn, sojourns
 from msg_analysis.model.record import RunRecord
@@ -61,10 +61,10 @@ class Switcher(NetworkNode):
         self._on_progress = on_progress
         self._ahead: list[int] = []  # first steps of the published sojourns that the slowest agent has not reached
         self._expected = [agent_name(i) for i in range(model.agents)] + readers
-        self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LOSSLESS)
-        self._graph = self.create_publisher(ActiveGraphMsg, GRAPH_TOPIC, LOSSLESS)
-        self._end = self.create_publisher(ProgressMsg, END_TOPIC, LOSSLESS)
-        self.create_subscription(ProgressMsg, PROGRESS_TOPIC, self._receive, LOSSLESS, raw=True)
+        self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LATCHED)
+        self._graph = self.create_publisher(ActiveGraphMsg, GRAPH_TOPIC, LATCHED)
+        self._end = self.create_publisher(ProgressMsg, END_TOPIC, LATCHED)
+        self.create_subscription(ProgressMsg, PROGRESS_TOPIC, self._receive, LATCHED, raw=True)
 
     def awaited(self) -> dict[str, list[str]]:
         """See NetworkNode."""

@@ -25,8 +25,8 @@ from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.twin import new_record
 
 STEPS = 300
-# Publishes everything, waits until every reader of the run has it, and only then appears as the node that the agents
-# and the switcher have been told to wait for.
+# Waits for every reader of the run, publishes everything, waits until they have it, and only then appears as the node
+# that the agents and the switcher have been told to wait for.
 STRANGER = """
 import sys, time
 from pathlib import Path
@@ -34,27 +34,28 @@ import rclpy
 from rclpy.duration import Duration
 from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress
 from std_msgs.msg import String
-from msg_agents.qos import LOSSLESS
+from msg_agents.qos import LATCHED, STREAM
 
 AGENTS = 5
 rclpy.init()
 node = rclpy.create_node("stranger", enable_rosout=False)
 kinds = {"graph": ActiveGraph, "progress": Progress, "end": Progress, "experiment": String}
 readers = {"graph": AGENTS + 1, "progress": 1, "end": AGENTS + 1, "experiment": 1}
-publishers = {}
-for line in Path(sys.argv[1]).read_text().splitlines():
-    topic, data = line.split()
-    if topic not in publishers:
-        publishers[topic] = node.create_publisher(kinds.get(topic, AgentState), topic, LOSSLESS)
-    publishers[topic].publish(bytes.fromhex(data))
+messages = [line.split() for line in Path(sys.argv[1]).read_text().splitlines()]
+publishers = {
+    topic: node.create_publisher(kinds.get(topic, AgentState), topic, LATCHED) for topic in dict(messages)
+}
 for topic, publisher in publishers.items():
     while publisher.get_subscription_count() < readers.get(topic, 3):  # the recorder and both neighbours
         time.sleep(0.1)
+for topic, data in messages:
+    publishers[topic].publish(bytes.fromhex(data))
+for publisher in publishers.values():
     assert publisher.wait_for_all_acked(Duration(seconds=30))
 referee = rclpy.create_node("referee", enable_rosout=False)
 topics = {"graph": ActiveGraph} | {f"agent_{i}/state": AgentState for i in range(1, AGENTS + 1)}
 for topic, kind in topics.items():
-    referee.create_subscription(kind, topic, lambda _: None, LOSSLESS)
+    referee.create_subscription(kind, topic, lambda _: None, LATCHED if topic == "graph" else STREAM)
 time.sleep(600)
 """
 Forgery = tuple[str, bytes]  # topic, message
@@ -62,7 +63,7 @@ Forgery = tuple[str, bytes]  # topic, message
 
 @pytest.fixture
 def run_beside(network: Any) -> Callable[[RunRecord, list[Forgery]], tuple[Trajectory, dict[str, str]]]:
-    """Runs a network while a stranger's messages, latched, meet every reader from its beginning."""
+    """Runs a network while a stranger's messages meet every reader before those of the run."""
 
     def run(record: RunRecord, forgeries: list[Forgery]) -> tuple[Trajectory, dict[str, str]]:
         directory: Path = network.directory

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from msg_analysis.model.payload import to_payload
 from msg_analysis.types import AnyArray, FloatArray
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
@@ -107,9 +108,13 @@ class StateCodec:
         """
         if state.shape != self._shape or state.dtype != np.float64:
             raise ValueError(f"state: {state.dtype} of shape {state.shape}, expected float64 of shape {self._shape}")
+        return self.wrap(step, mode, to_payload(state))
+
+    def wrap(self, step: int, mode: int, payload: bytes) -> bytes:
+        """One AgentState of a state that is bytes already, of the right length."""
         seconds, nanoseconds = divmod(self._nanoseconds(step), _SECOND)
         fixed = (1, 0, self._run, self._agent, step, mode, 0, self._replicas)
-        return _STATE.pack(LITTLE_ENDIAN, seconds, nanoseconds, *fixed) + state.tobytes()
+        return _STATE.pack(LITTLE_ENDIAN, seconds, nanoseconds, *fixed) + payload
 
 
 class StateFrame:
@@ -126,18 +131,17 @@ class StateFrame:
         self._replicas = replicas
         self.size = _STATE.size + 8 * replicas
 
-    def decode(self, data: bytes) -> tuple[int, int, int, FloatArray] | None:
-        """(agent, step, mode, state), or None where the bytes are not of this run and layout.
+    def unwrap(self, data: bytes) -> tuple[int, int, int, bytes] | None:
+        """(agent, step, mode, state as a payload), or None where the bytes are not of this run and layout.
 
-        None means: ask :meth:`AgentState.decode`, which tells what it is. ``state`` (replicas,) is read-only.
+        None means: ask :meth:`AgentState.decode`, which tells what it is.
         """
         if len(data) != self.size:
             return None
         header, fixed, agent, step, mode, heard, replicas = _STATE_FIXED.unpack_from(data)
         if fixed != self._fixed or heard or replicas != self._replicas or header != LITTLE_ENDIAN:
             return None
-        # A slice is a copy, but an aligned one: arithmetic on it is so much faster that the copy pays at once.
-        return agent, step, mode, np.frombuffer(data[_STATE.size :])
+        return agent, step, mode, data[_STATE.size :]
 
 
 class _Reader:

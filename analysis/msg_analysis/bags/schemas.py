@@ -73,21 +73,23 @@ class Topic:
     ----------
     name : absolute
     type : of its messages
+    latched : whether who comes late still gets the messages
     """
 
     name: str
     type: MessageType
+    latched: bool
 
     @property
     def qos(self) -> list[dict[str, Any]]:
-        """The one profile that its publishers offer, in rosbag2's words: reliable, keep-all, transient-local."""
+        """The one profile that its publishers offer, in rosbag2's words: reliable, keep-all, maybe latched."""
         forever = {"sec": 9223372036, "nsec": 854775807}
         return [
             {
                 "history": "keep_all",
                 "depth": 0,
                 "reliability": "reliable",
-                "durability": "transient_local",
+                "durability": "transient_local" if self.latched else "volatile",
                 "deadline": dict(forever),
                 "lifespan": dict(forever),
                 "liveliness": "automatic",
@@ -109,9 +111,9 @@ def network_topics(agents: int, namespace: str = "") -> Sequence[Topic]:
     """
     root = "/" + namespace.strip("/") + "/" if namespace.strip("/") else "/"
     return (
-        Topic(f"{root}experiment", STRING),
-        Topic(f"{root}graph", ACTIVE_GRAPH),
-        *(Topic(state_topic(root, agent), AGENT_STATE) for agent in range(1, agents + 1)),
+        Topic(f"{root}experiment", STRING, latched=True),
+        Topic(f"{root}graph", ACTIVE_GRAPH, latched=True),
+        *(Topic(state_topic(root, agent), AGENT_STATE, latched=False) for agent in range(1, agents + 1)),
     )
 
 

@@ -7,10 +7,7 @@ threads), and each term is one multiplication and one addition of doubles.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-
-import numpy as np
 
 from msg_analysis.types import FloatArray
 
@@ -44,12 +41,3 @@ def step(weights: Sequence[float | FloatArray], values: Sequence[FloatArray], dr
     total += drive
     return total
 
-
-def all_finite(values: FloatArray) -> bool:
-    """Whether no value is infinite or undefined. Half a microsecond where all is well.
-
-    Parameters
-    ----------
-    values : (replicas,)
-    """
-    return math.isfinite(values.dot(values)) or bool(np.isfinite(values).all())

@@ -54,4 +54,4 @@ def test_topics() -> None:
     ]
     named = network_topics(1, "/lab/")
     assert [topic.name for topic in named] == ["/lab/experiment", "/lab/graph", "/lab/agent_1/state"]
-    assert {topic.qos[0]["durability"] for topic in named} == {"transient_local"}
+    assert [topic.qos[0]["durability"] for topic in named] == ["transient_local", "transient_local", "volatile"]
