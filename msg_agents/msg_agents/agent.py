@@ -56,10 +56,9 @@ class Agent(NetworkNode):
             self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), STREAM, raw=True)
         self.leave_at_end()
 
-    def awaited(self) -> dict[str, list[str]]:
+    def awaited(self) -> list[str]:
         """See NetworkNode."""
-        missing = self.missing_readers(self._states, self._expected)
-        return {self._states.topic_name: missing} if missing else {}
+        return self.missing_readers(self._states, self._expected)
 
     def begin(self) -> None:
         """Publish x(0)."""

@@ -72,9 +72,9 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
                 if not self.context.ok():
                     raise
 
-    def awaited(self) -> dict[str, list[str]]:
-        """Who has not been found yet: for each topic that this node publishes, the nodes that should read it."""
-        return {}
+    def awaited(self) -> list[str]:
+        """Names of the nodes that should read what this node publishes, and have not been found yet."""
+        return []
 
     def begin(self) -> None:
         """Everyone has been found: start."""

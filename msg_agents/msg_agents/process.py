@@ -152,7 +152,7 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
         if not waiting:
             return
         if time.monotonic() > deadline:
-            missing = sorted({name for topics in awaited.values() for names in topics.values() for name in names})
+            missing = sorted({name for names in awaited.values() for name in names})
             raise NotFoundError(
                 f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} had not found: "
                 f"{', '.join(missing)}. Are they running, in the same ROS_DOMAIN_ID "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import signal
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
@@ -17,6 +16,7 @@ from msg_agents.domain import free_domain
 from msg_agents.environment import node_environment
 from msg_agents.network import count_processes, plan_network
 from msg_agents.supervisor import Supervisor
+from msg_agents.workshop import workshop
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.writer import RECORDING_MARKER
@@ -99,25 +99,23 @@ def run_network(
         out.mkdir(parents=True, exist_ok=True)
     bag = make_bag_directory(experiment, out.absolute()) if out is not None else None
     result = RunResult(bag)
-    workshop = Path(tempfile.mkdtemp(prefix="msg_agents_"))
     try:
-        run_file = workshop / "run.json"
-        run_file.write_text(new_record(experiment).to_json(), encoding="utf-8")
-        with (
-            free_domain() if domain is None else nullcontext(domain) as chosen,
-            _interruptible() as interrupted,
-        ):
-            supervisor = Supervisor(workshop, node_environment(chosen) | dict(environment or {}))
-            with supervisor:
+        with workshop() as folder:
+            run_file = folder / "run.json"
+            run_file.write_text(new_record(experiment).to_json(), encoding="utf-8")
+            with (
+                free_domain() if domain is None else nullcontext(domain) as chosen,
+                _interruptible() as interrupted,
+                Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
+            ):
                 supervisor.start(plan_network(experiment, run_file, bag))
                 _watch(supervisor, experiment.steps, result, interrupted, on_progress)
                 # Before the others are ended: what ends because we end it has not failed.
                 _collect_failures(supervisor, result, interrupted)
-        if bag is not None:
-            _settle(bag, result)
-            shutil.copytree(workshop, bag / "log")
+            if bag is not None:
+                _settle(bag, result)
+                shutil.copytree(folder, bag / "log")
     finally:
-        shutil.rmtree(workshop, ignore_errors=True)
         if bag is not None:
             with suppress(OSError):
                 bag.rmdir()  # if nothing came of it

@@ -66,10 +66,9 @@ class Switcher(NetworkNode):
         self._end = self.create_publisher(ProgressMsg, END_TOPIC, LATCHED)
         self.create_subscription(ProgressMsg, PROGRESS_TOPIC, self._receive, LATCHED, raw=True)
 
-    def awaited(self) -> dict[str, list[str]]:
+    def awaited(self) -> list[str]:
         """See NetworkNode."""
-        missing = self.missing_readers(self._graph, self._expected)
-        return {self._graph.topic_name: missing} if missing else {}
+        return self.missing_readers(self._graph, self._expected)
 
     def begin(self) -> None:
         """Publish the experiment and the beginning of the path."""
