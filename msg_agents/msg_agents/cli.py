@@ -53,6 +53,13 @@ def main() -> None:
 @click.option("--duration", type=float, help="Instead of run.duration, in units of simulated time.")
 @click.option("--pace", help="Instead of run.pace: lockstep.")
 @click.option("--processes", help="Instead of run.processes: auto, one_per_agent or a number.")
+@click.option(
+    "--restarts",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="How often agents or the switcher may be killed and are started again.",
+)
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own.")
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
@@ -65,6 +72,7 @@ def run(
     duration: float | None,
     pace: str | None,
     processes: str | None,
+    restarts: int,
     domain: int | None,
     executor: str | None,
     as_json: bool,
@@ -84,9 +92,12 @@ def run(
             what,
             None if no_record else out,
             domain=domain,
+            restarts=restarts,
             on_progress=on_progress,
             environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
         )
+    for line in result.restarts:
+        click.echo(f"{click.style('note:', fg='yellow', bold=True)} {line}", err=True)
     for line in result.failures:
         click.echo(f"{click.style('failed:', fg='red', bold=True)} {line}", err=True)
     conclude(result)
@@ -109,6 +120,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         "report": str(result.bag / REPORT_FILE) if result.bag and result.comparison else None,
         "rate": result.rate,
         "wall_time": result.wall_time,
+        "restarts": result.restarts,
         "failures": result.failures,
     }
     if result.bag is not None and result.comparison is not None:
@@ -223,6 +235,13 @@ _await = click.option(
 )
 
 
+_checkpoint = click.option(
+    "--checkpoint",
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Directory that keeps what is needed to go on after being killed: the same command then takes over.",
+)
+
+
 @main.command(epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
 @_node_options
 @click.option(
@@ -234,7 +253,10 @@ _await = click.option(
     help="Number of an agent, from 1. Repeatable.",
 )
 @_await
-def agent(run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...], **options: Any) -> None:
+@_checkpoint
+def agent(
+    run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...], checkpoint: Path | None, **options: Any
+) -> None:
     """Run one or more agents of the run in RUN_RECORD in one process."""
     from msg_analysis.errors import InputError
     from msg_analysis.model.step import build_step_model
@@ -251,7 +273,10 @@ def agent(run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...]
         from msg_agents.agent import Agent
 
         model = build_step_model(record.experiment)
-        return [Agent(record=record, model=model, agent=i - 1, readers=list(readers)) for i in agents]
+        directory = _make(checkpoint)
+        return [
+            Agent(record=record, model=model, agent=i - 1, readers=list(readers), checkpoints=directory) for i in agents
+        ]
 
     _run_nodes(nodes, **options)
 
@@ -259,8 +284,11 @@ def agent(run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...]
 @main.command(epilog=examples("msg-agents switcher run.json --await recorder"))
 @_node_options
 @_await
+@_checkpoint
 @click.option("--status", type=int, hidden=True)
-def switcher(run_record: Path, *, readers: tuple[str, ...], status: int | None, **options: Any) -> None:
+def switcher(
+    run_record: Path, *, readers: tuple[str, ...], checkpoint: Path | None, status: int | None, **options: Any
+) -> None:
     """Run the switcher of the run in RUN_RECORD: it publishes the experiment and the active graph."""
     from msg_analysis.model.step import build_step_model
 
@@ -274,7 +302,8 @@ def switcher(run_record: Path, *, readers: tuple[str, ...], status: int | None, 
         from msg_agents.switcher import Switcher
 
         model = build_step_model(record.experiment)
-        return [Switcher(record=record, model=model, readers=list(readers), on_progress=report)]
+        directory = _make(checkpoint)
+        return [Switcher(record=record, model=model, readers=list(readers), on_progress=report, checkpoints=directory)]
 
     _run_nodes(nodes, **options)
 
@@ -302,6 +331,17 @@ def _run_nodes(nodes: Callable[[], list[NetworkNode]], *, lifeline: int | None, 
     executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
     if not run_nodes(nodes, executor=executor, discovery_timeout=discovery_timeout):
         sys.exit(INCOMPLETE)
+
+
+def _make(directory: Path | None) -> Path | None:
+    from msg_analysis.errors import InputError
+
+    if directory is not None:
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"--checkpoint: {directory}: cannot be made ({error.strerror}): name another") from error
+    return directory
 
 
 def _load(path: Path) -> Experiment:

@@ -24,11 +24,13 @@ class ProcessPlan:
     name : what people call it
     arguments : of the command ``msg-agents`` that runs it
     agents : indices from 0 of the agents in it
+    resumes : whether the same command takes over when the process has been killed
     """
 
     name: str
     arguments: tuple[str, ...]
     agents: tuple[int, ...] = ()
+    resumes: bool = False
 
 
 def count_processes(experiment: Experiment) -> int:
@@ -50,7 +52,9 @@ def count_processes(experiment: Experiment) -> int:
     return count
 
 
-def plan_network(experiment: Experiment, run_file: Path, bag: Path | None) -> list[ProcessPlan]:
+def plan_network(
+    experiment: Experiment, run_file: Path, bag: Path | None, checkpoints: Path | None = None
+) -> list[ProcessPlan]:
     """The processes of a run, in the order in which they should be started.
 
     Parameters
@@ -58,13 +62,17 @@ def plan_network(experiment: Experiment, run_file: Path, bag: Path | None) -> li
     experiment : what is run
     run_file : the run record that every node is given
     bag : directory to record to; None: no recorder
+    checkpoints : directory for what agents and switcher need to go on after being killed; None: they cannot
 
     Raises
     ------
     InputError : more processes than discovery can handle
     """
     count = count_processes(experiment)
-    readers = ("--await", RECORDER) if bag is not None else ()
+    options: tuple[str, ...] = ("--await", RECORDER) if bag is not None else ()
+    if checkpoints is not None:
+        options += ("--checkpoint", str(checkpoints))
+    resumes = checkpoints is not None
     plans = []
     if bag is not None:
         plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag))))
@@ -74,6 +82,6 @@ def plan_network(experiment: Experiment, run_file: Path, bag: Path | None) -> li
         numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
         first, last = agents[0] + 1, agents[-1] + 1
         name = f"agent_{first}" if first == last else f"agents_{first}_to_{last}"
-        plans.append(ProcessPlan(name, ("agent", str(run_file), *numbers, *readers), agents))
-    plans.append(ProcessPlan("switcher", ("switcher", str(run_file), *readers)))
+        plans.append(ProcessPlan(name, ("agent", str(run_file), *numbers, *options), agents, resumes))
+    plans.append(ProcessPlan("switcher", ("switcher", str(run_file), *options), resumes=resumes))
     return plans

@@ -11,7 +11,9 @@ from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 
 from msg_agents.errors import RCLError
+from msg_agents.health import Health, Reporter
 from msg_agents.qos import LATCHED
+from msg_agents.synchronizer import Refusal
 from msg_analysis.bags.cdr import CdrError, Progress, StepClock
 from msg_analysis.model.record import RunRecord
 
@@ -21,11 +23,18 @@ PROGRESS_TOPIC = "progress"
 END_TOPIC = "end"
 NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
 OTHER_RUN = "of another run, agent or layout"
+RECORDED = "recorded already"
+REPEATS = {Refusal.OLD, Refusal.KNOWN, RECORDED}
 
 
 def agent_name(agent: int) -> str:
     """Name of the node, and namespace of the topics, of an agent (index from 0)."""
     return f"agent_{agent + 1}"
+
+
+def resend_topic(agent: int) -> str:
+    """Topic on which an agent (index from 0) is asked for its states from some step on."""
+    return f"{agent_name(agent)}/resend"
 
 
 def state_topic(agent: int) -> str:
@@ -50,9 +59,17 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         self._step_clock = StepClock(record.experiment.step_length)
         self.done: Future = Future()
         self.refused: Counter[str] = Counter()
+        self.repeated = 0
+        Reporter(self)
 
     def refuse(self, reason: str, topic: str) -> None:
-        """Count a message that is no part of this run; say so the first time."""
+        """Count a message that is no part of this run; say so the first time.
+
+        What is here already is only counted: agents send again what one of them may have missed.
+        """
+        if reason in REPEATS:
+            self.repeated += 1
+            return
         self.refused[reason] += 1
         if self.refused[reason] == 1:
             self.get_logger().warning(f"refused a message on {topic}: {reason} (further ones are only counted)")
@@ -71,6 +88,10 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
             except RCLError:
                 if not self.context.ok():
                     raise
+
+    def health(self) -> Health:
+        """How this node is, asked about once a second."""
+        raise NotImplementedError
 
     def awaited(self) -> list[str]:
         """Names of the nodes that should read what this node publishes, and have not been found yet."""

@@ -12,7 +12,17 @@ from msg_agents_interfaces.msg import AgentState as AgentStateMsg
 from msg_agents_interfaces.msg import Progress as ProgressMsg
 from std_msgs.msg import String
 
-from msg_agents.node import EXPERIMENT_TOPIC, GRAPH_TOPIC, NOT_AN_AGENT, PROGRESS_TOPIC, NetworkNode, state_topic
+from msg_agents.checkpoint import MOST
+from msg_agents.health import Health
+from msg_agents.node import (
+    EXPERIMENT_TOPIC,
+    GRAPH_TOPIC,
+    NOT_AN_AGENT,
+    PROGRESS_TOPIC,
+    RECORDED,
+    NetworkNode,
+    state_topic,
+)
 from msg_agents.qos import LATCHED, STREAM
 from msg_analysis.bags.cdr import ActiveGraph, AgentState, CdrError, StateFrame, decode_string, stamp_ns
 from msg_analysis.bags.schemas import network_topics
@@ -48,6 +58,8 @@ class Recorder(NetworkNode):
         self._last = experiment.steps
         self._frame = StateFrame(self.run, experiment.run.replicas)
         self._topics = [self.resolve_topic_name(state_topic(agent)) for agent in range(experiment.agents)]
+        self._known: list[dict[int, int]] = [{} for _ in range(experiment.agents)]  # step -> hash of what was written
+        self._seen: set[bytes] = set()  # all but the states that have been written
         self._pending: list[tuple[int, bytes]] = []  # states collected and not yet written, with their agents
         # Topics whose last message (last state, last sojourn, experiment) has not come.
         self._awaiting = {topic.name for topic in topics}
@@ -59,6 +71,11 @@ class Recorder(NetworkNode):
         self.leave_at_end()
         self.create_timer(WRITE_PERIOD, self._guarded(self._write_states))
         self.create_timer(FLUSH_PERIOD, self._guarded(self.bag.flush))
+
+    def health(self) -> Health:
+        """See NetworkNode."""
+        values = {"messages": str(self.bag.messages), "topics without their last message": str(len(self._awaiting))}
+        return Health(f"{self.bag.messages} messages recorded", values=values)
 
     def finish(self, *, complete: bool) -> None:  # noqa: ARG002  an interrupted bag is closed just as well
         """Close the bag: it is complete only if the recorder saw the end of the run."""
@@ -89,10 +106,23 @@ class Recorder(NetworkNode):
                 if message.agent != agent + 1:
                     self.refuse(OTHER_AGENT, topic)
                     continue
+            elif self._have(agent, frame[1], data):
+                self.refuse(RECORDED, topic)
+                continue
             write(topic, data, stamp_ns(data))
             if frame is not None and frame[1] == last and all_finite(frame[3]):
                 self._came(topic)
         self._pending.clear()
+
+    def _have(self, agent: int, step: int, data: bytes) -> bool:
+        """Whether the very same message has been written: agents send theirs again when one of them was killed."""
+        known, mark = self._known[agent], hash(data)
+        if known.get(step) == mark:
+            return True
+        known[step] = mark
+        if len(known) > 2 * MOST:
+            self._known[agent] = {k: v for k, v in known.items() if k > step - MOST}
+        return False
 
     def _record_graph(self, data: bytes) -> None:
         graph = self._decode(ActiveGraph, data, GRAPH_TOPIC)
@@ -122,6 +152,10 @@ class Recorder(NetworkNode):
         return message
 
     def _write(self, topic: str, data: bytes, time: int, *, last: bool) -> None:
+        if data in self._seen:
+            self.refuse(RECORDED, topic)
+            return
+        self._seen.add(data)
         name = self.resolve_topic_name(topic)
         self._guarded(lambda: self.bag.write(name, data, time))()
         if last:

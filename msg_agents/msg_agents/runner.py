@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from msg_analysis.inference.compare import Comparison
 
 POLL = 0.05  # s
+CHECKPOINTS = "checkpoints"
 REPORT_FILE, RESULT_FILE = "report.html", "result.json"
 
 
@@ -43,6 +44,7 @@ class RunResult:
     interrupted : whether the user ended the run
     wall_time : s from the first state to the last one
     rate : steps per second of wall time
+    restarts : what was killed and started again, one line each
     trajectory, comparison : of the bag, if it could be read
     """
 
@@ -51,6 +53,7 @@ class RunResult:
     interrupted: bool = False
     wall_time: float = 0.0
     rate: float = 0.0
+    restarts: list[str] = field(default_factory=list)
     trajectory: Trajectory | None = None
     comparison: Comparison | None = None
 
@@ -72,6 +75,7 @@ def run_network(
     out: Path | None,
     *,
     domain: int | None = None,
+    restarts: int = 0,
     on_progress: Callable[[int], None] = lambda _: None,
     environment: Mapping[str, str] | None = None,
 ) -> RunResult:
@@ -82,6 +86,7 @@ def run_network(
     experiment : what to run
     out : directory in which a new bag is made; None: do not record
     domain : ROS_DOMAIN_ID; a free one is chosen if not given
+    restarts : how often an agent or the switcher may be killed and is started again; once more ends the run
     on_progress : called a few times a second with the step that every agent has reached
     environment : changes to the environment of the processes
 
@@ -108,13 +113,13 @@ def run_network(
                 _interruptible() as interrupted,
                 Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
             ):
-                supervisor.start(plan_network(experiment, run_file, bag))
-                _watch(supervisor, experiment.steps, result, interrupted, on_progress)
+                supervisor.start(plan_network(experiment, run_file, bag, folder / CHECKPOINTS if restarts else None))
+                _watch(supervisor, experiment.steps, result, restarts, interrupted, on_progress)
                 # Before the others are ended: what ends because we end it has not failed.
                 _collect_failures(supervisor, result, interrupted)
             if bag is not None:
                 _settle(bag, result)
-                shutil.copytree(folder, bag / "log")
+                shutil.copytree(folder, bag / "log", ignore=shutil.ignore_patterns(CHECKPOINTS))
     finally:
         if bag is not None:
             with suppress(OSError):
@@ -126,12 +131,13 @@ def _watch(
     supervisor: Supervisor,
     steps: int,
     result: RunResult,
+    restarts: int,
     interrupted: list[int],
     on_progress: Callable[[int], None],
 ) -> None:
-    """Until all have done their part, one has failed, or the user has had enough."""
+    """Until all have done their part, one has failed for good, or the user has had enough."""
     began: float | None = None
-    while supervisor.running and not supervisor.failures and not interrupted:
+    while not interrupted and _revive(supervisor, result, restarts) and supervisor.running:
         time.sleep(POLL)
         supervisor.read_status()
         reached = min(supervisor.steps, default=-1)
@@ -144,6 +150,18 @@ def _watch(
         on_progress(reached)
     if result.wall_time:
         result.rate = min(supervisor.steps, default=0) / result.wall_time
+
+
+def _revive(supervisor: Supervisor, result: RunResult, restarts: int) -> bool:
+    """Start again who has been killed; False if somebody cannot be."""
+    for child in supervisor.failures:
+        if not child.resumes or len(result.restarts) >= restarts:
+            return False
+        step = min((supervisor.steps[i] for i in child.plan.agents), default=-1) if supervisor.steps else -1
+        after = f" after step {step}" if step >= 0 else ""
+        result.restarts.append(f"{child.plan.name}: {child.failure}{after}, started again")
+        supervisor.restart(child)
+    return True
 
 
 def _collect_failures(supervisor: Supervisor, result: RunResult, interrupted: list[int]) -> None:

@@ -54,6 +54,12 @@ class Child:
             return f"killed by {signal.Signals(-code).name}"
         return f"exit code {code}"
 
+    @property
+    def resumes(self) -> bool:
+        """Whether it was killed and can take over from itself. An error of its own would only come again."""
+        code = self.process.poll()
+        return self.plan.resumes and code is not None and code < 0
+
     def last_words(self) -> str:
         """The last line that it printed."""
         with contextlib.suppress(OSError):
@@ -91,26 +97,30 @@ class Supervisor:
         self._lifeline = os.pipe()
         self._status = os.pipe()
         os.set_blocking(self._status[0], False)
-        for plan in plans:
-            log = self.logs / f"{plan.name}.log"
-            options = ["--lifeline", str(self._lifeline[0])]
-            descriptors = [self._lifeline[0]]
-            if plan.name == "switcher":
-                options += ["--status", str(self._status[1])]
-                descriptors.append(self._status[1])
-            with log.open("wb") as output:
-                process = subprocess.Popen(
-                    [sys.executable, "-m", "msg_agents", *plan.arguments, *options],
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=subprocess.STDOUT,
-                    env=dict(self.environment),
-                    pass_fds=descriptors,
-                    start_new_session=True,
-                )
-            self.children.append(Child(plan, process, log))
-        os.close(self._lifeline[0])
-        os.close(self._status[1])
+        self.children += [self._start(plan) for plan in plans]
+
+    def restart(self, child: Child) -> None:
+        """Start again what has been killed."""
+        self.children[self.children.index(child)] = self._start(child.plan)
+
+    def _start(self, plan: ProcessPlan) -> Child:
+        log = self.logs / f"{plan.name}.log"
+        options = ["--lifeline", str(self._lifeline[0])]
+        descriptors = [self._lifeline[0]]
+        if plan.name == "switcher":
+            options += ["--status", str(self._status[1])]
+            descriptors.append(self._status[1])
+        with log.open("ab") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "msg_agents", *plan.arguments, *options],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=dict(self.environment),
+                pass_fds=descriptors,
+                start_new_session=True,
+            )
+        return Child(plan, process, log)
 
     def read_status(self) -> None:
         """Take in what the switcher has reported since the last call."""
@@ -157,6 +167,6 @@ class Supervisor:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
-        for descriptor in (self._lifeline[1], self._status[0]):
+        for descriptor in (*self._lifeline, *self._status):
             with contextlib.suppress(OSError):
                 os.close(descriptor)

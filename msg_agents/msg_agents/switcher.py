@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
 from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.duration import Duration
 from std_msgs.msg import String
 
+from msg_agents.health import Health
 from msg_agents.network import RECORDER
 from msg_agents.node import (
     END_TOPIC,
@@ -29,6 +32,8 @@ AHEAD = 1000
 """Sojourns that are published before the slowest agent reaches them. Enough never to be waited for; bounded, so that a
 long run keeps little in memory, and below the 5,000 messages that a late reader is given."""
 
+BEHIND = 5000
+"""Sojourns that a reader may be behind: what the middleware keeps of a writer."""
 
 FAREWELL = 4.0  # s; more than the 3 s between two heartbeats of Fast DDS
 
@@ -42,6 +47,7 @@ class Switcher(NetworkNode):
     model : its step model
     readers : names of the nodes, besides the agents, that must read the graph before the run starts
     on_progress : called with the newest step of every agent (-1: none yet) whenever one of them reports
+    checkpoints : directory in which it leaves a mark; whoever finds one there takes over from a process that has gone
     """
 
     def __init__(
@@ -51,6 +57,7 @@ class Switcher(NetworkNode):
         model: StepModel,
         readers: list[str],
         on_progress: Callable[[Sequence[int]], None] = lambda _: None,
+        checkpoints: Path | None = None,
     ) -> None:
         super().__init__("switcher", record=record)
         self._graphs = record.experiment.graph_list
@@ -59,6 +66,9 @@ class Switcher(NetworkNode):
         self._reached = [-1] * model.agents
         self._recorded = RECORDER not in readers
         self._on_progress = on_progress
+        # Part of the path has been published if there is a mark, and nobody says how much.
+        self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
+        self._behind = bool(self._mark and self._mark.exists())
         self._ahead: list[int] = []  # first steps of the published sojourns that the slowest agent has not reached
         self._expected = [agent_name(i) for i in range(model.agents)] + readers
         self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LATCHED)
@@ -70,8 +80,19 @@ class Switcher(NetworkNode):
         """See NetworkNode."""
         return self.missing_readers(self._graph, self._expected)
 
+    def health(self) -> Health:
+        """See NetworkNode."""
+        slowest = min(self._reached)
+        values = {"step of the slowest agent": str(slowest), "sojourns ahead of it": str(len(self._ahead))}
+        if slowest < 0:
+            silent = [agent_name(i) for i, step in enumerate(self._reached) if step < 0]
+            return Health(f"waiting for {', '.join(silent)}", waiting=True, values=values)
+        return Health(f"{len(self._ahead)} sojourns ahead of step {slowest}", values=values)
+
     def begin(self) -> None:
         """Publish the experiment and the beginning of the path."""
+        if self._mark:
+            self._mark.touch()
         self.publish(self._experiment, encode_string(self.record.to_json()))
         self._keep_ahead()
 
@@ -96,13 +117,31 @@ class Switcher(NetworkNode):
 
     def _keep_ahead(self) -> None:
         slowest = min(self._reached)
+        if self._behind:
+            if slowest < 0:  # not everybody has said yet where he is
+                return
+            self._catch_up(slowest)
         self._ahead = [first for first in self._ahead if first > slowest]
         while len(self._ahead) < AHEAD:
             sojourn = next(self._path, None)
             if sojourn is None:
                 return
-            self.publish(self._graph, self._message(sojourn).encode())
-            self._ahead.append(sojourn.first_step)
+            self._publish_sojourn(sojourn)
+
+    def _catch_up(self, slowest: int) -> None:
+        """Publish again what may still have been under way when the process before this one went."""
+        recent: deque[Sojourn] = deque(maxlen=BEHIND)
+        for sojourn in self._path:
+            recent.append(sojourn)
+            if sojourn.last_step >= slowest:
+                break
+        for sojourn in recent:
+            self._publish_sojourn(sojourn)
+        self._behind = False
+
+    def _publish_sojourn(self, sojourn: Sojourn) -> None:
+        self.publish(self._graph, self._message(sojourn).encode())
+        self._ahead.append(sojourn.first_step)
 
     def _message(self, sojourn: Sojourn) -> ActiveGraph:
         graph = self._graphs[sojourn.mode]

@@ -26,6 +26,7 @@ class Refusal:
     OLD = "a step already done or already here"
     FAR = "a step that a peer cannot have reached"
     SEQUENCE = "a sojourn out of sequence"
+    KNOWN = "a sojourn known already"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +47,7 @@ class Synchronizer(Generic[Value]):
     inputs : for each mode, the other agents whose states the agent's row uses, ascending
     peers : every other agent that the agent ever hears or is heard by (of which ``inputs`` are some)
     window : steps that the agent may be ahead of a peer, >= 0
+    start : step that the agent is at already, where it takes over from a process that has gone
     """
 
     def __init__(
@@ -56,9 +58,10 @@ class Synchronizer(Generic[Value]):
         inputs: Sequence[Sequence[int]],
         peers: Collection[int],
         window: int = WINDOW,
+        start: int = 0,
     ) -> None:
         self.agent = agent
-        self.step = 0
+        self.step = start
         self.steps = steps
         self._inputs = [tuple(row) for row in inputs]
         self._window = window
@@ -66,8 +69,9 @@ class Synchronizer(Generic[Value]):
         self._newest = dict.fromkeys(self._buffers, -1)
         self._limit = window - 1 if peers else steps
         self._known: deque[_Known] = deque()
-        self._sequence = 0
-        self._unplanned = 0  # first step whose graph is not known
+        # Of the next sojourn. Who takes over comes into the middle, and takes the sojourn of its step for the first.
+        self._sequence: int | None = 0 if start == 0 else None
+        self._unplanned = start  # first step whose graph is not known
         self._mode = 0  # of the next step, if its graph is known
         self._needed: tuple[int, ...] = ()  # by the next step
         self._missing = 1  # of them; never 0 while the graph is not known
@@ -82,9 +86,16 @@ class Synchronizer(Generic[Value]):
         -------
         None if taken, else the reason (a ``Refusal``). Sojourns must come in sequence, each where the last one ended.
         """
-        if sequence != self._sequence or first_step != self._unplanned or last_step < first_step:
+        if self._sequence is None:
+            if last_step < self.step:
+                return Refusal.KNOWN
+            if not first_step <= self.step:
+                return Refusal.SEQUENCE
+        elif sequence < self._sequence:
+            return Refusal.KNOWN
+        elif sequence != self._sequence or first_step != self._unplanned or last_step < first_step:
             return Refusal.SEQUENCE
-        self._sequence += 1
+        self._sequence = sequence + 1
         self._unplanned = last_step + 1
         self._known.append(_Known(mode, last_step))
         if len(self._known) == 1:

@@ -64,24 +64,24 @@ class Network:
     states: list[list[int]] = field(init=False)  # [agent][step]
     links: dict[tuple[int, int], deque[tuple[int, int]]] = field(init=False)
     graphs: list[deque[Sojourn]] = field(init=False)
+    unheard: set[tuple[int, int]] = field(default_factory=set)  # links over which a new process has not asked yet
+    killed: bool = False
 
     def __post_init__(self) -> None:
         case = self.case
-        self.nodes = [
-            Synchronizer(
-                agent=i,
-                steps=case.steps,
-                inputs=[mode[i] for mode in case.inputs],
-                peers=case.peers(i),
-                window=case.window,
-            )
-            for i in range(case.agents)
-        ]
+        self.nodes = [self._node(i, 0) for i in range(case.agents)]
         self.links = {(j, i): deque() for i in range(case.agents) for j in case.peers(i)}
         self.graphs = [deque(case.path) for _ in range(case.agents)]
         self.states = [[] for _ in range(case.agents)]
         for i in range(case.agents):
             self._publish(i, i + 1)
+
+    def _node(self, agent: int, start: int) -> Synchronizer[int]:
+        case = self.case
+        inputs = [mode[agent] for mode in case.inputs]
+        return Synchronizer(
+            agent=agent, steps=case.steps, inputs=inputs, peers=case.peers(agent), window=case.window, start=start
+        )
 
     def _publish(self, agent: int, value: int) -> None:
         for (source, _), queue in self.links.items():
@@ -89,19 +89,38 @@ class Network:
                 queue.append((len(self.states[agent]), value))
         self.states[agent].append(value)
 
+    def kill(self, agent: int) -> None:
+        """All that is under way to and from it is lost; its next process publishes again what this one has."""
+        self.killed = True
+        self.nodes[agent] = self._node(agent, self.nodes[agent].step)
+        self.graphs[agent] = deque(self.case.path)
+        for source, target in self.links:
+            if source == agent:
+                self.links[source, target] = deque(enumerate(self.states[agent]))
+            elif target == agent:
+                self.links[source, target].clear()
+                self.unheard.add((source, target))
+
     def events(self) -> list[tuple[str, int, int]]:
         """Everything that can happen now."""
         possible = [("state", j, i) for (j, i), queue in self.links.items() if queue]
         possible += [("graph", i, i) for i, queue in enumerate(self.graphs) if queue]
+        possible += [("again", j, i) for j, i in self.unheard]
         return possible + [("step", i, i) for i, node in enumerate(self.nodes) if node.ready()]
 
     def happen(self, event: tuple[str, int, int]) -> None:
         kind, source, target = event
         node = self.nodes[target]
         if kind == "state":
-            assert node.offer(source, *self.links[source, target].popleft()) is None
+            refused = node.offer(source, *self.links[source, target].popleft())
+            assert refused in ((None, Refusal.OLD) if self.killed else (None,))
         elif kind == "graph":
-            assert node.learn(*self.graphs[target].popleft()) is None
+            refused = node.learn(*self.graphs[target].popleft())
+            assert refused in ((None, Refusal.KNOWN) if self.killed else (None,))
+        elif kind == "again":
+            self.unheard.discard((source, target))
+            first = max(0, node.step - self.case.window - 1)
+            self.links[source, target].extend(list(enumerate(self.states[source]))[first:])
         else:
             step = node.step
             mode, values = node.inputs()
@@ -169,6 +188,21 @@ def test_any_network_in_any_order_is_the_serial_loop(case: Case, seed: int, slow
     }
     while events := network.events():
         network.happen(rng.choices(events, [weight[event] for event in events])[0])
+    network.check_end(serial(case))
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases(), st.integers(0, 2**32))
+def test_agents_may_be_killed_at_any_time(case: Case, seed: int) -> None:
+    """Each of them a few times, also while others wait for its answer."""
+    rng = random.Random(seed)
+    network, lives = Network(case), 2 * case.agents
+    while events := network.events():
+        if lives and rng.random() < 0.05:
+            lives -= 1
+            network.kill(rng.randrange(case.agents))
+        else:
+            network.happen(rng.choice(events))
     network.check_end(serial(case))
 
 
@@ -252,15 +286,21 @@ def test_refused_states_change_nothing(agent: int, step: int, reason: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("sequence", "first", "last"),
-    [(0, 0, 4), (2, 5, 9), (1, 6, 9), (1, 4, 9), (1, 5, 4)],
+    ("sequence", "first", "last", "reason"),
+    [
+        (0, 0, 4, Refusal.KNOWN),
+        (2, 5, 9, Refusal.SEQUENCE),
+        (1, 6, 9, Refusal.SEQUENCE),
+        (1, 4, 9, Refusal.SEQUENCE),
+        (1, 5, 4, Refusal.SEQUENCE),
+    ],
     ids=["again", "one left out", "gap", "overlap", "empty"],
 )
-def test_refused_sojourns_change_nothing(sequence: int, first: int, last: int) -> None:
+def test_refused_sojourns_change_nothing(sequence: int, first: int, last: int, reason: str) -> None:
     node = pair()
     assert node.learn(0, 0, 0, 4) is None
     before = everything(node)
-    assert node.learn(sequence, 1, first, last) == Refusal.SEQUENCE
+    assert node.learn(sequence, 1, first, last) == reason
     assert everything(node) == before
     assert node.learn(1, 1, 5, 9) is None
 

@@ -126,6 +126,11 @@ class BagWriter:
         if time_ns < file.start:
             file.start = time_ns
 
+    @property
+    def messages(self) -> int:
+        """Written so far."""
+        return self._file.messages
+
     def flush(self) -> None:
         """Hand everything so far to the operating system, so that it survives the end of this process.
 

@@ -31,6 +31,11 @@ class AgentLaw:
         self._offsets = [float(offset) for offset in model.offsets[:, agent]]
         self._drives = self._draw(0)
 
+    def resume(self, step: int, state: bytes) -> None:
+        """Go on from x(step). The noise of every step is a function of the seed and the step: nothing else is needed."""
+        self.step, self.state = step, state
+        self._drives = self._draw(step // STEPS_PER_BLOCK)
+
     def neighbours(self, mode: int) -> list[int]:
         """The other agents, ascending, whose states this agent uses under a mode (index from 0)."""
         return [j for j in self._inputs[mode] if j != self.agent]
