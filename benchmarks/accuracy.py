@@ -76,7 +76,8 @@ def kronecker_continuous(experiment: Experiment) -> FloatArray:
     laplacians = [projector @ graph.laplacian @ projector for graph in experiment.graph_list]
     matrix = scipy.linalg.block_diag(*[np.kron(z, eye) + np.kron(eye, z) for z in laplacians])
     matrix -= np.kron(chain.matrix.T, np.kron(projector, projector))
-    noise = projector @ experiment.noise_gain @ experiment.noise_gain.T @ projector
+    gain = experiment.noise_gain[0]
+    noise = projector @ gain @ gain.T @ projector
     right = np.concatenate([share * noise.ravel() for share in chain.stationary])
     solution = np.linalg.pinv(matrix, rcond=1e-11) @ right
     return np.asarray(solution.reshape(n, m, m).sum(axis=0))
@@ -88,7 +89,8 @@ def kronecker_emulated(experiment: Experiment) -> FloatArray:
     projector = np.eye(m) - 1 / m
     steps = [projector @ (np.eye(m) - dt * graph.laplacian) for graph in experiment.graph_list]
     transition = scipy.linalg.expm(experiment.chain.matrix * dt)
-    noise = (dt * projector @ experiment.noise_gain @ experiment.noise_gain.T @ projector).ravel()
+    gain = experiment.noise_gain[0]
+    noise = (dt * projector @ gain @ gain.T @ projector).ravel()
     share = experiment.chain.stationary
     matrix = np.eye(n * m * m)
     right = np.zeros((n, m * m))

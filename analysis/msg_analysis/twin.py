@@ -62,9 +62,9 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
     -------
     The same states, to the last bit, as those of a lockstep network run.
     """
-    record = record or new_record(experiment)
-    experiment = record.experiment
+    experiment = record.experiment if record else experiment
     experiment.require_available()
+    record = record or new_record(experiment)
     model = build_step_model(experiment)
     modes = mode_path(experiment, model.initial)
     states = np.empty((experiment.steps + 1, *record.start.shape))
@@ -83,9 +83,12 @@ def _states(experiment: Experiment, model: StepModel, modes: IntArray, start: Fl
     for k, mode in enumerate(modes):
         within = k % STEPS_PER_BLOCK
         if within == 0:
-            block = np.stack([noise.block(i, k // STEPS_PER_BLOCK) for i in range(model.agents)], axis=1)
+            noises = [noise.block(i, k // STEPS_PER_BLOCK) for i in range(model.agents)]
+            drives: dict[int, FloatArray] = {}
+        if mode not in drives:
+            drives[mode] = np.stack([of_agent[mode] for of_agent in noises], axis=1) + offsets[mode]
         weights, inputs = rows[mode]
-        state = step(weights, [state[j] for j in inputs], block[within] + offsets[mode])
+        state = step(weights, [state[j] for j in inputs], drives[mode][within])
         yield state
 
 

@@ -22,7 +22,8 @@ import numpy as np
 
 from msg_analysis.inference.observation import Observation
 from msg_analysis.theory import symmetric
-from msg_analysis.theory.moments import mode_potential, step_operators, transient_mean
+from msg_analysis.theory.loss import lost_adjoint
+from msg_analysis.theory.moments import mode_potential, transient_mean
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.types import FloatArray
 
@@ -172,12 +173,15 @@ def _values(prediction: Prediction, forms: FloatArray) -> list[_Value]:
     moved = system.matrices @ usual @ system.matrices.transpose(0, 2, 1)
     noise = system.noise + (system.propagate(usual) - moved)
     values = []
-    for mode, operator in enumerate(step_operators(system)):
+    for mode, step in enumerate(system.matrices):
+        before = step.T @ dual @ step  # (q, n, d, d): the adjoint of what this graph's step does
+        if system.loss_variance is not None:
+            before += lost_adjoint(system.lift, system.loss_variance[mode], dual)
         constant = packed @ symmetric.pack(system.noise[mode]) + kappa.T
-        ahead = np.concatenate([packed @ operator, constant[:, :, None]], axis=2)
+        ahead = np.concatenate([np.moveaxis(symmetric.pack(before), 1, 0), constant[:, :, None]], axis=2)
         law = system.chain[mode]
         surprises = ahead - np.tensordot(law, ahead, axes=1)
-        values.append(_Value(law, surprises, packed, system.matrices[mode], noise[mode]))
+        values.append(_Value(law, surprises, packed, step, noise[mode]))
     return values
 
 

@@ -32,7 +32,7 @@ class AgentLaw:
         self._drives = self._draw(0)
 
     def resume(self, step: int, state: bytes) -> None:
-        """Go on from x(step). The noise of every step is a function of the seed and the step: nothing else is needed."""
+        """Go on from x(step). The noise is a function of the seed and the step: nothing else is needed."""
         self.step, self.state = step, state
         self._drives = self._draw(step // STEPS_PER_BLOCK)
 
@@ -62,5 +62,5 @@ class AgentLaw:
 
     def _draw(self, block: int) -> list[list[bytes]]:
         """For each mode, the noise plus offset of every step of a block."""
-        noise = self._noise.block(self.agent, block)
-        return [[to_payload(drive) for drive in noise + offset] for offset in self._offsets]
+        noises = zip(self._noise.block(self.agent, block), self._offsets, strict=True)
+        return [[to_payload(drive) for drive in noise + offset] for noise, offset in noises]

@@ -39,7 +39,7 @@ class Experiment:
     spec : the document, normalised: defaults written out, number of agents known, GraphML files read
     graph_list : the n graphs, in the order of the modes
     chain : the Markov chain that switches between them
-    noise_gain : (m, m) F; Q = F F^T
+    noise_gain : (n, m, m) F_i; Q_i = F_i F_i^T
     source : where it came from, for messages
     """
 
@@ -125,7 +125,7 @@ class Experiment:
         if self.run.pace == "realtime":
             lines.append(problem("run.pace", "'realtime'", "not available yet", "use lockstep"))
         if purpose == "run":
-            for key in ("broadcast", "link", "loss"):
+            for key in ("broadcast", "link", "loss", "delay"):
                 value = getattr(self.noise, key)
                 if value > 0:
                     lines.append(problem(f"noise.{key}", value, "not available in runs yet", "use 0"))
@@ -269,7 +269,8 @@ class _Sections:
         if self.agents is None or not self._fits(run if whole_steps else None):
             return
         if self.values["noise"]:
-            self.noise_gain, found = validation.noise_gain_of(self.values["noise"], self.agents)
+            names = list(self.values["graphs"])
+            self.noise_gain, found = validation.noise_gain_of(self.values["noise"], names, self.agents)
             self.problems += found
         self._build_graphs()
         if not self.graphs or not leaders_good:
@@ -322,7 +323,8 @@ class _Sections:
         assert self.agents is not None
         steps = round(run.duration / run.dt) if run else 1
         replicas = run.replicas if run else 1
-        found = validation.memory_problems(self.agents, len(self.values["graphs"]), steps, replicas)
+        delay = self.values["noise"].delay if self.values["noise"] else 0
+        found = validation.memory_problems(self.agents, len(self.values["graphs"]), steps, replicas, delay)
         self.problems += found
         return not found
 

@@ -40,4 +40,3 @@ def step(weights: Sequence[float | FloatArray], values: Sequence[FloatArray], dr
     total = weighted_sum(weights, values)
     total += drive
     return total
-

@@ -21,6 +21,7 @@ Label = Count
 GraphName = Annotated[str, Field(pattern=r"^\S(.{0,62}\S)?$")]
 Link = tuple[int, int, float]
 Matrix = list[list[Number]]
+NoiseGain = float | list[float] | list[list[float]]
 Purpose = Literal["predict", "run"]
 
 
@@ -52,7 +53,21 @@ def _link(value: object) -> Link:
     return (first, second, float(weight))
 
 
-def _process(value: object) -> float | list[float] | list[list[float]]:
+def _process(value: object) -> NoiseGain | dict[str, NoiseGain]:
+    if not isinstance(value, dict):
+        return _noise_gain(value)
+    gains, faults = {}, []
+    for name, gain in value.items():
+        try:
+            gains[str(name)] = _noise_gain(gain)
+        except PydanticCustomError as error:
+            faults.append(f"for graph {name} {error.message().removeprefix('expected ')}")
+    if faults:
+        raise expected(" and ".join(faults))
+    return gains
+
+
+def _noise_gain(value: object) -> NoiseGain:
     if is_number(value):
         if value < 0:  # type: ignore[operator]
             raise expected("a standard deviation >= 0")
@@ -175,18 +190,34 @@ class SwitchingSpec(_Section):
     initial: str = Field("stationary", description="'stationary' or a graph's name", examples=["stationary"])
 
 
+_Gain = NonNegative | list[NonNegative] | Matrix
+
+
 class NoiseSpec(_Section):
     """What is random besides the graphs."""
 
     process: Annotated[
-        float | list[float] | list[list[float]],
-        PlainValidator(_process, json_schema_input_type=NonNegative | list[NonNegative] | Matrix),
-    ] = Field(1.0, description="noise gain: a number, one per agent, or the matrix F with Q = F F^T", examples=[1.0])
+        NoiseGain | dict[str, NoiseGain],
+        PlainValidator(_process, json_schema_input_type=_Gain | dict[GraphName, _Gain]),
+    ] = Field(
+        1.0,
+        description="noise gain: a number, one per agent, or the matrix F with Q = F F^T; or one of these for every "
+        "graph by name",
+        examples=[1.0],
+    )
     broadcast: NonNegative = Field(0.0, description="standard deviation added to each published value", examples=[0.0])
     link: NonNegative = Field(0.0, description="standard deviation added by each receiver", examples=[0.0])
     loss: Annotated[Number, Field(ge=0, lt=1)] = Field(
         0.0, description="probability that a directed message is ignored in a step", examples=[0.0]
     )
+    delay: Annotated[int, Field(strict=True, ge=0, le=LARGEST_COUNT)] = Field(
+        0, description="age, in steps, of the values of others that a step uses", examples=[0]
+    )
+
+    @property
+    def steps_only(self) -> bool:
+        """Whether there is something that only steps can have: noise on the air, loss or delay."""
+        return bool(self.broadcast or self.link or self.loss or self.delay)
 
 
 class LeadersSpec(_Section):

@@ -19,15 +19,17 @@ if TYPE_CHECKING:
 class StepModel:
     """x(k+1) = W_g(k) x(k) + offset_g(k) + noise, then g jumps with P: "what the network actually does".
 
-    Convention: the step k -> k+1 uses g(k). Modes and agents count from 0 here.
+    Convention: the step k -> k+1 uses g(k). Modes and agents count from 0 here. With a delay d, the entries of W_g(k)
+    off the diagonal take x(k - d) instead of x(k), and x(k) = x(0) before the start.
 
     Attributes
     ----------
     weights : (n, m, m) mean W_g: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time); rows of grounded
         leaders are zero
     offsets : (n, m) what the reference adds, so that the reference is a fixed point
-    noise_gain : (m, m) B: the process noise of a step is B v with v ~ N(0, I)
-    noise : (n, m, m) covariance N_g of all that is random in a step: B B^T plus noise on the air
+    noise_gain : (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
+    noise : (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
+    delay : age d, in steps, of the states of others that a step uses
     loss : probability that a directed message is ignored in a step. ``weights`` is the mean over it already; the
         spread adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment (``loss_variance``)
     loss_variance : (n, m, m) p (1 - p) (W_g)_ij^2 off the diagonal
@@ -43,6 +45,7 @@ class StepModel:
     offsets: FloatArray
     noise_gain: FloatArray
     noise: FloatArray
+    delay: int
     loss: float
     loss_variance: FloatArray
     transition: FloatArray
@@ -102,13 +105,13 @@ def build_step_model(experiment: Experiment) -> StepModel:
         transition = experiment.chain.transition(dt)
     gain = np.sqrt(dt) * experiment.noise_gain
     if experiment.time == "continuous":
-        gain = np.where(grounded[:, None], 0.0, gain)  # a leader held at the reference has no noise either
+        gain[:, grounded] = 0.0  # a leader held at the reference has no noise either
     reference = experiment.reference
     offsets = reference * (1.0 - weights.sum(axis=2)) if reference else np.zeros((len(graphs), agents))
 
     coupling = weights * ~np.eye(agents, dtype=bool)
     loss = experiment.noise.loss
-    noise = np.broadcast_to(gain @ gain.T, weights.shape).copy()
+    noise = gain @ gain.transpose(0, 2, 1)
     for mode, a in enumerate(coupling):
         per_link = np.diag((a**2).sum(axis=1))
         noise[mode] += (1 - loss) * experiment.noise.link**2 * per_link
@@ -125,6 +128,7 @@ def build_step_model(experiment: Experiment) -> StepModel:
         offsets=offsets,
         noise_gain=gain,
         noise=noise,
+        delay=experiment.noise.delay,
         loss=loss,
         loss_variance=loss * (1 - loss) * coupling**2,
         transition=transition,

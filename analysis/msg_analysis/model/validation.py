@@ -13,7 +13,7 @@ import numpy as np
 from msg_analysis.model.chain import MarkovChain, Time
 from msg_analysis.model.graphs import Graph
 from msg_analysis.model.problems import problem, show
-from msg_analysis.model.spec import LeadersSpec, NoiseSpec, RunSpec, SwitchingSpec
+from msg_analysis.model.spec import LeadersSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
 from msg_analysis.types import FloatArray
 
 SUM_TOLERANCE = 1e-9
@@ -22,7 +22,7 @@ MOST_STEPS = 1e15
 """Beyond, a double cannot tell one step from the next."""
 LONGEST_DURATION = 2**31 - 1
 """A message's stamp has 32 bits for the seconds of simulated time."""
-_MATRICES_PER_GRAPH = 6  # adjacency, W, its coupling, N, the variance of loss, and the product that makes N
+_MATRICES_PER_GRAPH = 8  # adjacency, W, its coupling, F, B, N, the variance of loss, and the product that makes N
 
 
 def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tuple[MarkovChain | None, list[str]]:
@@ -180,9 +180,35 @@ def _list(agents: Sequence[int], longest: int = 8) -> str:
     return ("s " if len(agents) > 1 else " ") + shown + more
 
 
-def noise_gain_of(noise: NoiseSpec, agents: int) -> tuple[FloatArray, list[str]]:
-    """(m, m) F of ``noise.process``, and what is wrong with its shape."""
-    f = np.array(noise.process, dtype=float) if not _ragged(noise.process) else np.empty((0, 0))
+def noise_gain_of(noise: NoiseSpec, names: Sequence[str], agents: int) -> tuple[FloatArray, list[str]]:
+    """(n, m, m) F of every graph as ``noise.process`` has it, and what is wrong with it.
+
+    One and the same F for all graphs is stored once.
+    """
+    if not isinstance(noise.process, dict):
+        gain, found = _gain_of("noise.process", noise.process, agents)
+        return np.broadcast_to(gain, (len(names), *gain.shape)), found
+    found = []
+    for name in noise.process:
+        if name not in names:
+            wanted = f"expected one of the graphs {', '.join(names)}"
+            found.append(problem(f"noise.process.{name}", "unknown graph", wanted, "correct the name"))
+    gains = np.zeros((len(names), agents, agents))
+    for mode, name in enumerate(names):
+        key = f"noise.process.{name}"
+        if name not in noise.process:
+            found.append(problem(key, "missing", "expected the noise of every graph", f"for example {name}: 1.0"))
+            continue
+        gain, faults = _gain_of(key, noise.process[name], agents)
+        found += faults
+        if not faults:
+            gains[mode] = gain
+    return gains, found
+
+
+def _gain_of(key: str, value: NoiseGain, agents: int) -> tuple[FloatArray, list[str]]:
+    """(m, m) F, and what is wrong with its shape."""
+    f = np.array(value, dtype=float) if not _ragged(value) else np.empty((0, 0))
     if f.ndim == 0:
         return np.eye(agents) * f, []
     if f.shape == (agents,):
@@ -196,7 +222,7 @@ def noise_gain_of(noise: NoiseSpec, agents: int) -> tuple[FloatArray, list[str]]
     else:
         shape = "rows of different lengths"
     wanted = f"expected a number, {agents} numbers or a {agents} x {agents} matrix F"
-    return f, [problem("noise.process", shape, wanted, f"there are {agents} agents")]
+    return f, [problem(key, shape, wanted, f"there are {agents} agents")]
 
 
 def _ragged(value: object) -> bool:
@@ -282,9 +308,9 @@ def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
     return found
 
 
-def memory_needed(agents: int, modes: int, steps: int, replicas: int) -> tuple[int, int]:
-    """Bytes for the states of a run, and for the matrices of all graphs."""
-    return (steps + 1) * agents * replicas * 8, _MATRICES_PER_GRAPH * modes * agents**2 * 8
+def memory_needed(agents: int, modes: int, steps: int, replicas: int, delay: int = 0) -> tuple[int, int]:
+    """Bytes for the states of a run, and for the matrices of all graphs, which a delay makes larger."""
+    return (steps + 1) * agents * replicas * 8, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
 
 
 def available_memory() -> int:
@@ -298,14 +324,17 @@ def available_memory() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def memory_problems(agents: int, modes: int, steps: int, replicas: int) -> list[str]:
+def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int) -> list[str]:
     """States and matrices that cannot fit in memory."""
     available = available_memory()
-    states, matrices = memory_needed(agents, modes, steps, replicas)
+    states, matrices = memory_needed(agents, modes, steps, replicas, delay)
     if states + matrices <= available:
         return []
     room = f"expected at most {amount(available)}, the memory available"
     if matrices > states:
+        if delay:
+            text = f"{delay} steps with {modes} graphs of {agents} agents need {amount(matrices)}"
+            return [problem("noise.delay", text, room, "lower the delay, or the number of agents or graphs")]
         text = f"{modes} graphs of {agents} agents need {amount(matrices)}"
         return [problem("graphs", text, room, "lower the number of agents or graphs")]
     text = f"{steps} steps of {agents} agents with {replicas} replicas need {amount(states)}"

@@ -25,12 +25,12 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     ``switching`` (``matrix``, ``initial``), ``graphs`` (each ``name``, ``edges`` or ``arcs``,
     ``algebraic_connectivity``, ``stationary``, ``mean_holding_time``, ``stability_limit``),
     ``stability_limit``, ``predicted_system_error``, ``memory`` [bytes], ``unavailable``. None stands for what
-    is infinite or cannot be computed.
+    is infinite or cannot be computed, or, for the stability limits, is not known (with a delay).
     """
     document = experiment.to_document()
     chain = experiment.chain
     states, matrices = validation.memory_needed(
-        experiment.agents, chain.modes, experiment.steps, experiment.run.replicas
+        experiment.agents, chain.modes, experiment.steps, experiment.run.replicas, experiment.noise.delay
     )
     limits = [_stability_limit(experiment, graph) for graph in experiment.graph_list]
     return {
@@ -109,7 +109,7 @@ def algebraic_connectivity(graph: Graph) -> float:
 
 
 def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
-    if experiment.time == "discrete":
+    if experiment.time == "discrete" or experiment.noise.delay:
         return None
     limit = validation.stability_limit(graph, experiment.leader_gains)
     return limit if math.isfinite(limit) else None

@@ -25,6 +25,12 @@ _VERDICTS = {
     "incomplete": ("No verdict: the data are incomplete.", "bold yellow"),
 }
 
+_METHODS = {
+    "exhaustive": "trying every set",
+    "greedy": "greedy choice",
+    "swap": "greedy choice and exchanges",
+}
+
 
 def print_prediction(document: dict[str, Any], console: Console) -> None:
     """Steady errors of every law that the prediction has, and the share of time of every graph.
@@ -194,6 +200,38 @@ def print_bag(document: dict[str, Any], console: Console) -> None:
     console.print(facts)
 
 
+def print_leaders(document: dict[str, Any], console: Console) -> None:
+    """The best sets of leaders, and how good the first is.
+
+    Parameters
+    ----------
+    document : of ``Selection.to_json()``
+    console : where to print
+    """
+    gain = "held at the reference" if document["gain"] == "inf" else f"gain {document['gain']:g}"
+    law = _LAWS[document["law"]]
+    what = "Single leaders" if document["count"] == 1 else f"Sets of {document['count']} leaders"
+    title = f"{what}, {gain}, {law}"
+    centrality = "joint centrality" if document["gain"] == "inf" else "certainty"
+    table = _table(console, title, "agents", "system error", centrality)
+    for entry in document["sets"][:_ROWS]:
+        row = (_names(entry["agents"]), _number(entry["system_error"]), _number(entry["joint_centrality"]))
+        table.add_row(*row)
+    _note_cut(table, len(document["sets"]), "sets")
+    console.print(table)
+    facts = _facts(console, f"Found by {_METHODS[document['method']]}")
+    facts.add_row("system errors computed", str(document["evaluations"]))
+    bound, gap = document["bound"]["system_error"], document["bound"]["gap"]
+    if gap is not None and gap < 1e-8:
+        facts.add_row("guarantee", "the best set there is")
+    elif bound is not None:
+        above = "" if gap is None else f": this one is at most {100 * gap:.3g} % above the best"
+        facts.add_row("guarantee", f"no set has less than {_number(bound)}{above}")
+    else:
+        facts.add_row("guarantee", f"none: {document['note']}")
+    console.print(facts)
+
+
 def _table(console: Console, title: str, first: str, *numbers: str) -> Table:
     """A table under its heading: one column of names, the others of numbers."""
     console.print(Text(title, style="bold"))
@@ -243,7 +281,9 @@ def _interval(interval: Sequence[float | None] | None) -> str:
 
 
 def _short(value: Any) -> str:
-    """A number or word as it is, a list by its size."""
+    """A number or word as it is, a list by its size, a mapping entry by entry."""
+    if isinstance(value, dict):
+        return "; ".join(f"{key}: {_short(item)}" for key, item in value.items())
     if isinstance(value, list):
         if value and isinstance(value[0], list):
             return f"matrix {len(value)} x {len(value[0])}"

@@ -1,97 +1,94 @@
-"""Second moments of jump linear systems: steady, dual (adjoint) and transient.
-
-Dense solver on the half-vectorised coupled Lyapunov (continuous) or Stein (discrete) equations: one LU
-factorisation serves the steady moments and every dual. ``MomentSolver`` is all that other modules see of it.
-"""
+"""Second moments of jump linear systems: steady, dual (adjoint) and transient."""
 
 from __future__ import annotations
 
-import warnings
 from typing import Literal
 
 import numpy as np
-import scipy.linalg
 
 from msg_analysis.errors import InputError
 from msg_analysis.theory import symmetric
+from msg_analysis.theory.dense import DenseSolver
+from msg_analysis.theory.iterative import IterativeSolver
+from msg_analysis.theory.report import MAX_RELATIVE_ERROR, SolverReport
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
 
-MAX_UNKNOWNS = 10_000
-"""Largest dense system that is tried: 2.4 GB and about a minute."""
-
-MAX_RELATIVE_ERROR = 1e-6
-"""Largest estimated relative error that is let through; usual is 1e-12."""
+MAX_FALLBACK = 1000
+"""Unknowns up to which equations that do not converge are solved densely."""
 
 
 class MomentSolver:
-    """The coupled equations of one system, factorised.
+    """The coupled equations of one system.
 
         continuous: Z_i C_i + C_i Z_i^T - sum_j Gamma_ji C_j = pi_i Q_i
         discrete:   C_i - sum_j P_ji K_j[C_j] = sum_j P_ji pi_j N_j
 
-    The last block row is replaced by the sum of all of them, in which the chain cancels exactly, and rows are
-    scaled to largest entry 1: so the equations stay well conditioned however fast the graphs switch.
+    Matrix-free: time grows as n d^3, memory as n d^2. Equations that are small and do not converge are solved
+    densely.
 
     Parameters
     ----------
     system : what to solve for
+    method : "auto"; "krylov" or "dense" for this one and no other
+    guess : (n, d, d) steady moments of a similar system (the last one of a sweep), to start from
 
     Raises
     ------
-    InputError : too large for a dense solve, no steady second moments, or too ill-conditioned to be trusted
+    InputError : no steady second moments, or too ill-conditioned to be trusted
     """
 
-    def __init__(self, system: JumpSystem) -> None:
+    def __init__(
+        self,
+        system: JumpSystem,
+        *,
+        method: Literal["auto", "krylov", "dense"] = "auto",
+        guess: FloatArray | None = None,
+    ) -> None:
         self._system = system
-        n, p = system.modes, symmetric.size(system.dimension)
-        if n * p > MAX_UNKNOWNS:
+        unknowns = system.modes * symmetric.size(system.dimension)
+        self._dense_too = method == "auto" and 0 < unknowns <= MAX_FALLBACK
+        if guess is not None and guess.shape != system.matrices.shape:
             raise InputError(
-                f"second moments: {n} graphs of {len(system.lift)} agents give {n * p} coupled unknowns, for "
-                f"which a dense solve needs about {24e-9 * (n * p) ** 2:.1f} GB; at most {MAX_UNKNOWNS} are "
-                "solved: use fewer agents or graphs"
+                f"guess: shape {guess.shape}, but the second moments of this system have {system.matrices.shape}: "
+                "give those of a system with the same graphs and agents"
             )
-        local, flow = _local_operators(system), system.chain.T
-        matrix = np.zeros((n, p, n, p))
-        for j in range(n):
-            if system.time == "continuous":
-                matrix[:, range(p), j, range(p)] = -flow[:, j, None]
-                matrix[j, :, j, :] += local[j]
-            else:
-                matrix[:, :, j, :] = flow[:, j, None, None] * (local[j] - np.eye(p))
-                matrix[j, range(p), j, range(p)] += 1.0
-            matrix[-1, :, j, :] = local[j]
-        self._matrix = matrix.reshape(n * p, n * p)
-        scale = np.maximum(self._matrix.max(axis=1, initial=0.0), -self._matrix.min(axis=1, initial=0.0))
-        self._scale = 1.0 / np.where(scale > 0.0, scale, 1.0)
-        self._matrix *= self._scale[:, None]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)  # the condition is judged below
-            self._factors = scipy.linalg.lu_factor(self._matrix)
-        self._norm = float(np.linalg.norm(self._matrix, 1)) if self._matrix.size else 0.0
-        self._condition = _reciprocal_condition(self._factors[0], self._norm)
-        self._shape = (n, p)
-        self._check(float(np.finfo(float).eps))
+        self._solver: DenseSolver | IterativeSolver
+        if method == "dense" or unknowns == 0:
+            self._solver = DenseSolver(system)
+        else:
+            self._solver = IterativeSolver(system, guess)
 
     @property
     def system(self) -> JumpSystem:
         """The system whose equations these are."""
         return self._system
 
+    @property
+    def report(self) -> SolverReport | None:
+        """How the steady state was found; None before that."""
+        return self._solver.report
+
     def steady(self) -> FloatArray:
-        """(n, d, d): C_i = E[y y^T; mode i] in the steady state (the paper's second-moment propositions)."""
-        system = self._system
-        weighted = symmetric.pack(system.stationary[:, None, None] * system.noise)
-        right = weighted.copy() if system.time == "continuous" else system.chain.T @ weighted
-        right[-1] = weighted.sum(axis=0)
-        solution = self._solve(right.reshape(-1, 1) * self._scale[:, None], trans=0)
-        moments = symmetric.unpack(solution.reshape(self._shape), system.dimension)
-        least = np.linalg.eigvalsh(moments).min(initial=0.0) if system.dimension else 0.0
-        if least < -MAX_RELATIVE_ERROR * np.abs(moments).max(initial=0.0):
+        """(n, d, d): C_i = E[y y^T; mode i] in the steady state (the paper's second-moment propositions).
+
+        Raises
+        ------
+        InputError : no steady second moments, or too ill-conditioned to be trusted
+        """
+        try:
+            moments = self._solver.steady()
+        except InputError:
+            self._fall_back()
+            moments = self._solver.steady()
+        shift = MAX_RELATIVE_ERROR * np.abs(moments).max(initial=0.0) or 1.0
+        try:
+            np.linalg.cholesky(moments + shift * np.eye(self._system.dimension))
+        except np.linalg.LinAlgError:
             raise InputError(
                 "second moments: the equations have no positive solution, so the errors grow without bound: "
                 "lower run.dt, or add edges until the union of the graphs connects everybody"
-            )
+            ) from None
         return moments
 
     def dual(self, forms: FloatArray) -> FloatArray:
@@ -109,61 +106,22 @@ class MomentSolver:
         Returns
         -------
         (q, n, d, d)
+
+        Raises
+        ------
+        InputError : as ``steady``
         """
-        n, p = self._shape
-        right = np.tile(symmetric.pack(forms), (1, n)).T
-        solution = self._solve(right, trans=1) * self._scale[:, None]
-        blocks = solution.reshape(n, p, -1)
-        blocks[:-1] += blocks[-1]  # transpose of "replace the last row by the sum"
-        return symmetric.unpack(np.moveaxis(blocks, 2, 0), self._system.dimension)
+        try:
+            return self._solver.dual(forms)
+        except InputError:
+            self._fall_back()
+            return self._solver.dual(forms)
 
-    def _solve(self, right: FloatArray, *, trans: Literal[0, 1]) -> FloatArray:
-        matrix = self._matrix.T if trans else self._matrix
-        solution = scipy.linalg.lu_solve(self._factors, right, trans=trans)
-        residual = right - matrix @ solution
-        solution += scipy.linalg.lu_solve(self._factors, residual, trans=trans)
-        residual = np.abs(right - matrix @ solution).max(initial=0.0)
-        size = self._norm * np.abs(solution).max(initial=0.0) + np.abs(right).max(initial=0.0)
-        self._check(float(residual / size) if size > 0.0 else 0.0)
-        return np.asarray(solution)
-
-    def _check(self, backward: float) -> None:
-        """Refuse what is too ill-conditioned for a backward error."""
-        # Not ">": a number that is not finite must not pass.
-        if self._matrix.size and not backward <= MAX_RELATIVE_ERROR * self._condition:
-            raise InputError(
-                "second moments: the equations are (nearly) singular (reciprocal condition "
-                f"{self._condition:.1e}), so the errors grow without bound or cannot be computed: check "
-                "that the union of the graphs connects everybody and that the rates do not differ by many "
-                "orders of magnitude"
-            )
-
-
-def _local_operators(system: JumpSystem) -> FloatArray:
-    """(n, p, p) matrices of C -> Z C + C Z^T, or of C -> C - K[C]."""
-    if system.time == "continuous":
-        return np.stack([symmetric.lyapunov(z) for z in system.matrices])
-    return np.eye(symmetric.size(system.dimension)) - step_operators(system)
-
-
-def step_operators(system: JumpSystem) -> FloatArray:
-    """(n, p, p) matrices of C -> K_j[C] = E[W C W^T | mode j] on packed C. Discrete time."""
-    operators = np.stack([symmetric.congruence(w) for w in system.matrices])
-    if system.loss_variance is not None:
-        lift = system.lift
-        entering = symmetric.pack(lift[:, :, None] * lift[:, None, :])  # (m, p): e_i e_i^T in reduced coordinates
-        differences = lift[:, None, :] - lift[None, :, :]
-        for mode, variance in enumerate(system.loss_variance):
-            seen = np.einsum("ij,ija,ijb->iab", variance, differences, differences)
-            operators[mode] += entering.T @ symmetric.pack(seen)
-    return operators
-
-
-def _reciprocal_condition(factors: FloatArray, norm: float) -> float:
-    if factors.size == 0:
-        return 1.0
-    reciprocal, _ = scipy.linalg.lapack.dgecon(factors, norm)
-    return float(reciprocal)
+    def _fall_back(self) -> None:
+        """To the dense solver, in an exception handler: raise again where that may not be tried."""
+        if not self._dense_too or isinstance(self._solver, DenseSolver):
+            raise
+        self._solver = DenseSolver(self._system)
 
 
 def mode_potential(system: JumpSystem, dual: FloatArray) -> tuple[FloatArray, FloatArray]:

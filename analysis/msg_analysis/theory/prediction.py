@@ -14,6 +14,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.step import StepModel, build_step_model
 from msg_analysis.theory import system as systems
 from msg_analysis.theory.moments import MomentSolver
+from msg_analysis.theory.report import SolverReport
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
 
@@ -21,23 +22,36 @@ if TYPE_CHECKING:
     from msg_analysis.model.experiment import Experiment
 
 
+ROUNDING = 1e-14
+"""Node errors below this, relative to the largest one, are rounding."""
+
+WEAK_NOISE = 1e-6
+"""Directions with less noise than this, relative to the noisiest one, do not show whether steps are stable."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Moments:
     """Steady second moments of the agents.
+
+    Node errors that are nothing but rounding, next to the largest one, count as 0: an agent without noise may have
+    none.
 
     Attributes
     ----------
     covariance : (m, m) of the disagreement (consensus) or of the deviation from the reference (tracking)
     by_mode : (n, m, m) E[.; mode i], which sum to ``covariance``; None for the static baseline
+    solver : how they were computed; None for the static baseline
     """
 
     covariance: FloatArray
     by_mode: FloatArray | None = None
+    solver: SolverReport | None = None
 
     @property
     def node_errors(self) -> FloatArray:
         """(m,) E_i."""
-        return np.diag(self.covariance).copy()
+        errors = np.diag(self.covariance)
+        return np.where(errors > ROUNDING * errors.max(initial=0.0), errors, 0.0)
 
     @property
     def system_error(self) -> float:
@@ -55,6 +69,8 @@ class Moments:
         }
         if self.by_mode is not None:
             document["mode_second_moments"] = self.by_mode.tolist()
+        if self.solver is not None:
+            document["solver"] = self.solver.to_json()
         return document
 
 
@@ -66,10 +82,10 @@ class Prediction:
     ----------
     experiment : what is predicted
     step : the experiment compiled to one step
-    solver : the equations of the run's steps, factorised; its ``system`` is the reduced system
+    solver : of the equations of the run's steps; its ``system`` is the reduced system
     steady : (n, d, d) steady second moments of the reduced system of the run's steps
     emulated : what the run's steps do, exactly ("discrete" in the document of a discrete-time experiment)
-    continuous : the paper's continuous-time system; None in discrete time or with noise on the air or loss
+    continuous : the paper's continuous-time system; None in discrete time or with noise on the air, loss or delay
     static : the pi-weighted mean over the graphs held for ever; None where one of them cannot keep the
         agents together
     """
@@ -111,18 +127,18 @@ def predict(experiment: Experiment) -> Prediction:
     InputError : too large, or without finite steady errors
     """
     step = build_step_model(experiment)
-    noise = experiment.noise
     continuous = static = None
-    if not (noise.broadcast or noise.link or noise.loss):
+    if not experiment.noise.steps_only:
         if experiment.time == "continuous":
             paper = systems.continuous(experiment)
-            continuous = _moments(paper, MomentSolver(paper).steady())
+            exact = MomentSolver(paper)
+            continuous = _moments(exact, exact.steady())
         else:
             paper = systems.emulated(step, experiment.problem)
         if all(_holds_together(experiment, mode) for mode in range(step.modes)):
             static = _static(paper)
     solver, steady = _steady(step, experiment.problem)
-    emulated = _moments(solver.system, steady)
+    emulated = _moments(solver, steady)
     return Prediction(experiment, step, solver, steady, emulated, continuous, static)
 
 
@@ -146,12 +162,47 @@ def stationary_start_factor(step: StepModel, problem: str, mode: int) -> FloatAr
 
 
 def _steady(step: StepModel, problem: str) -> tuple[MomentSolver, FloatArray]:
-    solver = MomentSolver(systems.emulated(step, problem))
-    return solver, solver.steady()
+    limit = _safe_step(step)
+    try:
+        solver = MomentSolver(systems.emulated(step, problem))
+        steady = solver.steady()
+        if step.dt >= limit:
+            _require_stability(solver)
+    except InputError as error:
+        if step.dt < limit:
+            raise
+        raise InputError(f"{error}; every dt below {limit:.4g} is stable, whatever the switching and delay") from error
+    return solver, steady
 
 
-def _moments(system: JumpSystem, steady: FloatArray) -> Moments:
-    return Moments(system.lifted(steady.sum(axis=0)), system.lifted(steady))
+def _require_stability(solver: MomentSolver) -> None:
+    """Refuse unstable steps that the noise does not show, because it leaves alone what grows.
+
+    A positive solution of Y_i = I + K_i^*[sum_j P_ij Y_j] exists only where every second moment stays bounded.
+    """
+    system = solver.system
+    sizes = np.linalg.eigvalsh(system.noise)
+    if not sizes.size or sizes.min() > WEAK_NOISE * sizes.max():
+        return
+    dual = solver.dual(np.eye(system.dimension)[None])[0]
+    if np.linalg.eigvalsh(dual).min() < 0.0:
+        raise InputError(
+            "second moments: the steps are unstable, although this noise does not show it: from another start the "
+            "errors grow without bound: lower run.dt"
+        )
+
+
+def _safe_step(step: StepModel) -> float:
+    """Largest dt below which no agent overshoots what it hears: W is stochastic then, and stable with any delay."""
+    own = np.diagonal(step.weights, axis1=1, axis2=2)
+    heard = (step.weights.sum(axis=2) - own) / (1.0 - step.loss)  # without loss
+    pull = (1.0 - step.weights.sum(axis=2)) + heard
+    return float(step.dt / pull[:, ~step.grounded].max())
+
+
+def _moments(solver: MomentSolver, steady: FloatArray) -> Moments:
+    system = solver.system
+    return Moments(system.lifted(steady.sum(axis=0)), system.lifted(steady), solver.report)
 
 
 def _static(system: JumpSystem) -> Moments | None:

@@ -97,7 +97,7 @@ def simulate_air(experiment, seed):
         heard = sent[None] + noise.link * random.standard_normal((m, m, replicas))
         arrived = random.random((m, m, replicas)) >= noise.loss
         pull = (adjacency[g][:, :, None] * arrived * (heard - x[:, None])).sum(axis=1)
-        process = experiment.noise_gain @ random.standard_normal(x.shape)
+        process = experiment.noise_gain[g] @ random.standard_normal(x.shape)
         states[k + 1] = x + dt * pull + np.sqrt(dt) * process
     record = RunRecord(uuid.UUID(int=seed), experiment, states[0])
     count = states[:, :, 0].size

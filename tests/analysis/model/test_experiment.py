@@ -50,7 +50,7 @@ def test_defaults_of_a_minimal_file() -> None:
         "agents": 3,
         "graphs": {"line": {"path": [1, 2, 3]}},
         "switching": {"scale": 1.0, "initial": "stationary"},
-        "noise": {"process": 1.0, "broadcast": 0.0, "link": 0.0, "loss": 0.0},
+        "noise": {"process": 1.0, "broadcast": 0.0, "link": 0.0, "loss": 0.0, "delay": 0},
         "run": {
             "dt": 0.05,
             "duration": 100.0,
@@ -128,7 +128,25 @@ def test_graphml_nodes_with_other_names_are_numbered_in_file_order(tmp_path: Pat
     ],
 )
 def test_noise_gain(process: Any, expected: FloatArray) -> None:
-    assert np.array_equal(small(noise={"process": process}).noise_gain, expected)
+    assert np.array_equal(small(noise={"process": process}).noise_gain, expected[None])
+
+
+def test_noise_gain_by_graph() -> None:
+    """By name, in whatever order; the gains are in the order of the graphs."""
+    correlated = [[1, -2, 3], [0, 1, 0], [0, 0, 1]]
+    experiment = small(
+        graphs={name: {"path": [1, 2, 3]} for name in ("a", "b", "c")},
+        switching={"generator": [[-2, 1, 1], [1, -2, 1], [1, 1, -2]]},
+        noise={"process": {"c": [1, 0.5, 0], "a": 2, "b": correlated}},
+    )
+    assert np.array_equal(experiment.noise_gain, [2 * np.eye(3), correlated, np.diag([1, 0.5, 0])])
+    assert not experiment.noise.steps_only
+
+
+def test_noise_that_only_steps_have() -> None:
+    for key in ("broadcast", "link", "loss", "delay"):
+        assert small(noise={key: 0.5 if key != "delay" else 2}).noise.steps_only
+    assert not small().noise.steps_only
 
 
 def test_leaders() -> None:
@@ -198,18 +216,19 @@ def test_the_order_of_the_graphs_matters() -> None:
 def test_what_is_not_available_yet_is_listed() -> None:
     assert small().unavailable() == []
     small().require_available()
-    noisy = small(noise={"broadcast": 0.1, "link": 0.2, "loss": 0.3}, run={"pace": "realtime"})
+    noisy = small(noise={"broadcast": 0.1, "link": 0.2, "loss": 0.3, "delay": 2}, run={"pace": "realtime"})
     assert [line.split(":")[0] for line in noisy.unavailable()] == [
         "run.pace",
         "noise.broadcast",
         "noise.link",
         "noise.loss",
+        "noise.delay",
     ]
     assert noisy.unavailable()[0] == "run.pace: 'realtime': not available yet: use lockstep"
     with pytest.raises(NotAvailableError, match=r"noise\.loss: 0\.3"):
         noisy.require_available()
     assert len(noisy.unavailable("predict")) == 1
-    small(noise={"loss": 0.3}).require_available("predict")
+    small(noise={"loss": 0.3, "delay": 2}).require_available("predict")
 
 
 def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path: Path) -> None:
@@ -305,6 +324,7 @@ def documents(draw: st.DrawFn) -> dict[str, Any]:
     graphs = {"line": {"path": list(range(1, m + 1))}} | {f"graph {i}": graph for i, graph in enumerate(others)}
     discrete = draw(st.booleans())
     number = st.floats(0, 1e3)
+    gain = st.one_of(number, st.lists(number, min_size=m, max_size=m))
     document: dict[str, Any] = {
         "name": draw(st.from_regex(r"[a-z][a-z0-9_]*", fullmatch=True)),
         "time": "discrete" if discrete else "continuous",
@@ -312,9 +332,10 @@ def documents(draw: st.DrawFn) -> dict[str, Any]:
         "switching": draw(switchings(len(graphs), discrete))
         | {"initial": draw(st.sampled_from(["stationary", *graphs]))},
         "noise": {
-            "process": draw(st.one_of(number, st.lists(number, min_size=m, max_size=m))),
+            "process": draw(st.one_of(gain, st.fixed_dictionaries(dict.fromkeys(graphs, gain)))),
             "broadcast": draw(number),
             "loss": draw(st.floats(0, 0.99)),
+            "delay": draw(st.integers(0, 3)),
         },
         "run": {
             "duration": draw(st.integers(1, 1000)),
@@ -327,10 +348,10 @@ def documents(draw: st.DrawFn) -> dict[str, Any]:
     }
     if draw(st.booleans()):
         leaders = draw(st.lists(st.integers(1, m), min_size=1, max_size=m - 1, unique=True))
-        gain = draw(st.one_of(st.just("inf"), st.floats(0.1, 10)))
+        pull = draw(st.one_of(st.just("inf"), st.floats(0.1, 10)))
         document |= {
             "problem": "tracking",
-            "leaders": {"agents": leaders, "gain": gain, "reference": draw(number)},
+            "leaders": {"agents": leaders, "gain": pull, "reference": draw(number)},
         }
     return document
 

@@ -231,6 +231,27 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ({"noise.link": math.nan}, ["noise.link: .nan: expected a finite number"]),
     ({"noise.loss": 1}, ["noise.loss: 1: expected a number < 1"]),
     ({"noise.loss": -0.1}, ["noise.loss: -0.1: expected a number >= 0"]),
+    ({"noise.delay": -1}, ["noise.delay: -1: expected a number >= 0: for example delay: 0"]),
+    ({"noise.delay": 0.5}, ["noise.delay: 0.5: expected a whole number"]),
+    ({"noise.delay": True}, ["noise.delay: true: expected a whole number"]),
+    ({"noise.delay": 2**31}, ["noise.delay: 2147483648 steps with 2 graphs of 5 agents need", "lower the delay"]),
+    ({"noise.process": {"line": 1}}, ["noise.process.ring: missing: expected the noise of every graph: for example"]),
+    (
+        {"noise.process": {"line": 1, "ring": 1, "rong": 1}},
+        ["noise.process.rong: unknown graph: expected one of the graphs line, ring: correct the name"],
+    ),
+    (
+        {"noise.process": {"line": 1, "ring": [1, 2]}},
+        ["noise.process.ring: 2 entries: expected a number, 5 numbers or a 5 x 5 matrix F: there are 5 agents"],
+    ),
+    (
+        {"noise.process": {"line": -1, "ring": "x"}},
+        [
+            'noise.process: {"line": -1, "ring": "x"}: expected for graph line a standard deviation >= 0',
+            "and for graph ring a finite number, one per agent, or a square matrix F",
+        ],
+    ),
+    ({"noise.process": {"line": {"ring": 1}, "ring": 1}}, ["noise.process:", "expected for graph line a finite num"]),
     # leaders
     ({"problem": "tracking"}, ["leaders: missing: expected leaders, since problem is tracking"]),
     (
@@ -385,7 +406,7 @@ def test_memory_is_compared_with_what_is_available(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(validation, "available_memory", lambda: needed)
     Experiment.parse(GOOD)
     monkeypatch.setattr(validation, "available_memory", lambda: needed - 1)
-    assert "need 320 kB: expected at most 322 kB, the memory available" in problems_of({})[0]
+    assert "need 320 kB: expected at most 323 kB, the memory available" in problems_of({})[0]
 
 
 def test_available_memory_is_a_plausible_number_of_bytes() -> None:

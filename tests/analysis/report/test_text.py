@@ -145,6 +145,17 @@ def test_experiment_that_cannot_be_run_yet() -> None:
     assert "noise.loss: 0.1: not available in runs yet" in shown(text.print_experiment, document)
 
 
+def test_noise_by_graph_and_delay_explained() -> None:
+    """Limits of the graphs alone would say nothing about steps with a delay."""
+    gains = {"line": 1.0, "ring": [0.5, 1.0, 1.0, 2.0], "arcs": [[1.0, 0.0, 0.0, 0.5]] * 4}
+    document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"process": gains, "delay": 2}}))
+    assert document["stability_limit"] is None
+    assert document["predicted_system_error"] > 0
+    output = " ".join(shown(text.print_experiment, document).split())
+    assert "line: 1.0; ring: [0.5, 1.0, 1.0, 2.0]; arcs: matrix 4 x 4" in output
+    assert "delay 2" in output
+
+
 def test_one_graph_that_is_never_left() -> None:
     plain = {"name": "one", "graphs": {"line": {"path": [1, 2]}}}
     (graph,) = describe_experiment(Experiment.parse(plain))["graphs"]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.chain import stationary_law
-from msg_analysis.theory import moments as module
+from msg_analysis.theory import dense
 from msg_analysis.theory.moments import MomentSolver, mode_potential, transient_mean
 from msg_analysis.theory.system import JumpSystem, held
 
@@ -234,7 +234,7 @@ def test_unstable_steps_are_refused():
 
 
 def test_too_large_says_the_size(monkeypatch):
-    monkeypatch.setattr(module, "MAX_UNKNOWNS", 10)
+    monkeypatch.setattr(dense, "MAX_UNKNOWNS", 10)
     system, _, _ = consensus(np.random.default_rng(8), 4, 2)
     with pytest.raises(InputError, match="2 graphs of 4 agents give 12 coupled unknowns"):
-        MomentSolver(system)
+        MomentSolver(system, method="dense")

@@ -1,0 +1,128 @@
+"""Krylov methods for stacks of equations: every right-hand side has its own, and all take their steps together."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from msg_analysis.types import FloatArray
+
+MAX_BASIS = 150
+"""Vectors that GMRES keeps before it restarts, if they fit."""
+
+MAX_BASIS_BYTES = 1.2e9
+
+
+class Equations(Protocol):
+    """A X = B with a preconditioner; stacks are (q, n, d, d)."""
+
+    weights: FloatArray
+    definite: bool
+
+    def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(Z, A Z) for Z near A^-1 R."""
+
+    def average(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(Z, A Z) for a start Z from which the preconditioner acts as a symmetric one."""
+
+
+def conjugate_gradients(
+    equations: Equations, right: FloatArray, goal: FloatArray, tolerance: float, most: int
+) -> tuple[FloatArray, int]:
+    """(X, iterations) for A X = B with ``definite`` equations, in the inner product of their weights.
+
+    Parameters
+    ----------
+    equations : A and its preconditioner
+    right : (q, n, d, d) B
+    goal : (q,) norms of the preconditioned residual that are small enough
+    tolerance : the same, relative to X
+    most : iterations
+    """
+    weights = equations.weights
+    x, moved = equations.average(right)  # the preconditioner is symmetric where the residual has mean zero
+    residual = right - moved
+    p, ap, buffer, before = np.zeros_like(x), np.zeros_like(x), np.empty_like(x), np.ones(len(x))
+    for iteration in range(1, most + 1):
+        z, az = equations.precondition(residual)
+        now = _product(residual, z, weights)
+        if (weighted_norm(z, weights) <= np.maximum(goal, tolerance * weighted_norm(x, weights))).all():
+            return x + z, iteration
+        ratio = _broadcast(now / before, x)
+        p *= ratio
+        p += z
+        ap *= ratio
+        ap += az
+        before = np.where(now > 0.0, now, 1.0)
+        curvature = _product(p, ap, weights)
+        step = _broadcast(np.divide(now, curvature, out=np.zeros_like(now), where=curvature > 0.0), x)
+        x += np.multiply(step, p, out=buffer)
+        residual -= np.multiply(step, ap, out=buffer)
+    return x, most
+
+
+def gmres(equations: Equations, right: FloatArray, tolerance: FloatArray, most: int) -> tuple[FloatArray, int]:
+    """(X, iterations) for A X = B, preconditioned from the right, without restart.
+
+    Parameters
+    ----------
+    equations : A and its preconditioner
+    right : (q, n, d, d) B
+    tolerance : (q,) residuals that are small enough, relative to B
+    most : iterations, bounded by ``MAX_BASIS`` too
+    """
+    q, shape = len(right), right.shape
+    length = right[0].size
+    most = max(5, min(most, MAX_BASIS, int(MAX_BASIS_BYTES / right.nbytes)))
+    basis = np.empty((q, most + 1, length), dtype=right.dtype)
+    triangle = np.zeros((q, most, most))
+    cosines, sines, target = np.zeros((q, most)), np.zeros((q, most)), np.zeros((q, most + 1))
+    norm = np.linalg.norm(right.reshape(q, -1), axis=1)
+    basis[:, 0] = right.reshape(q, -1) / np.where(norm > 0.0, norm, 1.0)[:, None]
+    target[:, 0] = norm
+    used = 0
+    while used < most:
+        _, moved = equations.precondition(basis[:, used].reshape(shape))
+        vector = moved.reshape(q, length)
+        column = np.zeros((q, used + 2))
+        known = basis[:, : used + 1]
+        for _ in range(2):  # Gram-Schmidt twice is enough
+            part = known @ vector[:, :, None]
+            vector = vector - (part.transpose(0, 2, 1) @ known)[:, 0]
+            column[:, : used + 1] += part[:, :, 0]
+        size = np.linalg.norm(vector, axis=1)
+        column[:, used + 1] = size
+        basis[:, used + 1] = vector / np.where(size > 0.0, size, 1.0)[:, None]
+        for k in range(used):
+            upper, lower = column[:, k].copy(), column[:, k + 1]
+            column[:, k] = cosines[:, k] * upper + sines[:, k] * lower
+            column[:, k + 1] = cosines[:, k] * lower - sines[:, k] * upper
+        pivot = np.hypot(column[:, used], column[:, used + 1])
+        safe = np.where(pivot > 0.0, pivot, 1.0)
+        cosines[:, used], sines[:, used] = column[:, used] / safe, column[:, used + 1] / safe
+        column[:, used] = safe
+        triangle[:, : used + 1, used] = column[:, : used + 1]
+        target[:, used + 1] = -sines[:, used] * target[:, used]
+        target[:, used] *= cosines[:, used]
+        used += 1
+        if (np.abs(target[:, used]) <= tolerance * norm).all():
+            break
+    factors = np.linalg.solve(triangle[:, :used, :used], target[:, :used, None])
+    combined = (factors.transpose(0, 2, 1).astype(basis.dtype) @ basis[:, :used])[:, 0]
+    x, _ = equations.precondition(combined.reshape(shape))
+    return x, used
+
+
+def _product(a: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray:
+    """(q,): sum_i pi_i tr(A_i^T B_i)."""
+    return np.asarray(np.einsum("qnab,qnab->qn", a, b) @ weights)
+
+
+def weighted_norm(a: FloatArray, weights: FloatArray) -> FloatArray:
+    """(q,): sqrt(sum_i pi_i |A_i|^2)."""
+    return np.asarray(np.sqrt(_product(a, a, weights)))
+
+
+def _broadcast(factors: FloatArray, like: FloatArray) -> FloatArray:
+    return np.asarray(factors[:, None, None, None], dtype=like.dtype)

@@ -1,0 +1,41 @@
+"""What lost messages add to a step's map of second moments, and the adjoint of that, matrix-free.
+
+A message from j to i that may be lost adds variance_ij E[(x_i - x_j)^2] to the second moment of agent i.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from msg_analysis.types import FloatArray
+
+
+def lost(lift: FloatArray, variance: FloatArray, moments: FloatArray) -> FloatArray:
+    """(..., n, d, d): sum_ij variance_ij <(e_i - e_j)(e_i - e_j)^T, C> e_i e_i^T in reduced coordinates.
+
+    Parameters
+    ----------
+    lift : (m, d)
+    variance : (n, m, m), or (m, m) for one graph; see ``StepModel.loss_variance``
+    moments : (..., n, d, d) symmetric C
+    """
+    full = lift @ moments @ lift.T
+    own = np.diagonal(full, axis1=-2, axis2=-1)
+    squares = own[..., :, None] + own[..., None, :] - 2.0 * full
+    spread = (variance * squares).sum(axis=-1)
+    return np.asarray(lift.T @ (spread[..., None] * lift))
+
+
+def lost_adjoint(lift: FloatArray, variance: FloatArray, forms: FloatArray) -> FloatArray:
+    """(..., n, d, d): sum_ij variance_ij <e_i e_i^T, Y> (e_i - e_j)(e_i - e_j)^T in reduced coordinates.
+
+    Parameters
+    ----------
+    lift : (m, d)
+    variance : (n, m, m), or (m, m) for one graph
+    forms : (..., n, d, d) symmetric Y
+    """
+    seen = variance * ((lift @ forms) * lift).sum(axis=-1)[..., None]
+    laplacian = -(seen + seen.swapaxes(-1, -2))
+    laplacian += np.eye(len(lift)) * (seen.sum(axis=-1) + seen.sum(axis=-2))[..., None]
+    return np.asarray(lift.T @ laplacian @ lift)

@@ -1,0 +1,121 @@
+"""Second moments against the same equations in 60 digits (mpmath), at extreme rates and gains."""
+
+import mpmath
+import numpy as np
+import pytest
+import scipy.linalg
+
+from msg_analysis.model.chain import stationary_law
+from msg_analysis.theory.moments import MomentSolver
+from msg_analysis.theory.system import JumpSystem
+
+RATES = [1e-8, 1e-4, 1.0, 1e3, 1e6]
+GAINS = [1e-3, 1.0, 1e3, 1e6]
+
+PATH = [[1.0, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 2, -1], [0, 0, -1, 1]]
+RING = [[2.0, -1, 0, -1], [-1, 2, -1, 0], [0, -1, 2, -1], [-1, 0, -1, 2]]
+PAIRS = [[1.0, -1, 0, 0], [-1, 1, 0, 0], [0, 0, 1, -1], [0, 0, -1, 1]]
+BRIDGE = [[0.0, 0, 0, 0], [0, 1, -1, 0], [0, -1, 1, 0], [0, 0, 0, 0]]
+LISTEN = [[0.0, 0, 0, 0], [-0.5, 0.5, 0, 0], [0, -2, 2, 0], [-1, 0, -0.25, 1.25]]
+STAR = [[3.0, -1, -1, -1], [-1, 1, 0, 0], [-1, 0, 1, 0], [-1, 0, 0, 1]]
+
+CHAINS = {
+    "even": [[-1.0, 1.0], [1.0, -1.0]],
+    "uneven": [[-0.001, 0.001], [2.0, -2.0]],
+    "one way round": [[-1.0, 1.0, 0.0], [0.0, -2.0, 2.0], [0.5, 0.0, -0.5]],
+}
+
+
+def helmert(m):
+    """(m - 1, m) in the digits of the moment."""
+    rows = mpmath.zeros(m - 1, m)
+    for k in range(1, m):
+        for j in range(k):
+            rows[k - 1, j] = 1 / mpmath.sqrt(k * (k + 1))
+        rows[k - 1, k] = -k / mpmath.sqrt(k * (k + 1))
+    return rows
+
+
+def exact(laplacians, gains, generator):
+    """(m, m) covariance: every step in 60 digits, nothing symmetric assumed, Q = I."""
+    with mpmath.workdps(60):
+        m, n = len(laplacians[0]), len(generator)
+        basis = mpmath.eye(m) if any(gains) else helmert(m)
+        z = [basis * (mpmath.matrix(a) + mpmath.diag(gains)) * basis.T for a in laplacians]
+        chain = mpmath.matrix(generator)
+        for i in range(n):  # rows sum to zero in 60 digits, too
+            chain[i, i] = -sum(chain[i, j] for j in range(n) if j != i)
+        balance = chain.T.copy()
+        for j in range(n):
+            balance[n - 1, j] = 1
+        law = mpmath.lu_solve(balance, mpmath.matrix([0] * (n - 1) + [1]))
+        d = basis.rows
+        matrix, right = mpmath.zeros(n * d * d), mpmath.zeros(n * d * d, 1)
+        for i in range(n):
+            for a in range(d):
+                for b in range(d):
+                    row = (i * d + a) * d + b
+                    right[row] = law[i] if a == b else 0
+                    for c in range(d):
+                        matrix[row, (i * d + c) * d + b] += z[i][a, c]
+                        matrix[row, (i * d + a) * d + c] += z[i][b, c]
+                    for j in range(n):
+                        matrix[row, (j * d + a) * d + b] -= chain[j, i]
+        solution = mpmath.lu_solve(matrix, right)
+        total = mpmath.matrix(d, d)
+        for i in range(n):
+            for a in range(d):
+                for b in range(d):
+                    total[a, b] += solution[(i * d + a) * d + b]
+        return np.array((basis.T * total * basis).tolist(), dtype=float)
+
+
+def double(laplacians, gains, generator, **options):
+    """(m, m) covariance by the solver."""
+    m = len(laplacians[0])
+    lift = np.eye(m) if any(gains) else scipy.linalg.helmert(m).T
+    z = lift.T @ (np.array(laplacians) + np.diag(gains)) @ lift
+    chain = np.array(generator)
+    noise = np.stack([np.eye(lift.shape[1])] * len(chain))
+    system = JumpSystem("continuous", z, noise, chain, stationary_law(chain), lift)
+    solver = MomentSolver(system, **options)
+    return system.lifted(solver.steady().sum(axis=0)), solver
+
+
+def worst(measured, expected):
+    """Largest relative error of node and system errors, and of the matrix in its norm."""
+    nodes = np.abs(np.diag(measured) / np.diag(expected) - 1).max()
+    return max(
+        nodes,
+        abs(np.trace(measured) / np.trace(expected) - 1),
+        np.linalg.norm(measured - expected, 2) / np.linalg.norm(expected, 2),
+    )
+
+
+def scaled(name, rate):
+    return (np.array(CHAINS[name]) * rate).tolist()
+
+
+GRAPHS = {
+    "connected": [PATH, RING, STAR],
+    "disconnected": [PAIRS, BRIDGE, BRIDGE],
+    "directed": [LISTEN, RING, STAR],
+}
+
+
+@pytest.mark.parametrize("chain", CHAINS)
+@pytest.mark.parametrize("graphs", GRAPHS)
+@pytest.mark.parametrize("rate", [*RATES, 1e10])
+def test_consensus(graphs, chain, rate):
+    laplacians, generator = GRAPHS[graphs][: len(CHAINS[chain])], scaled(chain, rate)
+    measured, _ = double(laplacians, [0.0] * 4, generator, method="krylov")
+    assert worst(measured, exact(laplacians, [0.0] * 4, generator)) < (1e-9 if rate <= 1e6 else 1e-7)
+
+
+@pytest.mark.parametrize("gain", GAINS)
+@pytest.mark.parametrize("rate", [*RATES, 1e10])
+def test_tracking(gain, rate):
+    for graphs in GRAPHS.values():
+        generator, gains = scaled("uneven", rate), [0.0, gain, 0.0, 0.0]
+        measured, _ = double(graphs[:2], gains, generator, method="krylov")
+        assert worst(measured, exact(graphs[:2], gains, generator)) < (1e-9 if rate <= 1e6 else 1e-7)
