@@ -50,8 +50,10 @@ format: setup ## Rewrite the code in the house style
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-bench: setup ## Measure speed side by side with the bare middleware
+bench: setup ## Measure speed side by side with the bare middleware, and with other solvers
 	$(BIN)/python benchmarks/network.py
+	$(BIN)/python benchmarks/moments.py
+	$(BIN)/python benchmarks/leaders.py
 
 docs: setup ## Build the documentation into site/
 	$(BIN)/mkdocs build --strict --quiet

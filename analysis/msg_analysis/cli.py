@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 import msg_analysis
+from msg_analysis import cli_theory
 from msg_analysis.console import CommandGroup, examples, print_json, result_console
 from msg_analysis.errors import InputError
 
@@ -110,6 +111,77 @@ def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, repor
     context.exit(comparison.exit_code)
 
 
+@main.command(
+    epilog=examples(
+        "msg-analysis leaders line_ring.yaml --count 2",
+        "msg-analysis leaders line_ring.yaml --count 2 --gain 0.5 --json | jq .sets[0].agents",
+    )
+)
+@_experiment
+@click.option("--count", type=int, required=True, help="Number of leaders.")
+@click.option(
+    "--method",
+    type=click.Choice(["auto", "exhaustive", "greedy", "swap"]),
+    default="auto",
+    help="auto (default): exhaustive where there are at most 1000 sets, else swap.",
+)
+@click.option("--law", type=click.Choice(["continuous", "emulated", "discrete"]), help="By default the paper's.")
+@click.option("--gain", type=float, default=float("inf"), help="Pull of the leaders; inf (default) holds them.")
+@click.option("--top", type=int, default=10, help="How many sets to list; 10 by default.")
+@_json
+def leaders(experiment: Path, count: int, method: str, law: str | None, gain: float, top: int, as_json: bool) -> None:
+    """Find the best leaders for the network of EXPERIMENT, by joint robustness centrality.
+
+    Leaders that EXPERIMENT names do not count.
+    """
+    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.progress import SolveProgress
+    from msg_analysis.theory.leaders import select_leaders
+
+    loaded = Experiment.load(experiment)
+    loaded.require_available("predict")
+    with SolveProgress(loaded.name) as progress:
+        selection = select_leaders(
+            loaded,
+            count,
+            method=method,  # type: ignore[arg-type]  # click has checked it
+            law=law,  # type: ignore[arg-type]
+            gain=gain,
+            top=top,
+            watch=progress,
+        )
+    document = selection.to_json()
+    if as_json:
+        print_json(document)
+    else:
+        from msg_analysis.report.text import print_leaders
+
+        print_leaders(document, result_console())
+
+
+@main.command(epilog=examples("msg-analysis figures", "msg-analysis figures 3 --out paper --format pdf"))
+@click.argument("example", type=click.Choice(["1", "2", "3", "all"]), default="all")
+@click.option("--out", type=click.Path(path_type=Path), default=Path("figures"), help="Directory; figures by default.")
+@click.option(
+    "--format",
+    "formats",
+    type=click.Choice(["png", "svg", "pdf"]),
+    multiple=True,
+    default=("png", "svg", "pdf"),
+    help="May be given several times; all three by default.",
+)
+def figures(example: str, out: Path, formats: tuple[str, ...]) -> None:
+    """Draw the EXAMPLEs of the paper, with the numbers as CSV; print the files' names.
+
+    Files of the same names in the directory are replaced.
+    """
+    from msg_analysis.report.paper_figures import write_figures
+
+    for number in (1, 2, 3) if example == "all" else (int(example),):
+        for path in write_figures([number], out, tuple(dict.fromkeys(formats))):
+            click.echo(path)
+
+
 @main.command(epilog=examples("msg-analysis info line_ring.yaml", "msg-analysis info line_ring_twin --json"))
 @click.argument("source", metavar="EXPERIMENT|BAG", type=click.Path(path_type=Path))
 @_json
@@ -127,6 +199,10 @@ def info(source: Path, as_json: bool) -> None:
         print_json(document)
     else:
         show(document, result_console())
+
+
+main.add_command(cli_theory.transient)
+main.add_command(cli_theory.facts)
 
 
 @main.command(epilog=examples("msg-analysis schema > experiment.schema.json"))

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "tests/data/golden"
 LINE_RING = str(GOLDEN / "line_ring.yaml")
 HEAVY = ["numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich"]
-COMMANDS = ["compare", "info", "predict", "schema", "simulate"]
+COMMANDS = ["compare", "facts", "info", "predict", "schema", "simulate", "transient"]
 
 
 def call(*arguments: str | Path) -> Result:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from typing import Any
 
@@ -24,7 +24,7 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
 )
 MODE_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, YELLOW, BLACK)
 _GREY = "#6b7280"
-_STYLE = {
+STYLE = {
     "font.family": "sans-serif",
     "font.size": 9.5,
     "axes.spines.top": False,
@@ -52,7 +52,7 @@ _LABELLED = 40  # agents up to which the drawings show their numbers
 def _figure(height: float, width: float = _WIDTH) -> Iterator[tuple[Figure, io.StringIO]]:
     """A figure and where its SVG text goes when the context ends."""
     text = io.StringIO()
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
         yield figure, text
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None}, dpi=150)
@@ -241,13 +241,38 @@ def graphs(experiment: Experiment) -> str:
         for number, panel in enumerate(panels):
             panel.set_axis_off()
             if number < len(chosen):
-                _draw(panel, chosen[number], places, leaders, MODE_COLOURS[number % len(MODE_COLOURS)])
+                draw_graph(panel, chosen[number], places, MODE_COLOURS[number % len(MODE_COLOURS)], leaders=leaders)
     return text.getvalue()
 
 
-def _draw(axes: Axes, graph: Graph, places: Mapping[int, FloatArray], leaders: set[int], colour: str) -> None:
+def draw_graph(
+    axes: Axes,
+    graph: Graph,
+    places: Mapping[int, FloatArray],
+    colour: str,
+    *,
+    leaders: Set[int] = frozenset(),
+    size: float | None = None,
+) -> None:
+    """Draw one graph; leaders are squares.
+
+    Parameters
+    ----------
+    axes : Axes
+        where
+    graph : Graph
+        what
+    places : Mapping[int, FloatArray]
+        (2,) of every agent, from 0
+    colour : str
+        of the links, and of the agents
+    leaders : Set[int]
+        agents from 0
+    size : float | None
+        area of an agent [points^2]; by default what fits the number of agents
+    """
     agents = graph.agents
-    size = float(min(4200 / agents, 260)) if agents <= _LABELLED else 14.0
+    size = size or (float(min(4200 / agents, 260)) if agents <= _LABELLED else 14.0)
     network = nx.DiGraph() if not graph.symmetric else nx.Graph()
     network.add_nodes_from(range(agents))
     arcs = graph.edges if graph.symmetric else graph.arcs

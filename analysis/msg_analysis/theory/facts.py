@@ -1,0 +1,184 @@
+"""The paper's lemmas on eigenvalues, as checks of one network: how many at 0 (or 1), where the others, null vectors.
+
+The matrices are those of the paper in full Kronecker form, unreduced and n m^2 on a side, because the lemmas
+speak of these. Nothing else uses them. The nullities of the projected matrices are the corrected ones:
+
+    Nbar_c    n                     vectors e_i (x) 1, not pi (x) 1 alone
+    Mbar_c    n + 2 sum (z_i - 1)   vectors e_i (x) 1 (x) 1; and e_i (x) 1 (x) w, e_i (x) w (x) 1 with L_i w = 0
+
+where z_i is the number of zero eigenvalues of L_i: 1 if graph i is connected, so that n remains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.linalg
+
+from msg_analysis.errors import InputError
+from msg_analysis.types import FloatArray
+
+if TYPE_CHECKING:
+    from msg_analysis.model.experiment import Experiment
+
+MAX_UNKNOWNS = 1500
+"""Largest n m^2: all eigenvalues of a matrix of this size take a few seconds."""
+
+_BLURRED = 1e-13, 1e-10
+"""Relative to the largest entry: what is smaller is 0, what is larger is not, and between them nobody can tell."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fact:
+    """One matrix of the paper and what a lemma says about its eigenvalues.
+
+    Attributes
+    ----------
+    name : the matrix
+    statement : what the lemma says, corrected where the paper errs
+    holds : whether it is so here
+    target : the special eigenvalue: 0 in continuous time, 1 in discrete time
+    expected, multiplicity, nullity : eigenvalues at the target: by the lemma, counted, and counted as null vectors
+    others : least real part of the other eigenvalues (continuous time, must be > 0), or largest modulus (discrete
+        time, must be < 1)
+    residual : largest entry of (matrix - target) @ v over the null vectors v that the lemma names, relative
+    """
+
+    name: str
+    statement: str
+    holds: bool
+    target: float
+    expected: int
+    multiplicity: int
+    nullity: int
+    others: float
+    residual: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of one fact."""
+        return {
+            "name": self.name,
+            "statement": self.statement,
+            "holds": self.holds,
+            "target": self.target,
+            "expected": self.expected,
+            "multiplicity": self.multiplicity,
+            "nullity": self.nullity,
+            "others": self.others,
+            "residual": self.residual,
+        }
+
+
+def check_facts(experiment: Experiment) -> list[Fact]:
+    """Check every lemma on eigenvalues that speaks of this experiment's time and problem.
+
+    Continuous time: N_c, M_c and their projections (consensus), or N_k, M_k (tracking). Discrete time: H_c, A_c
+    and their projections, or H_k, A_k. Graphs may be directed, weighted and disconnected, if their union connects
+    everybody. Leaders of infinite gain are deleted.
+
+    Raises
+    ------
+    InputError : n m^2 is too large, or rates and gains differ by so much that rounding hides which eigenvalues are 0
+    """
+    gains = experiment.leader_gains
+    follows = np.isfinite(gains)
+    block = np.ix_(follows, follows)
+    laplacians = [(graph.laplacian + np.diag(np.where(follows, gains, 0.0)))[block] for graph in experiment.graph_list]
+    n, m = len(laplacians), len(laplacians[0])
+    if n * m * m > MAX_UNKNOWNS:
+        raise InputError(
+            f"facts: {n} graphs of {m} agents give matrices of n m^2 = {n * m * m} rows, expected at most "
+            f"{MAX_UNKNOWNS}: check a smaller network of the same kind"
+        )
+    chain, law = experiment.chain.matrix, experiment.chain.stationary
+    consensus = experiment.problem == "consensus"
+    check = _continuous if experiment.time == "continuous" else _discrete
+    return check(laplacians, chain, law, consensus)
+
+
+def _continuous(drifts: list[FloatArray], generator: FloatArray, law: FloatArray, consensus: bool) -> list[Fact]:
+    n, m = len(drifts), len(drifts[0])
+    first = scipy.linalg.block_diag(*drifts) - _kron(generator.T, np.eye(m))
+    second = scipy.linalg.block_diag(*map(_kronecker_sum, drifts)) - _kron(generator.T, np.eye(m * m))
+    if not consensus:
+        return [_fact("N_k", first, 0.0, []), _fact("M_k", second, 0.0, [])]
+    ones, projector = np.ones(m), np.eye(m) - 1.0 / m
+    projected = [projector @ z @ projector for z in drifts]
+    first_bar = scipy.linalg.block_diag(*projected) - _kron(generator.T, projector)
+    second_bar = scipy.linalg.block_diag(*map(_kronecker_sum, projected))
+    second_bar -= _kron(generator.T, _kron(projector, projector))
+    modes = np.eye(n)
+    second_null = [_kron(e, _kron(ones, ones)) for e in modes]
+    for e, z in zip(modes, projected, strict=True):
+        # The null space of the projected Laplacian is spanned by 1 and, if the graph is disconnected, by more.
+        for w in scipy.linalg.null_space(np.vstack([z, ones]), rcond=1e-10).T:
+            second_null += [_kron(e, _kron(ones, w)), _kron(e, _kron(w, ones))]
+    return [
+        _fact("N_c", first, 0.0, [_kron(law, ones)]),
+        _fact("M_c", second, 0.0, [_kron(law, _kron(ones, ones))]),
+        _fact("Nbar_c", first_bar, 0.0, [_kron(e, ones) for e in modes]),
+        _fact("Mbar_c", second_bar, 0.0, second_null),
+    ]
+
+
+def _discrete(drifts: list[FloatArray], transition: FloatArray, law: FloatArray, consensus: bool) -> list[Fact]:
+    m = len(drifts[0])
+    steps = [np.asarray(scipy.linalg.expm(-z)) for z in drifts]
+
+    def matrices(weights: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        first = _kron(transition.T, np.eye(m)) @ scipy.linalg.block_diag(*weights)
+        squares = [_kron(w, w) for w in weights]
+        return first, _kron(transition.T, np.eye(m * m)) @ scipy.linalg.block_diag(*squares)
+
+    first, second = matrices(steps)
+    if not consensus:
+        return [_fact("H_k", first, 1.0, []), _fact("A_k", second, 1.0, [])]
+    ones, projector = np.ones(m), np.eye(m) - 1.0 / m
+    first_bar, second_bar = matrices([projector @ w @ projector for w in steps])
+    return [
+        _fact("H_c", first, 1.0, [_kron(law, ones)]),
+        _fact("A_c", second, 1.0, [_kron(law, _kron(ones, ones))]),
+        _fact("Hbar_c", first_bar, 1.0, []),
+        _fact("Abar_c", second_bar, 1.0, []),
+    ]
+
+
+def _kron(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(np.kron(a, b), dtype=float)
+
+
+def _kronecker_sum(z: FloatArray) -> FloatArray:
+    eye = np.eye(len(z))
+    return _kron(z, eye) + _kron(eye, z)
+
+
+def _fact(name: str, matrix: FloatArray, target: float, null_vectors: list[FloatArray]) -> Fact:
+    """Count the eigenvalues at the target in two ways, and see where the others are."""
+    shifted = matrix - target * np.eye(len(matrix))
+    scale = float(np.abs(matrix).max(initial=0.0)) or 1.0
+    values = np.linalg.eigvals(matrix)
+    distances = np.abs(values - target) / scale
+    singular = np.linalg.svd(shifted, compute_uv=False) / scale
+    zero, clear = (limit * len(matrix) for limit in _BLURRED)
+    if any(((sizes > zero) & (sizes < clear)).any() for sizes in (distances, singular)):
+        raise InputError(
+            f"facts: {name} has eigenvalues so near {target:g} that rounding hides whether they are there: expected "
+            "rates, weights and gains within about eight orders of magnitude: bring them closer together"
+        )
+    away = distances > zero
+    nullity = int(np.count_nonzero(singular <= zero))
+    residual = max((float(np.abs(shifted @ v).max()) for v in null_vectors), default=0.0) / scale
+    if target:
+        others, where = float(np.abs(values[away]).max(initial=0.0)), "strictly inside the unit circle"
+    else:
+        others, where = float(values[away].real.min(initial=np.inf)), "strictly in the right half-plane"
+    expected, multiplicity = len(null_vectors), int(np.count_nonzero(~away))
+    inside = others < 1.0 if target else others > 0.0
+    if expected:
+        statement = f"exactly {expected} eigenvalue{'s' * (expected > 1)} at {target:g}, all others {where}"
+    else:
+        statement = f"all eigenvalues {where}"
+    holds = inside and multiplicity == nullity == expected and residual <= 1e-9
+    return Fact(name, statement, holds, target, expected, multiplicity, nullity, others, residual)

@@ -1,0 +1,213 @@
+"""How fast the errors settle: the settling time from a given start, and asymptotic rates.
+
+The end of a transient is certain, not guessed: if at some time -f C_i <= D_i <= f C_i for every mode (D the distance
+of the second moments from their steady state C) and |pi_i(t) - pi_i| <= f pi_i, then this holds for ever, because
+both maps are positive and have (C, pi) as their fixed point. So the system error stays within the fraction f from then
+on, and only the time before has to be searched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+import scipy.sparse.linalg
+
+from msg_analysis.errors import InputError
+from msg_analysis.model.chain import Time
+from msg_analysis.theory import symmetric
+from msg_analysis.theory.operators import homogeneous_propagator, mean_propagator
+from msg_analysis.theory.propagator import Flow, Power
+from msg_analysis.theory.rational import RationalFlow, slowest_rate
+from msg_analysis.theory.system import JumpSystem
+from msg_analysis.theory.transient import (
+    MAX_UNKNOWNS,
+    Snapshot,
+    advance,
+    distance,
+    joint_flow,
+    joint_stack,
+    unknowns,
+)
+from msg_analysis.types import FloatArray
+
+FRACTION = 0.05
+"""Of the steady value: the usual definition of settling."""
+
+SUBSTEPS = 5
+"""The search looks at 2^5 times between t and 2 t."""
+
+MAX_DOUBLINGS = 200
+MAX_STEPS = 1_000_000
+
+
+def settling_time(system: JumpSystem, steady: FloatArray, start: Snapshot, fraction: float = FRACTION) -> float:
+    """First time after which the system error stays within a fraction of its steady value.
+
+    Exact to rounding where the error has no excursions shorter than 1/32 of the time gone by; from zero (known place,
+    stationary graph) it has none, because it rises all the time.
+
+    Parameters
+    ----------
+    system : with a steady state; continuous or discrete time
+    steady : (n, d, d) of ``MomentSolver(system).steady()``
+    start : at time 0
+    fraction : between 0 and 1
+
+    Returns
+    -------
+    units of time, or steps; 0.0 if the error is within the fraction from the start
+
+    Raises
+    ------
+    InputError : no noise, so that the steady error is 0; too large in continuous time; or never settles
+    """
+    if not 0.0 < fraction < 1.0:
+        raise InputError(f"settling fraction: {fraction:g}, expected a number between 0 and 1: for example 0.05")
+    weights = system.output.T @ system.output
+    error = float(np.einsum("nab,ab->", steady, weights))
+    if not error > 0.0:
+        raise InputError("settling time: the steady error is 0, expected noise: set noise.process")
+    away = distance(system, start, steady)
+    judge = _Judge(system, steady, weights, fraction * error, fraction)
+    if unknowns(system) > MAX_UNKNOWNS and system.time == "discrete":
+        return _stepped(system, judge, away)
+    stack = joint_stack(away)
+    flow = joint_flow(system, stack, lambda: slowest_rate(system, steady), decays=True)
+    return _searched(flow, judge, stack, system.time)
+
+
+class _Judge:
+    """Whether a distance from the steady state is outside the fraction now, and whether it can be again."""
+
+    def __init__(
+        self, system: JumpSystem, steady: FloatArray, weights: FloatArray, allowed: float, fraction: float
+    ) -> None:
+        self._d = system.dimension
+        self._form = symmetric.pack(weights)
+        self._stationary, self._allowed, self._fraction = system.stationary, allowed, fraction
+        values, vectors = np.linalg.eigh(steady)
+        # Directions that noise hardly reaches would make the test endless; they get the size of rounding.
+        floor = 1e-12 * values.max(axis=1, keepdims=True)
+        self._scale = vectors / np.sqrt(np.maximum(values, floor))[:, None, :]
+
+    def outside(self, joint: FloatArray) -> bool:
+        """Whether the system error is further from its steady value than allowed."""
+        return self.excess(joint) > 0.0
+
+    def excess(self, joint: FloatArray) -> float:
+        """|E(t) - E| - allowed."""
+        return abs(float(self._form @ joint[:, :-1].sum(axis=0))) - self._allowed
+
+    def settled(self, joint: FloatArray) -> bool:
+        """Whether it can never be outside again."""
+        moments = symmetric.unpack(joint[:, :-1], self._d)
+        scaled = self._scale.transpose(0, 2, 1) @ moments @ self._scale
+        size = np.abs(np.linalg.eigvalsh(scaled)).max(initial=0.0)
+        law = np.abs(joint[:, -1] / self._stationary).max()
+        return bool(max(size, law) <= self._fraction)
+
+
+def _searched(flow: Flow, judge: _Judge, start: FloatArray, time: Time) -> float:
+    """Doubling until settled, then the last time outside, then bisection with the same powers."""
+    tick = flow.tick
+    powers: list[Power] = []
+    y, reached = flow.rotated(start), 0  # the distance at `reached` ticks
+    last = (0, y) if judge.outside(start) else None
+    width = 0  # of the step, 2^width ticks, after the last time outside
+    for power in flow.doublings():
+        powers.append(power)
+        k = len(powers) - 1
+        fine = max(0, k - 1 - SUBSTEPS)
+        while reached < 1 << k:  # from 2^(k-1) (or 0) to 2^k ticks
+            y = powers[fine](y)
+            if last and last[0] == reached:
+                width = fine
+            reached += 1 << fine
+            if judge.outside(flow.restored(y)):
+                last = (reached, y)
+        if judge.settled(flow.restored(y)):
+            break
+        if k == MAX_DOUBLINGS:
+            raise InputError("settling time: the errors do not settle: check the rates and noise of the network")
+    if last is None:
+        return 0.0
+    ticks, y = last
+    for power, k in zip(powers[width::-1][1:], range(width - 1, -1, -1), strict=True):
+        ahead = power(y)
+        if judge.outside(flow.restored(ahead)):
+            y, ticks = ahead, ticks + (1 << k)
+    if time == "discrete":
+        return float(ticks + 1)
+
+    def excess(rest: float) -> float:
+        return judge.excess(flow.restored(flow.over(rest)(y)))
+
+    return ticks * tick + float(scipy.optimize.brentq(excess, 0.0, tick, xtol=1e-9 * tick))
+
+
+def _stepped(system: JumpSystem, judge: _Judge, away: Snapshot) -> float:
+    """The same by single steps. Discrete time."""
+    last = -1
+    for step in range(MAX_STEPS):
+        joint = joint_stack(away)
+        if judge.outside(joint):
+            last = step
+        elif step % 16 == 0 and judge.settled(joint):
+            return float(last + 1)
+        away = advance(system, away)
+    raise InputError(f"settling time: more than {MAX_STEPS} steps: raise run.dt, or use fewer agents")
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """How fast what is left of the start dies out in the end: like exp(-rate t), or exp(-rate k) in steps.
+
+    Attributes
+    ----------
+    mean : of the means: least real part of the eigenvalues of N, or -log of the spectral radius of H
+    second_moment : of the second moments: the same of M, or A; None where it was not found
+    graph : of the law of the graph; None for one graph
+    """
+
+    mean: float
+    second_moment: float | None
+    graph: float | None
+
+
+def asymptotic_rates(system: JumpSystem, steady: FloatArray) -> Rates:
+    """Rates of a reduced system, per unit of time or per step; infinite for what is gone in finitely many steps.
+
+    Parameters
+    ----------
+    system : with a steady state; continuous or discrete time
+    steady : (n, d, d) of ``MomentSolver(system).steady()``
+    """
+    means = mean_propagator(system)
+    second: float | None = None
+    if unknowns(system) <= MAX_UNKNOWNS:
+        second = homogeneous_propagator(system).slowest
+    elif system.time == "discrete":
+        second = _by_arnoldi(system)
+    elif steady.any():
+        stack = joint_stack(Snapshot(np.zeros(system.modes), np.zeros(0), steady))
+        second = RationalFlow(system, stack, slowest_rate(system, steady), decays=True).slowest
+    return Rates(means.slowest, second, means.slowest_jump if system.modes > 1 else None)
+
+
+def _by_arnoldi(system: JumpSystem) -> float | None:
+    def step(packed: FloatArray) -> FloatArray:
+        moments = symmetric.unpack(packed.reshape(system.modes, -1), system.dimension)
+        after = np.tensordot(system.chain, system.propagate(moments), axes=(0, 0))
+        return symmetric.pack(after).ravel()
+
+    size = unknowns(system) - system.modes
+    operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=step, dtype=float)
+    start = symmetric.pack(np.broadcast_to(np.eye(system.dimension), system.matrices.shape)).ravel()
+    try:
+        values = scipy.sparse.linalg.eigs(operator, k=1, v0=start, tol=1e-9, maxiter=1000, return_eigenvectors=False)
+    except scipy.sparse.linalg.ArpackNoConvergence:
+        return None
+    radius = float(np.abs(values).max())
+    return float(-np.log(radius)) if radius > 0.0 else np.inf

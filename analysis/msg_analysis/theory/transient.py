@@ -1,0 +1,277 @@
+"""Transients: the law of the graph, means and second moments of every mode over time, from any start.
+
+    continuous: d/dt nu = -N nu,   d/dt c = -M c + pi(t) (x) Q,       d/dt pi = Gamma^T pi
+    discrete:   nu(k+1) = H nu(k), C_i(k+1) = sum_j P_ji (K_j[C_j] + pi_j(k) N_j),   pi(k+1) = P^T pi(k)
+
+Where there is a steady state, the distance to it is what moves: so it is reached exactly, however long the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msg_analysis.errors import InputError
+from msg_analysis.theory import symmetric
+from msg_analysis.theory.operators import mean_propagator, second_moment_propagator
+from msg_analysis.theory.propagator import Flow
+from msg_analysis.theory.rational import RationalFlow, slowest_rate
+from msg_analysis.theory.system import JumpSystem
+from msg_analysis.types import FloatArray
+
+if TYPE_CHECKING:
+    from msg_analysis.model.experiment import Experiment
+
+MAX_UNKNOWNS = 300
+"""Largest n p + n, with p = d (d + 1) / 2, whose matrix is propagated as a whole."""
+
+MAX_BYTES = 2e9
+"""Largest result."""
+
+MAX_STEPS = 10_000_000
+"""Most steps that are made one after the other (discrete time, beyond MAX_UNKNOWNS)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """What the paper calls pi, nu and c at one time, in reduced coordinates.
+
+    Attributes
+    ----------
+    law : (n,) pi_i = P(g = i)
+    means : (n, d) E[y; mode i]
+    moments : (n, d, d) C_i = E[y y^T; mode i]
+    """
+
+    law: FloatArray
+    means: FloatArray
+    moments: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transient:
+    """Moments over time.
+
+    Attributes
+    ----------
+    system : whose they are
+    times : (T,) ascending; units of time, or numbers of steps
+    laws : (T, n) pi(t)
+    means : (T, n, d) nu(t), reduced
+    moments : (T, n, d, d) c(t), reduced
+    """
+
+    system: JumpSystem
+    times: FloatArray
+    laws: FloatArray
+    means: FloatArray
+    moments: FloatArray
+
+    @property
+    def mean(self) -> FloatArray:
+        """(T, m) mean of the agents, all modes together."""
+        return np.asarray(self.means.sum(axis=1) @ self.system.output.T)
+
+    @property
+    def node_errors(self) -> FloatArray:
+        """(T, m) mean square of each agent's disagreement (deviation); of its state in an unreduced system."""
+        output = self.system.output
+        return np.asarray(((output @ self.moments.sum(axis=1)) * output).sum(axis=2))
+
+    @property
+    def system_error(self) -> FloatArray:
+        """(T,) sum of the node errors."""
+        return np.asarray(self.node_errors.sum(axis=1))
+
+    @property
+    def mode_means(self) -> FloatArray:
+        """(T, n, m) E[agents; mode i]."""
+        return np.asarray(self.means @ self.system.output.T)
+
+    @property
+    def mode_second_moments(self) -> FloatArray:
+        """(T, n, m, m) E[agents agents^T; mode i]."""
+        return self.system.lifted(self.moments)
+
+
+def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | None = None) -> Snapshot:
+    """Agents at a known place, independent of the graph.
+
+    Parameters
+    ----------
+    system : reduced or not
+    deviation : (m,) x(0) - (what x should be); in consensus, x(0)
+    law : (n,) of g(0); by default the stationary law
+    """
+    law = system.stationary if law is None else law
+    y = system.reduced(deviation)
+    return Snapshot(law, np.multiply.outer(law, y), np.multiply.outer(law, np.outer(y, y)))
+
+
+def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
+    """The start that the experiment's ``run.start`` and ``switching.initial`` say.
+
+    Parameters
+    ----------
+    experiment : whose start
+    system : one of its laws
+    stationary : (n, d, d) second moments for ``run.start: stationary``
+    """
+    law = system.stationary
+    if experiment.switching.initial != "stationary":
+        law = np.array([float(graph.name == experiment.switching.initial) for graph in experiment.graph_list])
+    start = experiment.run.start
+    if start == "stationary":
+        shares = law / system.stationary
+        return Snapshot(law, np.zeros((system.modes, system.dimension)), shares[:, None, None] * stationary)
+    place = np.zeros(experiment.agents) if start == "zero" else np.array(start, dtype=float)
+    return point_start(system, place - experiment.reference, law)
+
+
+def unreduced_consensus(experiment: Experiment) -> JumpSystem:
+    """Consensus in continuous time with the agents' mean in it: its second moments grow without bound.
+
+    The twin for the steps of a run is ``systems.emulated(step, "tracking")``, which reduces nothing.
+    """
+    gain = experiment.noise_gain
+    drift = np.stack([graph.laplacian for graph in experiment.graph_list])
+    return JumpSystem(
+        time="continuous",
+        matrices=drift,
+        noise=gain @ gain.transpose(0, 2, 1),
+        chain=experiment.chain.matrix,
+        stationary=experiment.chain.stationary,
+        lift=np.eye(experiment.agents),
+    )
+
+
+def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None = None) -> Transient:
+    """Exact moments at the given times.
+
+    Parameters
+    ----------
+    system : continuous or discrete time
+    start : at time 0
+    times : (T,) >= 0, ascending; whole numbers of steps in discrete time
+    steady : (n, d, d) of ``MomentSolver(system).steady()``; None where there is no steady state
+
+    Raises
+    ------
+    InputError : times not usable, or too large
+    """
+    times = np.asarray(times, dtype=float)
+    _check_times(system, times)
+    if unknowns(system) > MAX_UNKNOWNS and system.time == "discrete":
+        return _stepped(system, start, times, steady)
+    return _powered(system, start, times, steady)
+
+
+def unknowns(system: JumpSystem) -> int:
+    """Size n p + n of the joint equations of second moments and graph law."""
+    return system.modes * (symmetric.size(system.dimension) + 1)
+
+
+def joint_flow(system: JumpSystem, stack: FloatArray, slow: Callable[[], float], *, decays: bool) -> Flow:
+    """How the joint equations move: as a whole where they are small, otherwise reduced for this start.
+
+    Parameters
+    ----------
+    system : small, or in continuous time
+    stack : (n, p + 1) of ``joint_stack``
+    slow : gives the slowest rate of interest
+    decays : whether the stack is a distance from the steady state
+    """
+    if unknowns(system) <= MAX_UNKNOWNS:
+        return second_moment_propagator(system)
+    return RationalFlow(system, stack, slow(), decays=decays)
+
+
+def _powered(system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None) -> Transient:
+    """By powers of matrices."""
+    longest = float(times[-1]) or 1.0
+
+    def slow() -> float:
+        return 1.0 / longest if steady is None else max(1.0 / longest, slowest_rate(system, steady))
+
+    def course(snapshot: Snapshot, when: FloatArray, *, decays: bool) -> tuple[FloatArray, FloatArray]:
+        stack = joint_stack(snapshot)
+        joint = joint_flow(system, stack, slow, decays=decays).grid(stack, when)
+        return joint[:, :, :-1], joint[:, :, -1]
+
+    means = np.zeros((len(times), *start.means.shape))
+    if start.means.any():
+        means = mean_propagator(system).grid(start.means, times)
+    if steady is None:
+        packed, laws = course(start, times, decays=False)
+    else:
+        limit = symmetric.pack(steady)
+        away, laws = course(distance(system, start, steady), times, decays=True)
+        packed, laws = limit + away, laws + system.stationary
+        # The distance is exact for long times. For short ones it may cancel with the limit; what has grown does not.
+        left = np.linalg.norm(away, axis=(1, 2))
+        early = np.flatnonzero(left > 0.5 * np.linalg.norm(limit))
+        if early.size:
+            grown, _ = course(start, times[early], decays=False)
+            better = np.linalg.norm(grown, axis=(1, 2)) < left[early]
+            packed[early[better]] = grown[better]
+    return Transient(system, times, laws, means, symmetric.unpack(packed, system.dimension))
+
+
+def distance(system: JumpSystem, snapshot: Snapshot, steady: FloatArray) -> Snapshot:
+    """What is left to the steady state, which moves by the same equations."""
+    return Snapshot(snapshot.law - system.stationary, snapshot.means, snapshot.moments - steady)
+
+
+def joint_stack(snapshot: Snapshot) -> FloatArray:
+    """(n, p + 1) packed second moments and probability of every mode."""
+    return np.concatenate([symmetric.pack(snapshot.moments), snapshot.law[:, None]], axis=1)
+
+
+def advance(system: JumpSystem, snapshot: Snapshot) -> Snapshot:
+    """One step. Discrete time; right for the distance to the steady state too."""
+    moments, law = system.advance(snapshot.moments, snapshot.law)
+    moved = np.einsum("nab,nb->na", system.matrices, snapshot.means)
+    return Snapshot(law, system.chain.T @ moved, moments)
+
+
+def _stepped(system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None) -> Transient:
+    """The same by single steps, which need no matrix of the whole. Discrete time."""
+    n, d = system.modes, system.dimension
+    now = start if steady is None else distance(system, start, steady)
+    laws, means, moments = np.zeros((len(times), n)), np.zeros((len(times), n, d)), np.zeros((len(times), n, d, d))
+    step = 0
+    for row, then in enumerate(times):
+        while step < then and (now.moments.any() or now.law.any() or now.means.any()):
+            now = advance(system, now)
+            step += 1
+        laws[row], means[row], moments[row] = now.law, now.means, now.moments
+    if steady is not None:
+        laws += system.stationary
+        moments += steady
+    return Transient(system, times, laws, means, moments)
+
+
+def _check_times(system: JumpSystem, times: FloatArray) -> None:
+    wrong = "numbers >= 0 in ascending order"
+    if (
+        times.ndim != 1
+        or not len(times)
+        or not np.isfinite(times).all()
+        or times[0] < 0.0
+        or (np.diff(times) < 0.0).any()
+    ):
+        raise InputError(f"times: {times.tolist()!r:.80}: expected {wrong}: give at least one")
+    if system.time == "discrete":
+        if (times != np.round(times)).any():
+            raise InputError("times: expected whole numbers of steps in discrete time")
+        if unknowns(system) > MAX_UNKNOWNS and times[-1] > MAX_STEPS:
+            raise InputError(f"times: {times[-1]:.3g} steps, expected at most {MAX_STEPS} with so many agents")
+    size = 8.0 * len(times) * system.modes * system.dimension**2
+    if size > MAX_BYTES:
+        raise InputError(
+            f"times: {len(times)} second moments of {system.modes} graphs of {len(system.output)} agents need "
+            f"{size / 1e9:.1f} GB, expected at most {MAX_BYTES / 1e9:.0f} GB: give fewer times"
+        )

@@ -1,0 +1,132 @@
+"""Two graphs: the error as the static baseline minus what switching gains, in closed form.
+
+With u_i = C_i / pi_i the equations of two modes reduce to one for the difference u_2 - u_1. Packed symmetric
+matrices, S_i the operator C -> Z_i C + C Z_i^T, s_i = S_i^-1 Q_i the moments of graph i held for ever:
+
+    E = E_static - pi_1 pi_2 h (S_2^-1 - S_1^-1) (I / beta + Omega)^-1 (s_2 - s_1)
+    Omega = pi_2 S_1^-1 + pi_1 S_2^-1,    beta = q_12 + q_21
+
+It is the paper's proposition for two topologies, whose alpha (I + beta Omega)^-1 is pi_1 pi_2 (I / beta +
+Omega)^-1 without the overflow: right for every beta > 0, and its limits are plain to see. In discrete time, with
+S_i: C -> C - K_i[C] and beta = P_12 + P_21, the same derivation gives the same formula with Omega - I in place of
+Omega. The differences come from S_2 - S_1, without cancellation.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from msg_analysis.errors import InputError
+from msg_analysis.theory import symmetric
+from msg_analysis.theory.operators import mode_operators
+from msg_analysis.theory.system import JumpSystem
+from msg_analysis.types import FloatArray
+
+MAX_UNKNOWNS = 2000
+"""Largest p = d (d + 1) / 2 for which the p x p matrices are built: about 60 agents."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwoTopology:
+    """Error = static baseline + switching term, for every agent and for all of them.
+
+    Attributes
+    ----------
+    rate : beta = q_12 + q_21 [1 / unit of time], or P_12 + P_21
+    static : (m,) pi-weighted mean of the node errors of the two graphs held for ever
+    switching : (m,) what switching adds to them; negative where it helps
+    fast : (m,) limit of ``switching`` for beta to infinity (continuous time), or its value at beta = 1, where
+        the graphs of successive steps are independent (discrete time)
+    """
+
+    rate: float
+    static: FloatArray
+    switching: FloatArray
+    fast: FloatArray
+
+    @property
+    def node_errors(self) -> FloatArray:
+        """(m,) E_i."""
+        return self.static + self.switching
+
+    @property
+    def system_error(self) -> float:
+        """E."""
+        return float(self.node_errors.sum())
+
+    def to_json(self) -> dict[str, Any]:
+        """The document: of the system and of every node."""
+        parts = {"static": self.static, "switching": self.switching, "error": self.node_errors, "fast": self.fast}
+        return {
+            "rate": self.rate,
+            "system": {key: float(values.sum()) for key, values in parts.items()},
+            "nodes": {key: values.tolist() for key, values in parts.items()},
+        }
+
+
+def two_topology(system: JumpSystem) -> TwoTopology:
+    """Closed form of the steady node errors under two graphs, each of which has a steady error of its own.
+
+    Parameters
+    ----------
+    system : two modes; continuous or discrete time, consensus or tracking, any noise and loss
+
+    Raises
+    ------
+    InputError : not two graphs, too many agents, or a graph that cannot be held for ever
+    """
+    if system.modes != 2:
+        raise InputError(f"two-topology form: {system.modes} graphs, expected 2: use predict")
+    p = symmetric.size(system.dimension)
+    if p > MAX_UNKNOWNS:
+        raise InputError(
+            f"two-topology form: {len(system.output)} agents give {p} x {p} matrices, expected at most "
+            f"{MAX_UNKNOWNS}: use predict, which needs none"
+        )
+    discrete = system.time == "discrete"
+    one, two = mode_operators(system)
+    first, second = _factors(one, 1), _factors(two, 2)
+    step = one - two
+    weight_1, weight_2 = system.stationary
+    rate = float(system.chain[0, 1] + system.chain[1, 0])
+    noise = symmetric.pack(system.noise)
+    forms = symmetric.pack(system.output[:, :, None] * system.output[:, None, :])
+
+    held_2 = scipy.linalg.lu_solve(second, noise[1])
+    held_1 = scipy.linalg.lu_solve(first, noise[0])
+    apart = scipy.linalg.lu_solve(first, step @ held_2 + noise[1] - noise[0])  # s_2 - s_1
+    seen_2 = scipy.linalg.lu_solve(second, forms.T, trans=1)
+    seen_apart = scipy.linalg.lu_solve(first, step.T @ seen_2, trans=1)  # (S_2^-1 - S_1^-1)^T h
+    omega = weight_2 * scipy.linalg.lu_solve(first, np.eye(p)) + weight_1 * scipy.linalg.lu_solve(second, np.eye(p))
+    if discrete:
+        omega -= np.eye(p)
+
+    def gained(inverse_rate: float) -> FloatArray:
+        inner = np.linalg.solve(omega + inverse_rate * np.eye(p), apart)
+        return np.asarray(-weight_1 * weight_2 * (seen_apart.T @ inner))
+
+    return TwoTopology(
+        rate=rate,
+        static=np.asarray(forms @ (weight_1 * held_1 + weight_2 * held_2)),
+        switching=gained(1.0 / rate),
+        fast=gained(1.0 if discrete else 0.0),
+    )
+
+
+def _factors(operator: FloatArray, graph: int) -> tuple[FloatArray, Any]:
+    """LU factors of S_i, which must be regular."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)  # the condition is judged below
+        factors = scipy.linalg.lu_factor(operator)
+    reciprocal, _ = scipy.linalg.lapack.dgecon(factors[0], np.linalg.norm(operator, 1))
+    if not reciprocal > 1e-13:
+        raise InputError(
+            f"two-topology form: graph {graph} held for ever has no steady error (reciprocal condition "
+            f"{reciprocal:.1e}), expected graphs that each connect everybody: use predict"
+        )
+    return factors

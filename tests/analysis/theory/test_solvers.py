@@ -1,0 +1,308 @@
+"""The matrix-free solvers on hard chains and graphs, against the dense reference, scipy and python-control.
+
+The reference is itself checked against the paper's Kronecker formulas in test_moments.py.
+"""
+
+import control
+import networkx as nx
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from msg_analysis.errors import InputError
+from msg_analysis.model.chain import stationary_law
+from msg_analysis.theory import equations, moments
+from msg_analysis.theory.local import LocalSolves
+from msg_analysis.theory.moments import MomentSolver
+from msg_analysis.theory.system import JumpSystem, held
+
+MODELS = settings(max_examples=30, deadline=None, derandomize=True)
+seeds = st.integers(0, 10_000)
+rates = st.sampled_from([1e-6, 1e-2, 1.0, 1e2, 1e6])
+
+
+def generator(random, n, rate=1.0, *, reversible=False):
+    flow = random.uniform(0.05, 2.0, (n, n)) * rate
+    if reversible:
+        flow = (flow + flow.T) / random.uniform(0.2, 1.0, n)[:, None]
+    np.fill_diagonal(flow, 0.0)
+    return flow - np.diag(flow.sum(axis=1))
+
+
+def laplacian(random, m, kind):
+    a = np.zeros((m, m))
+    if kind == "pieces":  # a few edges only: disconnected; the union is made to hold together below
+        for i, j in random.integers(m, size=(max(1, m // 3), 2)):
+            a[i, j] = a[j, i] = 1.0
+    elif kind == "chain":  # everybody hears the one before: no eigenvectors
+        a[range(1, m), range(m - 1)] = 1.0
+    else:
+        a = random.uniform(0.2, 1.5, (m, m)) * (random.random((m, m)) < 3.0 / m)
+        a[range(1, m), range(m - 1)] = 1.0
+        if kind == "symmetric":
+            a = a + a.T
+    np.fill_diagonal(a, 0.0)
+    return np.diag(a.sum(axis=1)) - a
+
+
+def system(random, m, gamma, kind="symmetric", dt=None, loss=False):
+    """Consensus; with dt in discrete time."""
+    n = len(gamma)
+    z = np.stack([laplacian(random, m, kind) for _ in range(n)])
+    if kind == "pieces":
+        z[0] += nx.laplacian_matrix(nx.path_graph(m)).toarray()
+    f = random.standard_normal((n, m, m))
+    lift = scipy.linalg.helmert(m).T
+    noise, law = lift.T @ (f @ f.transpose(0, 2, 1)) @ lift, stationary_law(gamma)
+    if dt is None:
+        return JumpSystem("continuous", lift.T @ z @ lift, noise, gamma, law, lift)
+    chain = np.clip(scipy.linalg.expm(gamma * dt), 0.0, None)
+    chain /= chain.sum(axis=1, keepdims=True)
+    variance = 0.2 * (dt * z * ~np.eye(m, dtype=bool)) ** 2 if loss else None
+    return JumpSystem("discrete", np.eye(m - 1) - dt * lift.T @ z @ lift, noise, chain, law, lift, variance)
+
+
+def agree(model, rtol=1e-9):
+    """Matrix-free against dense: steady state and duals."""
+    solver, dense = MomentSolver(model, method="krylov"), MomentSolver(model, method="dense")
+    expected = dense.steady()
+    np.testing.assert_allclose(solver.steady(), expected, rtol=rtol, atol=rtol * np.abs(expected).max())
+    assert solver.report.error <= 1e-12
+    forms = np.stack([np.eye(model.dimension), np.diag(np.arange(model.dimension) == 0).astype(float)])
+    expected = dense.dual(forms)
+    np.testing.assert_allclose(solver.dual(forms), expected, rtol=rtol, atol=rtol * np.abs(expected).max())
+    return solver
+
+
+@MODELS
+@given(seeds, st.integers(2, 7), st.integers(1, 4), rates, st.sampled_from(["symmetric", "directed", "chain"]))
+def test_continuous_time_is_the_dense_solution(seed, m, n, rate, kind):
+    random = np.random.default_rng(seed)
+    agree(system(random, m, generator(random, n, rate), kind))
+
+
+@MODELS
+@given(
+    seeds,
+    st.integers(2, 7),
+    st.integers(1, 4),
+    rates,
+    st.sampled_from(["symmetric", "directed", "chain"]),
+    st.booleans(),
+)
+def test_discrete_time_is_the_dense_solution(seed, m, n, rate, kind, loss):
+    random = np.random.default_rng(seed)
+    agree(system(random, m, generator(random, n, rate), kind, dt=0.03, loss=loss), rtol=1e-8)
+
+
+@MODELS
+@given(seeds, st.integers(4, 8), st.integers(2, 4), st.sampled_from([1e-2, 1.0, 1e2]), st.sampled_from([None, 0.1]))
+def test_disconnected_graphs(seed, m, n, rate, dt):
+    random = np.random.default_rng(seed)
+    agree(system(random, m, generator(random, n, rate), "pieces", dt), rtol=1e-7)  # the dense one loses digits
+
+
+@pytest.mark.parametrize("kind", ["symmetric", "directed", "pieces"])
+@pytest.mark.parametrize("fast", [1e2, 1e5])
+def test_groups_of_graphs_that_switch_fast_among_themselves(kind, fast):
+    gamma = np.array([[0, fast, 1e-2, 0], [fast, 0, 0, 1e-2], [2e-2, 0, 0, fast], [0, 1e-2, fast, 0]])
+    gamma -= np.diag(gamma.sum(axis=1))
+    solver = agree(system(np.random.default_rng(3), 10, gamma, kind), rtol=1e-7)
+    assert solver.report.iterations < 60
+
+
+@pytest.mark.parametrize("dt", [None, 0.02])
+@pytest.mark.parametrize("rate", [1e-4, 0.1, 1.0, 1e3, 1e6, 1e9])
+def test_large_systems_in_single_precision_are_as_accurate(rate, dt, monkeypatch):
+    """Both preconditioners, with products in single precision, against double precision throughout."""
+    random = np.random.default_rng(4)
+    model = system(random, 90, generator(random, 3, rate, reversible=True), dt=dt)
+    solver = MomentSolver(model)
+    measured, dual = solver.steady(), solver.dual(np.eye(89)[None])
+    monkeypatch.setattr(equations, "SINGLE_FROM", 1000)
+    reference = MomentSolver(model)
+    expected = reference.steady()
+    assert reference.report.preconditioner == "two-level"
+    np.testing.assert_allclose(measured, expected, rtol=1e-11, atol=1e-11 * expected.max())
+    np.testing.assert_allclose(dual, reference.dual(np.eye(89)[None]), rtol=1e-10, atol=1e-10)
+
+
+def test_what_is_chosen():
+    random = np.random.default_rng(5)
+    reversible, other = generator(random, 3, reversible=True), generator(random, 3)
+
+    def method(model):
+        solver = MomentSolver(model)
+        solver.steady()
+        return solver.report.method, solver.report.preconditioner
+
+    assert method(system(random, 8, reversible)) == ("cg", "two-level")
+    assert method(system(random, 8, other)) == ("gmres", "two-level")
+    assert method(system(random, 8, reversible, "directed")) == ("gmres", "two-level")
+    assert method(system(random, 8, reversible, dt=0.05)) == ("gmres", "two-level")
+    assert method(held(system(random, 8, other), 1)) == ("direct", "none")
+    assert method(system(random, 90, reversible * 10)) == ("cg", "averaged")
+
+
+PERIODIC = np.roll(np.eye(4), 1, axis=1)
+
+
+@pytest.mark.parametrize("chain", [np.full((4, 4), 0.25), PERIODIC, 0.999 * PERIODIC + 0.001 * np.eye(4)])
+def test_independent_and_periodic_graphs(chain):
+    random = np.random.default_rng(6)
+    slow = system(random, 12, generator(random, 4), dt=0.05)
+    agree(JumpSystem("discrete", slow.matrices, slow.noise, chain, np.full(4, 0.25), slow.lift))
+
+
+def test_gossip_of_random_pairs():
+    """Independent pairwise averaging: E[W C W^T] is not the averaged graph's, yet few iterations do."""
+    random, m, n = np.random.default_rng(7), 12, 20
+    lift, steps = scipy.linalg.helmert(m).T, np.stack([np.eye(m)] * n)
+    for step in steps:
+        i, j = random.choice(m, 2, replace=False)
+        step[np.ix_([i, j], [i, j])] = 0.5
+    steps[0] = 1.0 / m
+    noise = np.stack([np.eye(m - 1)] * n)
+    model = JumpSystem("discrete", lift.T @ steps @ lift, noise, np.full((n, n), 1 / n), np.full(n, 1 / n), lift)
+    solver = agree(model)
+    assert solver.report.iterations < 40
+
+
+@pytest.mark.parametrize("kind", ["symmetric", "directed"])
+def test_one_graph_is_the_h2_norm(kind):
+    """E is the squared H2 norm of the network, by python-control."""
+    model = held(system(np.random.default_rng(8), 7, np.array([[-1.0, 1], [1, -1]]), kind), 0)
+    root = np.linalg.cholesky(model.noise[0])
+    plant = control.ss(-model.matrices[0], root, np.eye(6), np.zeros((6, 6)))
+    assert np.trace(MomentSolver(model).steady()[0]) == pytest.approx(control.system_norm(plant, 2) ** 2, rel=1e-8)
+
+
+@MODELS
+@given(seeds, st.integers(4, 12))
+def test_one_graph_with_unit_noise_is_its_resistance(seed, m):
+    graph = nx.connected_watts_strogatz_graph(m, 3, 0.5, seed=seed)
+    lift = scipy.linalg.helmert(m).T
+    z = lift.T @ nx.laplacian_matrix(graph).toarray() @ lift
+    model = JumpSystem("continuous", z[None], np.eye(m - 1)[None], np.zeros((1, 1)), np.ones(1), lift)
+    resistance = nx.effective_graph_resistance(graph)
+    assert np.trace(MomentSolver(model).steady()[0]) == pytest.approx(resistance / (2 * m), rel=1e-10)
+
+
+def test_path_and_ring_of_forty():
+    """Kf of a path is (m^3 - m) / 6, of a ring (m^3 - m) / 12; switching keeps E below their mean."""
+    m = 40
+    lift = scipy.linalg.helmert(m).T
+    z = np.stack([nx.laplacian_matrix(g(m)).toarray().astype(float) for g in (nx.path_graph, nx.cycle_graph)])
+    noise = np.stack([np.eye(m - 1)] * 2)
+    gamma = np.array([[-1.0, 1.0], [1.0, -1.0]])
+    model = JumpSystem("continuous", lift.T @ z @ lift, noise, gamma, np.array([0.5, 0.5]), lift)
+    path, ring = ((m**3 - m) / (k * 2 * m) for k in (6, 12))
+    for mode, error in enumerate((path, ring)):
+        assert np.trace(MomentSolver(held(model, mode)).steady()[0]) == pytest.approx(error, rel=1e-11)
+    agree(model)
+    total = np.trace(MomentSolver(model).steady().sum(axis=0))
+    assert np.trace(np.linalg.inv(z.mean(axis=0)[1:, 1:])) > 0
+    assert 0.5 * np.trace(np.linalg.inv(lift.T @ z.mean(axis=0) @ lift)) < total < (path + ring) / 2
+
+
+@pytest.mark.parametrize("dt", [None, 0.05])
+def test_a_guess_saves_iterations_and_changes_nothing(dt):
+    random = np.random.default_rng(9)
+    gamma = generator(random, 3)
+    first = system(np.random.default_rng(1), 15, gamma, dt=dt)
+    second = system(np.random.default_rng(1), 15, gamma * (1 + 1e-4), dt=dt)
+    start = MomentSolver(first).steady()
+    cold, warm = MomentSolver(second), MomentSolver(second, guess=start)
+    np.testing.assert_allclose(warm.steady(), cold.steady(), rtol=1e-10, atol=1e-12)
+    assert warm.report.iterations < cold.report.iterations
+
+
+def test_a_guess_for_another_system_is_refused():
+    random = np.random.default_rng(9)
+    model = system(random, 5, generator(random, 2))
+    with pytest.raises(InputError, match=r"guess: shape \(2, 3, 3\).*\(2, 4, 4\)"):
+        MomentSolver(model, guess=np.zeros((2, 3, 3)))
+
+
+@pytest.mark.parametrize("time", ["continuous", "discrete"])
+@pytest.mark.parametrize("kind", ["symmetric", "directed", "chain"])
+def test_single_graphs_are_scipys(time, kind):
+    """The building block, in both directions, with a rate of leaving."""
+    random = np.random.default_rng(10)
+    drift = np.stack([laplacian(random, 9, kind)[1:, 1:] * 0.1 for _ in range(2)])
+    right = np.stack([a @ a.T for a in random.standard_normal((2, 8, 8))])
+    leaving = np.array([0.5, 0.125])
+    solves = LocalSolves(time, drift, leaving)
+    assert (solves.eigenvectors is None) == (kind == "chain")
+    for local, matrices in ((solves, drift), (solves.transposed(), drift.transpose(0, 2, 1))):
+        found, moved = local(right)
+        for x, y, d, f, a in zip(found, moved, matrices, right, leaving, strict=True):
+            if time == "continuous":
+                expected = scipy.linalg.solve_continuous_lyapunov(d + 0.5 * a * np.eye(8), f)
+                after = expected
+            else:
+                w = np.eye(8) - d
+                expected = scipy.linalg.solve_discrete_lyapunov(np.sqrt(1.0 - a) * w, f)
+                after = w @ expected @ w.T
+            np.testing.assert_allclose(x, expected, rtol=1e-8, atol=1e-10)
+            np.testing.assert_allclose(y, after, rtol=1e-8, atol=1e-10)
+
+
+def test_union_that_does_not_connect_is_refused():
+    pieces = np.kron(np.eye(2), [[1.0, -1.0], [-1.0, 1.0]])
+    lift = scipy.linalg.helmert(4).T
+    z = lift.T @ np.stack([pieces, 2 * pieces]) @ lift
+    gamma = np.array([[-1.0, 1.0], [1.0, -1.0]])
+    model = JumpSystem("continuous", z, np.stack([np.eye(3)] * 2), gamma, np.array([0.5, 0.5]), lift)
+    for method in ("auto", "krylov", "dense"):
+        with pytest.raises(InputError, match="union of the graphs connects everybody"):
+            MomentSolver(model, method=method).steady()
+
+
+@pytest.mark.parametrize("size", [8, 90])
+def test_unstable_steps_are_refused(size):
+    random = np.random.default_rng(11)
+    gamma = generator(random, 2, reversible=True)
+    stable = system(np.random.default_rng(1), size, gamma, dt=0.01)
+    largest = np.linalg.eigvalsh(np.eye(size - 1) - stable.matrices).max() / 0.01
+    MomentSolver(system(np.random.default_rng(1), size, gamma, dt=1.9 / largest)).steady()
+    with pytest.raises(InputError, match="grow without bound"):
+        MomentSolver(system(np.random.default_rng(1), size, gamma, dt=3.0 / largest)).steady()
+
+
+def test_drift_that_pushes_away_is_refused():
+    z = np.array([np.diag([1.0, -0.5]), np.diag([1.0, 0.7])])
+    gamma = np.array([[-0.1, 0.1], [0.1, -0.1]])
+    model = JumpSystem("continuous", z, np.stack([np.eye(2)] * 2), gamma, np.array([0.5, 0.5]), np.eye(2))
+    with pytest.raises(InputError, match="grow without bound"):
+        MomentSolver(model).steady()
+
+
+def test_no_convergence_is_an_error_or_a_dense_solve(monkeypatch):
+    from msg_analysis.theory import iterative
+
+    monkeypatch.setattr(iterative, "MAX_ITERATIONS", 2)
+    monkeypatch.setattr(iterative, "MAX_RELATIVE_ERROR", 1e-14)
+    random = np.random.default_rng(12)
+    model = system(random, 12, generator(random, 4), "directed")
+    with pytest.raises(InputError, match="iterations do not converge"):
+        MomentSolver(model, method="krylov").steady()
+    solver = MomentSolver(model)
+    solver.steady()
+    assert solver.report.method == "dense"
+    monkeypatch.setattr(moments, "MAX_FALLBACK", 10)
+    with pytest.raises(InputError, match="iterations do not converge"):
+        MomentSolver(model).steady()
+
+
+def test_many_forms_are_solved_in_batches(monkeypatch):
+    from msg_analysis.theory import iterative
+
+    random = np.random.default_rng(13)
+    model = system(random, 9, generator(random, 3))
+    forms = np.stack([a + a.T for a in random.standard_normal((7, 8, 8))])
+    together = MomentSolver(model).dual(forms)
+    monkeypatch.setattr(iterative, "CHUNK", 400)
+    np.testing.assert_allclose(MomentSolver(model).dual(forms), together, rtol=1e-10, atol=1e-12)
