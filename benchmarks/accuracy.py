@@ -1,26 +1,30 @@
 """How accurate the predicted second moments are, and how long they take: the table of docs/accuracy.md.
 
-Every row compares the dense solver with another route to the same numbers: the paper's formulas in full
-Kronecker form, which share the experiment's graphs and chain with the solver and nothing else; resistances
-from networkx; certainties printed in the paper. The last column is the largest difference between two
-covariances (or numbers), over their largest entry. Prints Markdown; takes a few seconds on one core.
+Every row compares the solver with another route to the same numbers: the paper's formulas in full Kronecker form,
+which share the experiment's graphs and chain with the solver and nothing else; the same in 60 digits at extreme rates
+and gains; resistances from networkx; certainties printed in the paper. The last column is the largest difference
+between two covariances (or numbers), over their largest entry. Prints Markdown; takes a few seconds on one core.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import mpmath
 import networkx as nx
 import numpy as np
 import scipy.linalg
 from threadpoolctl import threadpool_limits
 
 from msg_analysis.model.experiment import Experiment
+from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
+from msg_analysis.theory.system import continuous
 from msg_analysis.types import FloatArray
 
 Result = TypeVar("Result")
@@ -148,6 +152,67 @@ def resistances() -> Iterator[Row]:
         yield Row(f"one graph, {name}: E", "networkx, resistance", seconds, None, error)
 
 
+PIECES = {"first": {"edges": [[1, 2], [3, 4]]}, "second": {"edges": [[2, 3]]}}
+LINE_RING = {"first": {"path": [1, 2, 3, 4]}, "second": {"cycle": [1, 2, 3, 4]}}
+
+
+def sixty_digits(experiment: Experiment) -> FloatArray:
+    """(m, m) covariance in continuous time by the Kronecker form in a Helmert basis, all in 60 digits; F = I."""
+    with mpmath.workdps(60):
+        m, n = experiment.agents, experiment.chain.modes
+        gains = [float(gain) for gain in experiment.leader_gains]
+        basis = mpmath.eye(m)
+        if not any(gains):
+            rows = [[1] * k + [-k] + [0] * (m - k - 1) for k in range(1, m)]
+            basis = mpmath.matrix([[x / mpmath.sqrt(k * k + k) for x in row] for k, row in enumerate(rows, 1)])
+        d = basis.rows
+        z = [basis * (mpmath.matrix(g.laplacian) + mpmath.diag(gains)) * basis.T for g in experiment.graph_list]
+        chain = mpmath.matrix(experiment.chain.matrix)
+        for i in range(n):
+            chain[i, i] = -sum(chain[i, j] for j in range(n) if j != i)
+        balance = chain.T.copy()
+        for j in range(n):
+            balance[n - 1, j] = 1
+        law = mpmath.lu_solve(balance, mpmath.matrix([0] * (n - 1) + [1]))
+        matrix, right = mpmath.zeros(n * d * d), mpmath.zeros(n * d * d, 1)
+        for i, a, b in itertools.product(range(n), range(d), range(d)):
+            row = (i * d + a) * d + b
+            right[row] = law[i] * (a == b)
+            for c in range(d):
+                matrix[row, (i * d + c) * d + b] += z[i][a, c]
+                matrix[row, (i * d + a) * d + c] += z[i][b, c]
+            for j in range(n):
+                matrix[row, (j * d + a) * d + b] -= chain[j, i]
+        solution = mpmath.lu_solve(matrix, right)
+        total = mpmath.matrix(d, d)
+        for i, a, b in itertools.product(range(n), range(d), range(d)):
+            total[a, b] += solution[(i * d + a) * d + b]
+        return np.array((basis.T * total * basis).tolist(), dtype=float)
+
+
+def extremes() -> Iterator[Row]:
+    """Rates and gains over eighteen orders of magnitude; time is that of one solve."""
+    for name, graphs in (("line and ring of 4", LINE_RING), ("two graphs in pieces, union connected", PIECES)):
+        for rate in (1e-8, 1e-4, 1.0, 1e4, 1e6, 1e10):
+            yield extreme(f"{name}, rates {rate:g} and {rate / 1000:g}", {"graphs": graphs}, rate)
+        for gain in (1e-3, 1e6):
+            leaders = {"problem": "tracking", "leaders": {"agents": [2], "gain": gain}}
+            yield extreme(f"{name}, leader's gain {gain:g}", {"graphs": graphs, **leaders}, 1.0)
+
+
+def extreme(case: str, document: dict[str, Any], rate: float) -> Row:
+    """One of them."""
+    generator = [[-rate, rate], [rate / 1000, -rate / 1000]]
+    experiment = Experiment.parse(
+        {"name": "extreme", "agents": 4, "switching": {"generator": generator}, "run": {"dt": 1e-7, "duration": 1e-4}}
+        | document
+    )
+    system = continuous(experiment)
+    measured, seconds = timed(lambda _: system.lifted(MomentSolver(system).steady().sum(axis=0)), experiment)
+    exact, exact_seconds = timed(sixty_digits, experiment)
+    return Row(case, "60 digits (mpmath)", seconds, exact_seconds, difference(measured, exact))
+
+
 def printed() -> Iterator[Row]:
     """Example 1 of the paper: as good as its five digits."""
     for (forth, back), certainty in PAPER.items():
@@ -172,7 +237,7 @@ def main() -> None:
     print("| case | compared with | solver [s] | other [s] | relative difference |")
     print("|---|---|---:|---:|---:|")
     with threadpool_limits(1):
-        for rows in (brute_force(arguments.largest), resistances(), printed()):
+        for rows in (brute_force(arguments.largest), extremes(), resistances(), printed()):
             for row in rows:
                 other = "" if row.oracle_seconds is None else f"{row.oracle_seconds:.3g}"
                 print(

@@ -2,8 +2,8 @@
 
 One thread of linear algebra. Graphs are rings with random chords, m of them; rates are random, about 1, and
 symmetric; F = I. Every row is measured in this run; times are the best of a few, memory is the peak of a process of
-its own. Prints Markdown: the comparisons, then the cost over m and n with fitted exponents; takes about three minutes
-(--quick: half a minute). --plot FILE.svg draws the cost.
+its own. Prints Markdown: the comparisons, then the cost over m and n with fitted exponents; takes about two
+minutes (--quick: a quarter of one). --plot FILE.svg draws the cost.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def comparisons(*, quick: bool) -> Iterator[str]:
         began = time.perf_counter()
         reference = dense_formula(network, when)
         other = time.perf_counter() - began
-        error = np.abs(system.lifted(steady(system).sum(axis=0)) / reference - 1.0).max()
+        error = np.abs(system.lifted(steady(system).sum(axis=0)) - reference).max() / np.abs(reference).max()
         yield row(f"20 agents, 3 graphs, {when}", seconds, "`pinv` of the n m² matrix", other, f"differ by {error:.0e}")
     agents = 100 if quick else 300
     for when in whens:

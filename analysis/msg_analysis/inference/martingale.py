@@ -9,7 +9,7 @@ are martingale differences whose sum is N times the error of the time mean, up t
 the correlation in time. The covariance of the sum is estimated by the predictable quadratic variation, the
 sum of Cov(D_k | y_k, g_k), and not by sum D_k D_k^T: jumps of the graph that did not happen count as much as
 those that did, so that the standard errors do not break down in runs with a few jumps. With every step's
-second moments s_k packed, and a_k = (s_k, 1), it is exact and comes from sum a_k a_k^T of each graph alone.
+second moments s_k packed, and a_k = (s_k, 1), it is exact.
 Replicas share the path of the graphs: they are averaged inside h, and share the part of Cov(D_k) that is due
 to the jump.
 """
@@ -67,7 +67,7 @@ class _Value:
     ----------
     probability : (n,) P_gj
     surprises : (n, q, p + 1): E[f(next) | next graph j] - E[f(next)] = surprises[j] @ a
-    forms : (n, q, p) Y_j, packed
+    forms : (n, q, d, d) Y_j
     weights : (d, d) W_g
     noise : (d, d) N_g
     """
@@ -78,19 +78,35 @@ class _Value:
     weights: FloatArray
     noise: FloatArray
 
-    def covariance(self, gram: FloatArray, replicas: int) -> FloatArray:
-        """(q, q): sum over steps of Cov(D_k | now), from gram = sum of a a^T (p + 1, p + 1).
+    def jumps(self, a: FloatArray) -> FloatArray:
+        """(q, q): the part of the sum over steps of Cov(D_k | now) that the next graph is to blame for.
 
-        Given the next graph j, the next state is N(W y, N): Cov(f_a, f_b) = 2 tr(A N B N) + 4 y^T W^T A N B W
-        y.
+        Parameters
+        ----------
+        a : (b, p + 1) of some steps
         """
-        moved = self.weights @ symmetric.unpack(gram[-1, :-1], len(self.weights)) @ self.weights.T
-        spread = 2.0 * gram[-1, -1] * symmetric.congruence(self.noise)
-        spread += 4.0 * symmetric.product(self.noise, moved)
         total = np.zeros((self.forms.shape[1],) * 2)
-        for probability, surprise, form in zip(self.probability, self.surprises, self.forms, strict=True):
-            total += probability * (surprise @ gram @ surprise.T + form @ spread @ form.T / replicas)
+        for probability, surprise in zip(self.probability, self.surprises, strict=True):
+            surprised = a @ surprise.T
+            total += probability * (surprised.T @ surprised)
         return total
+
+    def spread(self, total: FloatArray) -> FloatArray:
+        """(q, q): the part that the noise is to blame for, with one replica.
+
+        Given the next graph j, the next state is N(W y, N): Cov(f_a, f_b) = 2 tr(A N B N) + 4 y^T W^T A N B W y.
+
+        Parameters
+        ----------
+        total : (p + 1,) sum of a over the steps
+        """
+        moved = self.weights @ symmetric.unpack(total[:-1], len(self.weights)) @ self.weights.T
+        seen = 2.0 * total[-1] * self.noise + 4.0 * moved
+        result = np.zeros((self.forms.shape[1],) * 2)
+        for probability, form in zip(self.probability, self.forms, strict=True):
+            left, right = form @ self.noise, seen @ form  # tr(A N B S) is the product of A N and (B S)^T = S B
+            result += probability * left.reshape(len(form), -1) @ right.reshape(len(form), -1).T
+        return result
 
     def variances(self, combination: FloatArray, a: FloatArray, replicas: int) -> FloatArray:
         """(b,): Var(D_k | now) of one combination (q,) of the forms in every step, a being (b, p + 1)."""
@@ -98,7 +114,7 @@ class _Value:
         linear = np.zeros(a.shape[1])
         for probability, surprise, form in zip(self.probability, self.surprises, self.forms, strict=True):
             total += probability * (a @ (combination @ surprise)) ** 2
-            matrix = symmetric.unpack(combination @ form, len(self.weights))
+            matrix = np.tensordot(combination, form, axes=1)
             seen = matrix @ self.noise @ matrix
             linear[:-1] += 4.0 * probability * symmetric.pack(self.weights.T @ seen @ self.weights)
             linear[-1] += 2.0 * probability * np.trace(seen @ self.noise)
@@ -137,7 +153,8 @@ def time_means(observation: Observation) -> TimeMeans:
     trace = nodes.sum(axis=0)  # the system error is the sum of the node errors
 
     values = _values(observation.prediction, forms)
-    grams = np.zeros((system.modes, p + 1, p + 1))
+    totals = np.zeros((system.modes, p + 1))
+    covariance = np.zeros((len(forms), len(forms)))
     series, variances = np.empty(steps), np.empty(steps)
     for first, last in observation.blocks(max(p, observation.states[0].size)):
         a = np.ones((last - first, p + 1))
@@ -145,10 +162,12 @@ def time_means(observation: Observation) -> TimeMeans:
         series[first:last] = a[:, :p] @ (trace @ forms)
         for mode, value in enumerate(values):
             at = np.flatnonzero(observation.modes[first:last] == mode)
-            grams[mode] += a[at].T @ a[at]
+            totals[mode] += a[at].sum(axis=0)
+            covariance += value.jumps(a[at])
             variances[first + at] = value.variances(trace, a[at], observation.replicas)
-    covariance = sum(v.covariance(gram, observation.replicas) for v, gram in zip(values, grams, strict=True))
-    moments = grams.sum(axis=0)[-1, :p] / steps
+    for value, total in zip(values, totals, strict=True):
+        covariance += value.spread(total) / observation.replicas
+    moments = totals.sum(axis=0)[:p] / steps
     expected = expected_mean(observation)
     return TimeMeans(
         second_moments=symmetric.unpack(moments, system.dimension),
@@ -156,7 +175,7 @@ def time_means(observation: Observation) -> TimeMeans:
         joint=joint,
         measured=forms @ moments,
         predicted=forms @ symmetric.pack(expected),
-        covariance=np.asarray(covariance) / steps**2,
+        covariance=covariance / steps**2,
         nodes=nodes,
         system_series=series,
         system_variances=variances,
@@ -181,7 +200,7 @@ def _values(prediction: Prediction, forms: FloatArray) -> list[_Value]:
         ahead = np.concatenate([np.moveaxis(symmetric.pack(before), 1, 0), constant[:, :, None]], axis=2)
         law = system.chain[mode]
         surprises = ahead - np.tensordot(law, ahead, axes=1)
-        values.append(_Value(law, surprises, packed, step, noise[mode]))
+        values.append(_Value(law, surprises, np.moveaxis(dual, 1, 0), step, noise[mode]))
     return values
 
 

@@ -69,7 +69,7 @@ class AveragedEquations:
         if self._discrete:
             divisor -= values[:, None] * values
         self._divisor = single(divisor)
-        self._buffers: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self._buffers: list[FloatArray] = []
 
     def enter(self, matrices: FloatArray) -> FloatArray:
         """Right-hand sides, from those of the equations."""
@@ -84,10 +84,10 @@ class AveragedEquations:
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(Z, A Z) for Z near A^-1 R; the next call overwrites them."""
         shape, n = right.shape, len(self.weights)
-        if self._buffers is None or self._buffers[0].shape != shape:  # fresh memory costs as much as a product
+        if not self._buffers or self._buffers[0].shape != shape:  # fresh memory costs as much as a product
             both = (shape[0], len(self._back), *shape[2:])
-            self._buffers = np.empty(shape, np.float32), np.empty(both, np.float32), np.empty(shape, np.float32)
-        half, found, moved = self._buffers
+            self._buffers = [np.empty(s, np.float32) for s in (shape, both, shape, shape)]
+        half, found, moved, squared = self._buffers
         _combine(self._forth, right, half)
         half /= self._divisor
         _combine(self._back, half, found)
@@ -95,7 +95,7 @@ class AveragedEquations:
         np.matmul(self._drift, z, out=half)
         np.add(half, half.swapaxes(-1, -2), out=moved)
         if self._discrete:
-            moved -= half @ self._drift
+            moved -= np.matmul(half, self._drift, out=squared)
         moved -= coupled
         return z, moved
 

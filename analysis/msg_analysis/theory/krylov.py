@@ -75,7 +75,7 @@ def gmres(equations: Equations, right: FloatArray, tolerance: FloatArray, most: 
     q, shape = len(right), right.shape
     length = right[0].size
     most = max(5, min(most, MAX_BASIS, int(MAX_BASIS_BYTES / right.nbytes)))
-    basis = np.empty((q, most + 1, length), dtype=right.dtype)
+    basis = np.empty((q, min(most + 1, 16), length), dtype=right.dtype)
     triangle = np.zeros((q, most, most))
     cosines, sines, target = np.zeros((q, most)), np.zeros((q, most)), np.zeros((q, most + 1))
     norm = np.linalg.norm(right.reshape(q, -1), axis=1)
@@ -83,6 +83,9 @@ def gmres(equations: Equations, right: FloatArray, tolerance: FloatArray, most: 
     target[:, 0] = norm
     used = 0
     while used < most:
+        if used + 1 == basis.shape[1]:  # memory that is not needed is not asked for: clearing it takes time
+            more = np.empty((q, min(used, most - used), length), dtype=right.dtype)
+            basis = np.concatenate([basis, more], axis=1)
         _, moved = equations.precondition(basis[:, used].reshape(shape))
         vector = moved.reshape(q, length)
         column = np.zeros((q, used + 2))
@@ -116,6 +119,8 @@ def gmres(equations: Equations, right: FloatArray, tolerance: FloatArray, most: 
 
 def _product(a: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray:
     """(q,): sum_i pi_i tr(A_i^T B_i)."""
+    if len(a) == 1:  # BLAS is faster than einsum
+        return np.array([sum(w * float(np.vdot(x, y)) for w, x, y in zip(weights, a[0], b[0], strict=True))])
     return np.asarray(np.einsum("qnab,qnab->qn", a, b) @ weights)
 
 
