@@ -41,17 +41,17 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     console : where to print
     """
     laws = {title: document[key] for key, title in _LAWS.items() if document.get(key) is not None}
-    errors = _table(console, "Mean-square error in the steady state", "", *laws)
-    errors.add_row("system", *(_number(law["system_error"]) for law in laws.values()), end_section=True)
+    errors = number_table(console, "Mean-square error in the steady state", "", *laws)
+    errors.add_row("system", *(number_text(law["system_error"]) for law in laws.values()), end_section=True)
     for agent in range(min(document["agents"], _ROWS)):
-        errors.add_row(f"agent {agent + 1}", *(_number(law["node_errors"][agent]) for law in laws.values()))
+        errors.add_row(f"agent {agent + 1}", *(number_text(law["node_errors"][agent]) for law in laws.values()))
     _note_cut(errors, document["agents"], "agents")
     errors.add_section()
-    errors.add_row("certainty", *(_number(law["system_certainty"]) for law in laws.values()))
+    errors.add_row("certainty", *(number_text(law["system_certainty"]) for law in laws.values()))
     console.print(errors)
-    modes = _table(console, "Graphs", "graph", "share of time")
+    modes = number_table(console, "Graphs", "graph", "share of time")
     for name, share in zip(document["modes"], document["stationary"], strict=True):
-        modes.add_row(Text(name), _number(share))
+        modes.add_row(Text(name), number_text(share))
     console.print(modes)
     for key, title in _LAWS.items():
         if key in document and document[key] is None:
@@ -71,7 +71,7 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
     count = document["completeness"]
     console.print(
         f"{count['received']} of {count['expected']} states in {document['steps']} steps "
-        f"({_number(document['simulated_time'])} units of time): {count['missing']} missing, "
+        f"({number_text(document['simulated_time'])} units of time): {count['missing']} missing, "
         f"{count['duplicates']} twice, {count['out_of_order']} out of order"
     )
     _print_errors(document, console)
@@ -80,16 +80,16 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
     console.print(f"95 % interval of batch means, free of the model: {_interval(interval)}", style="dim")
     continuous = document["continuous"]["system_error"]
     if continuous is not None:
-        console.print(f"System error in continuous time, for reference: {_number(continuous)}", style="dim")
+        console.print(f"System error in continuous time, for reference: {number_text(continuous)}", style="dim")
 
 
 def _print_errors(document: dict[str, Any], console: Console) -> None:
     columns = ("measured", "95 % interval", "predicted", "z")
-    table = _table(console, "Mean-square error over the run", "", *columns)
+    table = number_table(console, "Mean-square error over the run", "", *columns)
 
     def row(label: str, entry: dict[str, Any] | None, end_section: bool = False) -> None:
         entry = entry or {}
-        measured, predicted = _number(entry.get("measured")), _number(entry.get("predicted"))
+        measured, predicted = number_text(entry.get("measured")), number_text(entry.get("predicted"))
         table.add_row(
             label,
             measured,
@@ -111,8 +111,8 @@ def _print_tests(document: dict[str, Any], console: Console) -> None:
     tests = document.get("tests") or []
     if not tests:
         return
-    title = f"Tests, together at level {_number(document.get('level'))}"
-    table = _table(console, title, "test", "p", "p adjusted", "")
+    title = f"Tests, together at level {number_text(document.get('level'))}"
+    table = number_table(console, title, "test", "p", "p adjusted", "")
     # With many agents the table is cut: what rejects comes first.
     shown = [test for test in tests if test["rejected"]] + [test for test in tests if not test["rejected"]]
     for test in shown[:_ROWS]:
@@ -130,34 +130,34 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     console : where to print
     """
     run = document["run"]
-    facts = _facts(console, document["name"])
+    facts = fact_table(console, document["name"])
     facts.add_row("problem", f"{document['problem']} of {document['agents']} agents in {document['time']} time")
     if document["leaders"]:
         leaders = document["leaders"]
         text = f"{_names(leaders['agents'])}, gain {leaders['gain']}, reference {leaders['reference']}"
         facts.add_row("leaders", text)
     facts.add_row("noise", ", ".join(f"{key} {_short(value)}" for key, value in document["noise"].items()))
-    facts.add_row("steps", f"{run['steps']} of {_number(run['dt'])}, {_number(run['duration'])} units of time")
-    facts.add_row("stability limit of a step", _number(document["stability_limit"]))
+    facts.add_row("steps", f"{run['steps']} of {number_text(run['dt'])}, {number_text(run['duration'])} units of time")
+    facts.add_row("stability limit of a step", number_text(document["stability_limit"]))
     facts.add_row("copies (replicas)", str(run["replicas"]))
     facts.add_row("seed", str(run["seed"]))
     facts.add_row("start", f"{_short(run['start'])}, first graph {document['switching']['initial']}")
     facts.add_row("pace", f"{run['pace']}, processes {run['processes']}")
-    facts.add_row("predicted system error", _number(document["predicted_system_error"]))
+    facts.add_row("predicted system error", number_text(document["predicted_system_error"]))
     memory = document["memory"]
     facts.add_row("memory", f"states {amount(memory['states'])}, graphs {amount(memory['matrices'])}")
     facts.add_row("can be run by this version", "yes" if not document["unavailable"] else "no")
     console.print(facts)
     columns = ("connectivity", "share", "held for", "dt below")
-    graphs = _table(console, "Graphs", "graph", *columns)
+    graphs = number_table(console, "Graphs", "graph", *columns)
     graphs.add_column("links", overflow="fold")
     for graph in document["graphs"]:
         graphs.add_row(
             Text(graph["name"]),
-            _number(graph["algebraic_connectivity"]),
-            _number(graph["stationary"]),
-            _number(graph["mean_holding_time"]),
-            _number(graph["stability_limit"]),
+            number_text(graph["algebraic_connectivity"]),
+            number_text(graph["stationary"]),
+            number_text(graph["mean_holding_time"]),
+            number_text(graph["stability_limit"]),
             _links(graph),
         )
     console.print(graphs)
@@ -165,9 +165,9 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     title = "Rates from graph to graph" if document["time"] == "continuous" else "Probabilities from graph to graph"
     names = [graph["name"] for graph in document["graphs"]]
     if 1 < len(names) <= _ROWS:
-        chain = _table(console, title, "from / to", *names)
+        chain = number_table(console, title, "from / to", *names)
         for name, row in zip(names, switching["matrix"], strict=True):
-            chain.add_row(Text(name), *map(_number, row))
+            chain.add_row(Text(name), *map(number_text, row))
         console.print(chain)
     for line in document["unavailable"]:
         console.print(Text(line, style="yellow"))
@@ -182,11 +182,11 @@ def print_bag(document: dict[str, Any], console: Console) -> None:
     console : where to print
     """
     count = document["completeness"]
-    facts = _facts(console, document["bag"])
+    facts = fact_table(console, document["bag"])
     facts.add_row("run", document["run"])
     facts.add_row("experiment", f"{document['experiment']}, seed {document['seed']}")
     facts.add_row("agents, replicas", f"{document['agents']}, {document['replicas']}")
-    facts.add_row("steps", f"{document['steps']}, {_number(document['simulated_time'])} units of time")
+    facts.add_row("steps", f"{document['steps']}, {number_text(document['simulated_time'])} units of time")
     state = "complete" if count["complete"] else "incomplete"
     facts.add_row("states", f"{state}: {count['received']} of {count['expected']}, {count['missing']} missing")
     facts.add_row("came twice, out of order", f"{count['duplicates']}, {count['out_of_order']}")
@@ -213,26 +213,26 @@ def print_leaders(document: dict[str, Any], console: Console) -> None:
     what = "Single leaders" if document["count"] == 1 else f"Sets of {document['count']} leaders"
     title = f"{what}, {gain}, {law}"
     centrality = "joint centrality" if document["gain"] == "inf" else "certainty"
-    table = _table(console, title, "agents", "system error", centrality)
+    table = number_table(console, title, "agents", "system error", centrality)
     for entry in document["sets"][:_ROWS]:
-        row = (_names(entry["agents"]), _number(entry["system_error"]), _number(entry["joint_centrality"]))
+        row = (_names(entry["agents"]), number_text(entry["system_error"]), number_text(entry["joint_centrality"]))
         table.add_row(*row)
     _note_cut(table, len(document["sets"]), "sets")
     console.print(table)
-    facts = _facts(console, f"Found by {_METHODS[document['method']]}")
+    facts = fact_table(console, f"Found by {_METHODS[document['method']]}")
     facts.add_row("system errors computed", str(document["evaluations"]))
     bound, gap = document["bound"]["system_error"], document["bound"]["gap"]
     if gap is not None and gap < 1e-8:
         facts.add_row("guarantee", "the best set there is")
     elif bound is not None:
         above = "" if gap is None else f": this one is at most {100 * gap:.3g} % above the best"
-        facts.add_row("guarantee", f"no set has less than {_number(bound)}{above}")
+        facts.add_row("guarantee", f"no set has less than {number_text(bound)}{above}")
     else:
         facts.add_row("guarantee", f"none: {document['note']}")
     console.print(facts)
 
 
-def _table(console: Console, title: str, first: str, *numbers: str) -> Table:
+def number_table(console: Console, title: str, first: str, *numbers: str) -> Table:
     """A table under its heading: one column of names, the others of numbers."""
     console.print(Text(title, style="bold"))
     table = Table(box=box.SIMPLE_HEAD)
@@ -242,7 +242,7 @@ def _table(console: Console, title: str, first: str, *numbers: str) -> Table:
     return table
 
 
-def _facts(console: Console, title: str) -> Table:
+def fact_table(console: Console, title: str) -> Table:
     """A table of names and what they are, under its heading."""
     console.print(Text(title, style="bold"))
     table = Table(box=box.SIMPLE, show_header=False)
@@ -256,7 +256,8 @@ def _note_cut(table: Table, total: int, what: str) -> None:
         table.caption = f"{total - _ROWS} more {what}: use --json"
 
 
-def _number(value: float | None) -> str:
+def number_text(value: float | None) -> str:
+    """Six digits; a dash for what is undefined."""
     return "-" if value is None else f"{value:.6g}"
 
 
@@ -277,7 +278,7 @@ def _mark(test: dict[str, Any]) -> Text:
 def _interval(interval: Sequence[float | None] | None) -> str:
     if not interval or None in interval:
         return "-"
-    return f"{_number(interval[0])} .. {_number(interval[1])}"
+    return f"{number_text(interval[0])} .. {number_text(interval[1])}"
 
 
 def _short(value: Any) -> str:

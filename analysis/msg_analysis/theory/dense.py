@@ -13,6 +13,7 @@ import scipy.linalg
 
 from msg_analysis.errors import InputError
 from msg_analysis.theory import symmetric
+from msg_analysis.theory.operators import mode_operators
 from msg_analysis.theory.report import MAX_RELATIVE_ERROR, SolverReport, singular_message
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
@@ -48,7 +49,7 @@ class DenseSolver:
                 f"which a dense solve needs about {24e-9 * (n * p) ** 2:.1f} GB; at most {MAX_UNKNOWNS} are "
                 "solved: leave the choice of the method to the program, or use fewer agents or graphs"
             )
-        local, flow = _local_operators(system), system.chain.T
+        local, flow = mode_operators(system), system.chain.T
         matrix = np.zeros((n, p, n, p))
         for j in range(n):
             if system.time == "continuous":
@@ -107,26 +108,6 @@ class DenseSolver:
         # Not ">": a number that is not finite must not pass.
         if self._matrix.size and not backward <= MAX_RELATIVE_ERROR * self._condition:
             raise InputError(singular_message(f" (reciprocal condition {self._condition:.1e})"))
-
-
-def _local_operators(system: JumpSystem) -> FloatArray:
-    """(n, p, p) matrices of C -> Z C + C Z^T, or of C -> C - K[C]."""
-    if system.time == "continuous":
-        return np.stack([symmetric.lyapunov(z) for z in system.matrices])
-    return np.eye(symmetric.size(system.dimension)) - step_operators(system)
-
-
-def step_operators(system: JumpSystem) -> FloatArray:
-    """(n, p, p) matrices of C -> K_j[C] = E[W C W^T | mode j] on packed C. Discrete time."""
-    operators = np.stack([symmetric.congruence(w) for w in system.matrices])
-    if system.loss_variance is not None:
-        lift = system.lift
-        entering = symmetric.pack(lift[:, :, None] * lift[:, None, :])  # (m, p): e_i e_i^T in reduced coordinates
-        differences = lift[:, None, :] - lift[None, :, :]
-        for mode, variance in enumerate(system.loss_variance):
-            seen = np.einsum("ij,ija,ijb->iab", variance, differences, differences)
-            operators[mode] += entering.T @ symmetric.pack(seen)
-    return operators
 
 
 def _reciprocal_condition(factors: FloatArray, norm: float) -> float:

@@ -37,11 +37,6 @@ def unpack(vectors: FloatArray, d: int) -> FloatArray:
     return matrices
 
 
-def congruence(matrix: FloatArray) -> FloatArray:
-    """(p, p) matrix of C -> W C W^T."""
-    return product(matrix, matrix)
-
-
 def lyapunov(matrix: FloatArray) -> FloatArray:
     """(p, p) matrix of C -> Z C + C Z^T."""
     return 2.0 * product(matrix, np.eye(len(matrix)))
