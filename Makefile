@@ -10,7 +10,7 @@ RUNS := runs
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 LOCAL := --no-index --no-deps --no-build-isolation
 
-.PHONY: help setup demo test test-fast lint format bench docs colcon lock clean
+.PHONY: help setup demo test test-fast stress lint format bench docs colcon lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -40,6 +40,9 @@ test: setup ## Run all tests
 
 test-fast: setup ## Run the tests that start no network
 	$(BIN)/python -m pytest -m "not integration"
+
+stress: setup ## Repeat every random fault 20 times: about an hour and a half
+	STRESS=20 $(BIN)/python -m pytest tests/integration/test_kill.py tests/integration/test_restart.py tests/integration/test_faults.py
 
 lint: setup ## Check style and types
 	$(BIN)/ruff check

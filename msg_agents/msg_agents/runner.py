@@ -119,7 +119,7 @@ def run_network(
                 _collect_failures(supervisor, result, interrupted)
             if bag is not None:
                 _settle(bag, result)
-                shutil.copytree(folder, bag / "log", ignore=shutil.ignore_patterns(CHECKPOINTS))
+                _keep_logs(folder, bag / "log", result)
     finally:
         if bag is not None:
             with suppress(OSError):
@@ -171,6 +171,16 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interrupted: li
     for child in supervisor.failures:
         words = child.last_words()
         result.failures.append(f"{child.plan.name}: {child.failure}" + (f": {words}" if words else ""))
+
+
+def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
+    try:
+        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(CHECKPOINTS))
+    except OSError as error:
+        # Of a tree, the error is a list of (from, to, why).
+        reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)
+        shutil.rmtree(directory, ignore_errors=True)
+        result.failures.append(f"the logs of the processes could not be kept: {reason}")
 
 
 def _settle(bag: Path, result: RunResult) -> None:

@@ -37,6 +37,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.integration)
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Tests of random faults take a ``repetition``: once by default, as often as ``make stress`` says otherwise."""
+    if "repetition" in metafunc.fixturenames:
+        metafunc.parametrize("repetition", range(int(os.environ.get("STRESS", "1"))))
+
+
 def document(**changes: Any) -> dict[str, Any]:
     """Five agents on a line and a ring; ``run`` is merged, other keys are replaced."""
     run = {"dt": 0.05, "duration": 15, "replicas": 2, "seed": 7} | changes.pop("run", {})

@@ -20,11 +20,11 @@ LOG = logging.getLogger(__name__)
 @pytest.mark.parametrize("when", ["early", "middle"])
 @pytest.mark.parametrize("kind", ["agent", "switcher", "recorder"])
 def test_killed_child(
-    network: Any, kind: str, when: str, record_property: Any, caplog: pytest.LogCaptureFixture
+    network: Any, kind: str, when: str, repetition: int, record_property: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Early: between the birth of the child and, likely, the first state. Middle: while states are recorded."""
     caplog.set_level(logging.INFO)
-    rng = random.Random(f"{kind} {when}")
+    rng = random.Random(f"{kind} {when} {repetition}")
     run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs")
     network.wait_for(lambda: len(network.nodes()) == 4, 60, "four children")
     if when == "middle":

@@ -6,6 +6,7 @@ import json
 import random
 import re
 import signal
+import time
 from typing import Any
 
 import pytest
@@ -19,12 +20,13 @@ MIDDLING = {"duration": 250, "replicas": 64, "processes": 3}
 
 
 @pytest.mark.parametrize("kinds", [["agent"], ["switcher"], ["agent", "switcher", "agent"]], ids=" ".join)
-def test_killed_children_come_back(network: Any, kinds: list[str]) -> None:
-    rng = random.Random(" ".join(kinds))
+def test_killed_children_come_back(network: Any, kinds: list[str], repetition: int) -> None:
+    rng = random.Random(f"{kinds} {repetition}")
     run = network.start(
         "run", network.file(run=MIDDLING), "--out", network.directory / "runs", "--restarts", "5", "--json"
     )
     network.wait_until_moving()
+    time.sleep(rng.uniform(0.0, 0.5))
     for kind in kinds:
         victims = network.wait_for(lambda kind=kind: network.processes(kind), 30, f"a living {kind}")
         rng.choice(victims).kill(signal.SIGKILL)

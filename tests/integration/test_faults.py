@@ -1,0 +1,69 @@
+"""A recorder that stands still, and a disk that is full."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msg_agents.check import check
+from msg_analysis.bags.reader import read_bag
+
+PAUSE = 10.0  # s
+
+
+def test_stopped_recorder(network: Any, repetition: int) -> None:
+    """At full speed everybody waits for it in the end, and nothing is lost."""
+    rng = random.Random(f"stopped {repetition}")
+    file = network.file(run={"duration": 600, "processes": 2})
+    run = network.start("run", file, "--out", network.directory / "runs", "--json")
+    network.wait_until_moving()
+    time.sleep(rng.uniform(0.0, 1.0))
+    (recorder,) = network.processes("recorder")
+    recorder.kill(signal.SIGSTOP)
+    time.sleep(PAUSE)
+    recorder.kill(signal.SIGCONT)
+    stdout, stderr = run.communicate(timeout=120)
+    assert run.returncode in (0, 1), stderr  # by chance one run in a hundred disagrees
+    trajectory = read_bag(json.loads(stdout)["bag"])
+    assert trajectory.completeness.complete
+    assert trajectory.completeness.duplicates == 0
+    assert check(trajectory).difference is None
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of its own, of 1 MB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", disk], capture_output=True, check=False)
+    if mount.returncode:
+        pytest.skip("cannot mount a small file system here: not root")
+    try:
+        yield disk
+    finally:
+        subprocess.run(["umount", "--lazy", disk], check=True)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_full_disk(network: Any, small_disk: Path) -> None:
+    """The run ends, says why, and what was written can be read."""
+    file = network.file(run={"duration": 10_000, "processes": 2})
+    run = network.start("run", file, "--out", small_disk)
+    _, stderr = run.communicate(timeout=120)
+    assert run.returncode == 3, stderr
+    assert "Traceback" not in stderr
+    assert re.search(r"^failed: recorder: .*No space left on device", stderr, re.MULTILINE), stderr
+    assert network.processes() == []
+    (bag,) = (path for path in small_disk.iterdir() if path.is_dir())
+    trajectory = read_bag(bag)
+    assert trajectory.completeness.received > 1000
+    assert check(trajectory).difference is None
