@@ -1,9 +1,9 @@
 """How fast second moments are computed: side by side with dense formulas and with one Lyapunov solve per graph.
 
 One thread of linear algebra. Graphs are rings with random chords, m of them; rates are random, about 1, and
-symmetric; F = I. Every row is measured in this run; times are the best of a few, memory is the peak of a process of
-its own. Prints Markdown: the comparisons, then the cost over m and n with fitted exponents; takes about two
-minutes (--quick: a quarter of one). --plot FILE.svg draws the cost.
+symmetric; F = I. Every row is measured in this run; times are the best of a few, beside scipy medians of calls in turn;
+memory is the peak of a process of its own. Prints Markdown: the comparisons, then the cost over m and n with fitted
+exponents; takes about two minutes (--quick: a quarter of one). --plot FILE.svg draws the cost.
 """
 
 from __future__ import annotations
@@ -117,6 +117,13 @@ def best(function: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
+def side_by_side(one: Callable[[], object], other: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Median seconds of two functions that are called in turn, so that disturbances meet both."""
+    pairs = [(best(one, 1), best(other, 1)) for _ in range(repeats)]
+    first, second = np.median(pairs, axis=0)
+    return float(first), float(second)
+
+
 def alone(agents: int, graphs: int, when: Time) -> tuple[float, float, int]:
     """(seconds, peak memory in GB, iterations) of one solve; to be called in a fresh process."""
     with threadpool_limits(1):
@@ -157,8 +164,11 @@ def comparisons(*, quick: bool) -> Iterator[str]:
     agents = 100 if quick else 300
     for when in whens:
         system = Network.random(agents, 5).system(when)
-        seconds = best(lambda system=system: steady(system), 3)  # type: ignore[misc]
-        other = best(lambda system=system: uncoupled(system), 1)  # type: ignore[misc]
+        seconds, other = side_by_side(
+            lambda system=system: steady(system),  # type: ignore[misc]
+            lambda system=system: uncoupled(system),  # type: ignore[misc]
+            7,
+        )
         rival = f"scipy `solve_{when}_lyapunov`, 5 graphs uncoupled"
         yield row(f"{agents} agents, 5 graphs, {when}", seconds, rival, other)
     if not quick:

@@ -26,6 +26,7 @@ from scipy.sparse.csgraph import connected_components
 
 from msg_analysis.errors import InputError
 from msg_analysis.theory.averaged import AveragedEquations, suitable
+from msg_analysis.theory.krylov import STRIP, flat, norms, strips
 from msg_analysis.theory.local import LocalSolves, single
 from msg_analysis.theory.loss import lost, lost_adjoint
 from msg_analysis.theory.report import MAX_RELATIVE_ERROR, singular_message
@@ -142,15 +143,14 @@ class CoupledEquations:
         """(A X, size): as accurately as rounding lets it be, and (q, n) norms of what was added up."""
         total, moved = self._local(x)
         if self.leaving.max() <= FAST * self.decay.mean():
-            total += self.leaving[:, None, None] * moved
-            total -= self._mixed(moved)
+            _subtract_combined(total, self.rates - np.diag(self.leaving), moved)
         else:
             for i in range(self.system.modes):
                 for j in np.flatnonzero(self.rates[i]):
                     total[:, i] -= self.rates[i, j] * (moved[:, j] - moved[:, i])
-        size = 2.0 * np.linalg.norm(self.drift, axis=(1, 2)) + self.leaving
-        norms = np.linalg.norm(x, axis=(2, 3))
-        return total, size * norms + norms @ self.rates.T
+        size = 2.0 * norms(self.drift[None])[0] + self.leaving
+        given = norms(x)
+        return total, size * given + given @ self.rates.T
 
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(Z, A Z) for Z near A^-1 R."""
@@ -196,14 +196,15 @@ class CoupledEquations:
         half = drift @ x
         if "modes" in self.__dict__:
             half = self.modes.without_null(half)
-        local = half + half.swapaxes(-1, -2)
         if self.system.time == "continuous":
-            return local, x
+            return _plus_transposes(half), x
         squared = half @ drift.transpose(0, 2, 1)
-        local -= 0.5 * (squared + squared.swapaxes(-1, -2))
+        squared *= -0.5
+        squared += half
+        local = _plus_transposes(squared)
         if self.system.loss_variance is not None:
             local -= self._lost(x)
-        return local, x - local
+        return local, np.subtract(x, local, out=half)
 
     def moved(self, x: FloatArray) -> FloatArray:
         """K[X], or its adjoint. Discrete time."""
@@ -211,6 +212,8 @@ class CoupledEquations:
 
     def after_jump(self, y: FloatArray) -> FloatArray:
         """sum_j T_ij Y_j. Discrete time."""
+        if (y == y[:, :1]).all():
+            return y
         return np.asarray(self._mixed(y) + (1.0 - self.leaving)[:, None, None] * y)
 
     def _mixed(self, y: FloatArray) -> FloatArray:
@@ -232,6 +235,22 @@ def _combined(factors: FloatArray, stack: FloatArray) -> FloatArray:
     return np.asarray(factors @ stack.reshape(q, n, d * d)).reshape(q, len(factors), d, d)
 
 
+def _plus_transposes(stack: FloatArray) -> FloatArray:
+    """X + X^T of every matrix; large ones in place and one after the other, to stay in the caches."""
+    if stack[0, 0].size <= STRIP:
+        return stack + stack.swapaxes(-1, -2)
+    for place in np.ndindex(stack.shape[:2]):
+        stack[place] += stack[place].T
+    return stack
+
+
+def _subtract_combined(total: FloatArray, factors: FloatArray, stack: FloatArray) -> None:
+    """Subtract sum_j factors[i, j] stack[:, j]; piece by piece, since fresh memory costs as much as a product."""
+    total, stack = flat(total), flat(stack)
+    for part in strips(total.shape[-1]):
+        total[..., part] -= factors @ stack[..., part]
+
+
 def _off_diagonal(chain: FloatArray) -> FloatArray:
     rates = chain.copy()
     np.fill_diagonal(rates, 0.0)
@@ -242,11 +261,12 @@ def _drift(system: JumpSystem) -> FloatArray:
     """(n, d, d): Z or I - W; symmetric to the last bit if it is but for rounding."""
     matrices = system.matrices
     d = system.dimension
-    rows = np.linalg.norm(matrices, axis=2)
-    rounding = 16.0 * np.sqrt(d) * float(np.finfo(float).eps) * (rows[:, :, None] + rows[:, None, :])
-    drift = matrices if system.time == "continuous" else np.eye(d) - matrices
-    if (np.abs(matrices - matrices.transpose(0, 2, 1)) <= rounding).all():
-        drift = 0.5 * (drift + drift.transpose(0, 2, 1))
+    drift = matrices.copy() if system.time == "continuous" else np.eye(d) - matrices
+    rows = 16.0 * np.sqrt(d) * float(np.finfo(float).eps) * np.linalg.norm(matrices, axis=2)
+    # One matrix after the other, to stay in the caches.
+    if all((np.abs(w - w.T) <= rounding[:, None] + rounding).all() for w, rounding in zip(matrices, rows, strict=True)):
+        for matrix in drift:
+            matrix[:] = 0.5 * (matrix + matrix.T)
     return drift
 
 

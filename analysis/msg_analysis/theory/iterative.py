@@ -12,7 +12,14 @@ import numpy as np
 from msg_analysis.errors import InputError
 from msg_analysis.theory.averaged import AveragedEquations
 from msg_analysis.theory.equations import CoupledEquations
-from msg_analysis.theory.krylov import Equations, conjugate_gradients, gmres, weighted_norm
+from msg_analysis.theory.krylov import (
+    Equations,
+    conjugate_gradients,
+    gmres,
+    norms,
+    plain_conjugate_gradients,
+    weighted_norm,
+)
 from msg_analysis.theory.report import MAX_RELATIVE_ERROR, Method, Preconditioner, SolverReport, singular_message
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
@@ -24,6 +31,9 @@ MAX_ITERATIONS = 600
 
 MAX_CHEAP = 30
 """Iterations in which the cheaper preconditioner must gain six digits, or be given up."""
+
+FINEST = 5e-7
+"""Residual to which single precision is driven there, relative: two cycles of it do."""
 
 MAX_AMPLIFICATION = 1e14
 """Of the right-hand side by the solution, in units of the averaged decay: the condition, from below."""
@@ -59,7 +69,7 @@ class IterativeSolver:
             right = self._equations.after_jump(right)
         weights = system.stationary[:, None, None]
         x, self.report = _solve(self._equations, right, None if self._guess is None else self._guess[None] / weights)
-        return np.asarray(weights * x[0])
+        return np.asarray(np.multiply(weights, x[0], out=x[0]))
 
     def dual(self, forms: FloatArray) -> FloatArray:
         """See ``MomentSolver.dual``."""
@@ -80,55 +90,60 @@ class IterativeSolver:
 
 def _solve(equations: CoupledEquations, right: FloatArray, guess: FloatArray | None) -> tuple[FloatArray, SolverReport]:
     """Solve A X = B for (q, n, d, d) right-hand sides."""
-    start = np.zeros_like(right) if guess is None else 0.5 * (guess + guess.swapaxes(-1, -2))
+    x = None if guess is None or not guess.any() else 0.5 * (guess + guess.swapaxes(-1, -2))
     if equations.averaged is not None:
-        x, report = _by_average(equations, equations.averaged, right, start)
+        x, report = _by_average(equations, equations.averaged, right, x)
         if not report.error <= TOLERANCE:
-            x, report = _by_graphs(equations, right, x if np.isfinite(x).all() else start, report.iterations)
+            x, report = _by_graphs(equations, right, x if np.isfinite(x).all() else None, report.iterations)
     else:
-        x, report = _by_graphs(equations, right, start, 0)
+        x, report = _by_graphs(equations, right, x, 0)
     # Not ">": a number that is not finite must not pass.
     if not report.error <= MAX_RELATIVE_ERROR:
         raise InputError(singular_message(f", or too ill-conditioned ({report.iterations} iterations do not converge)"))
     size = (equations.decay * np.abs(np.diagonal(x, axis1=2, axis2=3))).max(initial=0.0)
     if not size <= MAX_AMPLIFICATION * np.abs(right).max(initial=0.0):
         raise InputError(singular_message(f" (amplification {size / np.abs(right).max():.1e})"))
-    return 0.5 * (x + x.swapaxes(-1, -2)), report
+    for place in np.ndindex(x.shape[:2]):
+        x[place] = 0.5 * (x[place] + x[place].T)
+    return x, report
 
 
 def _by_average(
-    equations: CoupledEquations, averaged: AveragedEquations, right: FloatArray, x: FloatArray
+    equations: CoupledEquations, averaged: AveragedEquations, right: FloatArray, guess: FloatArray | None
 ) -> tuple[FloatArray, SolverReport]:
     """With the cheaper preconditioner, until it is done or does not keep its promise."""
-    method, iterations, before, left, backward = _method(definite=averaged.definite), 0, np.inf, 1.0, 1.0
+    method, iterations, before = _method(definite=averaged.definite), 0, np.inf
+    x, known = np.zeros_like(right) if guess is None else guess, guess is not None
     while True:
-        residual = right
-        if x.any():
-            residual, left, backward = _residual(equations, right, x)
-        scaled, scale = _scaled(residual)
-        scaled = averaged.enter(scaled)
-        if residual is not right:
-            error = _error(averaged.precondition(scaled)[0] * scale, x)
+        residual, left, backward = _residual(equations, right, x) if known else (right, 1.0, 1.0)
+        scale = _scale(residual)
+        inside, error = averaged.enter(residual, scale), np.ones(len(x))
+        del residual  # memory that is used again need not be cleared
+        if known:
+            error = _error(averaged.solution(inside), x, scale)
             iterations += 1
-        else:
-            error = np.ones(len(x))
         worst = float(error.max(initial=0.0))
         if worst <= TOLERANCE or not worst <= 1e-3 * before:
             return x, SolverReport(method, "averaged", iterations, left, backward, worst)
-        size = weighted_norm(x, equations.weights) / scale[:, 0, 0, 0]
-        change, used = _improved(averaged, scaled, size, error, MAX_CHEAP)
-        x = x + averaged.leave(change) * scale
-        iterations, before = iterations + used, worst
+        enough = np.clip(0.5 * TOLERANCE / np.maximum(error, TOLERANCE), FINEST, 0.1)
+        if averaged.definite:
+            change, used = plain_conjugate_gradients(averaged.apply, inside, enough, MAX_CHEAP)
+        else:
+            change, used = gmres(averaged, inside, enough, MAX_CHEAP)
+        averaged.leave(change, scale, x)
+        iterations, before, known = iterations + used, worst, True
 
 
 def _by_graphs(
-    equations: CoupledEquations, right: FloatArray, x: FloatArray, iterations: int
+    equations: CoupledEquations, right: FloatArray, x: FloatArray | None, iterations: int
 ) -> tuple[FloatArray, SolverReport]:
     """With the two-level preconditioner, until nothing gets better."""
     inner = equations.inner
     method: Method = "direct" if equations.direct else _method(definite=inner.definite)
     preconditioner: Preconditioner = "none" if equations.direct else "two-level"
-    residual, error, before, known = right, np.ones(len(right)), np.inf, bool(x.any())
+    known = x is not None
+    x = np.zeros_like(right) if x is None else x
+    residual, error, before = right, np.ones(len(right)), np.inf
     while True:
         if known:
             residual, left, backward = _residual(equations, right, x)
@@ -165,27 +180,34 @@ def _improved(
 
 def _residual(equations: CoupledEquations, right: FloatArray, x: FloatArray) -> tuple[FloatArray, float, float]:
     """B - A X, in double precision; its norm relative to B, and to all that was added up."""
-    moved, terms = equations.apply(x)
-    residual = right - moved
-    given, left = np.linalg.norm(right, axis=(2, 3)), np.linalg.norm(residual, axis=(2, 3))
+    residual, terms = equations.apply(x)
+    np.subtract(right, residual, out=residual)
+    given, left = norms(right), norms(residual)
     return residual, float(_ratio(left, given).max(initial=0.0)), float(_ratio(left, terms + given).max(initial=0.0))
 
 
-def _error(step: FloatArray, x: FloatArray) -> FloatArray:
-    """(q,): norm of the step relative to X, in the graph where it is largest."""
-    size = np.linalg.norm(x, axis=(2, 3))
+def _error(step: FloatArray, x: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
+    """(q,): norm of the step (times the scale) relative to X, in the graph where it is largest."""
+    size = norms(x)
     size = np.maximum(size, 1e-6 * size.max(axis=1, keepdims=True))
-    return np.asarray(_ratio(np.linalg.norm(step, axis=(2, 3)), size).max(axis=1))
+    return np.asarray(_ratio(norms(step), size).max(axis=1) * scale)
 
 
 def _method(*, definite: bool) -> Method:
     return "cg" if definite else "gmres"
 
 
+def _scale(residual: FloatArray) -> FloatArray:
+    """(q,): largest entries; 1 where there is nothing."""
+    axes = (1, 2, 3)
+    scale = np.maximum(residual.max(axis=axes, initial=0.0), -residual.min(axis=axes, initial=0.0))
+    scale[scale == 0.0] = 1.0
+    return np.asarray(scale)
+
+
 def _scaled(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Largest entry 1 for every right-hand side, and the factors."""
-    scale = np.abs(residual).max(axis=(1, 2, 3), keepdims=True)
-    scale[scale == 0.0] = 1.0
+    scale = _scale(residual)[:, None, None, None]
     return residual / scale, scale
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
+import scipy.linalg
 
 from msg_analysis.types import FloatArray
 
@@ -13,15 +15,22 @@ MAX_BASIS = 150
 
 MAX_BASIS_BYTES = 1.2e9
 
+STRIP = 8192
+"""Entries of every graph that are worked on together, to stay in the caches."""
 
-class Equations(Protocol):
+
+class Preconditioned(Protocol):
     """A X = B with a preconditioner; stacks are (q, n, d, d)."""
-
-    weights: FloatArray
-    definite: bool
 
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(Z, A Z) for Z near A^-1 R."""
+
+
+class Equations(Preconditioned, Protocol):
+    """The same with the inner product in which A may be self-adjoint."""
+
+    weights: FloatArray
+    definite: bool
 
     def average(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(Z, A Z) for a start Z from which the preconditioner acts as a symmetric one."""
@@ -62,7 +71,42 @@ def conjugate_gradients(
     return x, most
 
 
-def gmres(equations: Equations, right: FloatArray, tolerance: FloatArray, most: int) -> tuple[FloatArray, int]:
+def plain_conjugate_gradients(
+    apply: Callable[[FloatArray, float], FloatArray], right: FloatArray, tolerance: FloatArray, most: int
+) -> tuple[FloatArray, int]:
+    """(X, iterations) for A X = B without a preconditioner, in the usual inner product.
+
+    Later products may be less accurate, as the residual gets smaller (inexact Krylov methods: van den Eshof and
+    Sleijpen 2004).
+
+    Parameters
+    ----------
+    apply : (X, relative accuracy that will do) -> A X, symmetric and positive definite
+    right : (q, n, d, d) B; overwritten
+    tolerance : (q,) residuals that are small enough, relative to B
+    most : iterations
+    """
+    x, residual, p = np.zeros_like(right), right, right.copy()
+    axpy = scipy.linalg.blas.get_blas_funcs("axpy", (right,))  # in place, in one pass
+    now = _squares(right, right)
+    small = tolerance**2 * now
+    for iteration in range(1, most + 1):
+        accuracy = np.sqrt(np.divide(small, now, out=np.ones_like(now), where=now > 0.0))
+        moved = apply(p, float(accuracy.min()))
+        curvature = _squares(p, moved)
+        steps = np.divide(now, curvature, out=np.zeros_like(now), where=curvature > 0.0)
+        for k, step in enumerate(steps):
+            axpy(p[k].ravel(), x[k].ravel(), a=step)
+            axpy(moved[k].ravel(), residual[k].ravel(), a=-step)
+        before, now = now, _squares(residual, residual)
+        if (now <= small).all():
+            return x, iteration
+        p *= _broadcast(np.divide(now, before, out=np.zeros_like(now), where=before > 0.0), p)
+        p += residual
+    return x, most
+
+
+def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, most: int) -> tuple[FloatArray, int]:
     """(X, iterations) for A X = B, preconditioned from the right, without restart.
 
     Parameters
@@ -117,6 +161,21 @@ def gmres(equations: Equations, right: FloatArray, tolerance: FloatArray, most: 
     return x, used
 
 
+def flat(stack: FloatArray) -> FloatArray:
+    """(q, n, d^2)."""
+    return stack.reshape(*stack.shape[:2], -1)
+
+
+def strips(length: int) -> list[slice]:
+    """Pieces of flat stacks that stay in the caches while they are worked on."""
+    return [slice(first, first + STRIP) for first in range(0, length, STRIP)]
+
+
+def norms(a: FloatArray) -> FloatArray:
+    """(q, n): of every matrix."""
+    return np.asarray(np.sqrt(np.einsum("qnab,qnab->qn", a, a)))
+
+
 def _product(a: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray:
     """(q,): sum_i pi_i tr(A_i^T B_i)."""
     if len(a) == 1:  # BLAS is faster than einsum
@@ -127,6 +186,11 @@ def _product(a: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray:
 def weighted_norm(a: FloatArray, weights: FloatArray) -> FloatArray:
     """(q,): sqrt(sum_i pi_i |A_i|^2)."""
     return np.asarray(np.sqrt(_product(a, a, weights)))
+
+
+def _squares(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(q,): sum_i tr(A_i^T B_i)."""
+    return np.array([float(np.vdot(x, y)) for x, y in zip(a, b, strict=True)])
 
 
 def _broadcast(factors: FloatArray, like: FloatArray) -> FloatArray:

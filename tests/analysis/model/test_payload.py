@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -33,7 +34,8 @@ def test_both_laws_give_the_same_bits(data: st.DataObject) -> None:
     payloads = data.draw(st.lists(entries, min_size=terms, max_size=terms))
     drive = data.draw(entries)
     ours = payload.combine(weights, payloads, drive)
-    reference = payload.combine_with_numpy(weights, payloads, drive)
+    with np.errstate(all="ignore"):
+        reference = payload.combine_with_numpy(weights, payloads, drive)
     for mine, other in zip(struct.iter_unpack("<Q", ours), struct.iter_unpack("<Q", reference), strict=True):
         # Which of the NaNs that meet survives is the processor's choice.
         assert mine == other or all(

@@ -14,6 +14,9 @@ from hypothesis import strategies as st
 from msg_analysis.errors import InputError
 from msg_analysis.model.chain import stationary_law
 from msg_analysis.theory import equations, moments
+from msg_analysis.theory.averaged import AveragedEquations
+from msg_analysis.theory.equations import CoupledEquations
+from msg_analysis.theory.krylov import plain_conjugate_gradients
 from msg_analysis.theory.local import LocalSolves
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.system import JumpSystem, held
@@ -115,10 +118,11 @@ def test_groups_of_graphs_that_switch_fast_among_themselves(kind, fast):
 
 @pytest.mark.parametrize("dt", [None, 0.02])
 @pytest.mark.parametrize("rate", [1e-4, 0.1, 1.0, 1e3, 1e6, 1e9])
-def test_large_systems_in_single_precision_are_as_accurate(rate, dt, monkeypatch):
+@pytest.mark.parametrize("reversible", [True, False])
+def test_large_systems_in_single_precision_are_as_accurate(rate, dt, reversible, monkeypatch):
     """Both preconditioners, with products in single precision, against double precision throughout."""
     random = np.random.default_rng(4)
-    model = system(random, 90, generator(random, 3, rate, reversible=True), dt=dt)
+    model = system(random, 90, generator(random, 3, rate, reversible=reversible), dt=dt)
     solver = MomentSolver(model)
     measured, dual = solver.steady(), solver.dual(np.eye(89)[None])
     monkeypatch.setattr(equations, "SINGLE_FROM", 1000)
@@ -144,6 +148,80 @@ def test_what_is_chosen():
     assert method(system(random, 8, reversible, dt=0.05)) == ("gmres", "two-level")
     assert method(held(system(random, 8, other), 1)) == ("direct", "none")
     assert method(system(random, 90, reversible * 10)) == ("cg", "averaged")
+    assert method(system(random, 90, other * 10)) == ("gmres", "averaged")
+    assert method(system(random, 90, reversible * 10, dt=0.01)) == ("cg", "averaged")
+
+
+def test_graphs_that_rather_alternate_do_not_use_the_average():
+    """The transition matrix has a negative eigenvalue: its inverse has no positive root."""
+    slow = system(np.random.default_rng(14), 90, np.array([[-1.0, 1.0], [1.0, -1.0]]), dt=0.02)
+    chain = np.array([[0.1, 0.9], [0.9, 0.1]])
+    model = JumpSystem("discrete", slow.matrices, slow.noise, chain, slow.stationary, slow.lift)
+    solver = MomentSolver(model)
+    second = solver.steady()
+    assert solver.report.preconditioner == "two-level"
+    moved = 0.5 * model.noise + model.matrices @ second @ model.matrices.transpose(0, 2, 1)
+    np.testing.assert_allclose(np.tensordot(chain.T, moved, axes=1), second, rtol=1e-9, atol=1e-9 * second.max())
+
+
+@pytest.mark.parametrize("dt", [None, 0.01])
+@pytest.mark.parametrize("reversible", [True, False])
+def test_the_averaged_equations_are_the_equations_in_other_coordinates(dt, reversible):
+    """(I + S) U is the right-hand side that X = M^-1/2 U solves, by the equations written out."""
+    random = np.random.default_rng(15)
+    model = system(random, 14, generator(random, 3, 3.0, reversible=reversible), dt=dt)
+    averaged = AveragedEquations(CoupledEquations(model))
+    assert averaged.definite == reversible
+    inside = random.standard_normal((2, 3, 13, 13)).astype(np.float32)
+    inside += inside.swapaxes(-1, -2)
+    x, scale = np.zeros(inside.shape), np.array([1.0, 1e3])
+    averaged.leave(inside, scale, x)
+    law, z = model.stationary, model.matrices
+    weighted = law[:, None, None] * x
+    if dt is None:
+        right = z @ weighted + weighted @ z - np.einsum("ji,qjab->qiab", model.chain, weighted)
+    else:
+        right = weighted - np.einsum("ji,qjab->qiab", model.chain, z @ weighted @ z)
+    expected = averaged.enter(right / law[:, None, None], scale)
+    limit = 1e-5 * np.abs(expected).max()
+    np.testing.assert_allclose(averaged.apply(inside), expected, rtol=0, atol=limit)
+    assert averaged.definite == (np.abs(_matrix(averaged) - _matrix(averaged).T).max() < 1e-5)
+    rough = averaged.apply(inside, 1.0)
+    assert np.abs(rough - expected).max() < (limit if dt is None else 0.05 * np.abs(expected).max())
+    same = np.broadcast_to(np.eye(13), inside.shape)
+    almost = same.copy()
+    almost[:, 0, 0, 0] += 1e-9  # not recognised as equal in all graphs
+    np.testing.assert_allclose(averaged.enter(same, scale), averaged.enter(almost, scale), rtol=1e-5, atol=1e-5)
+
+
+def _matrix(averaged):
+    """I + S for diagonal unknowns: enough to see whether it is symmetric."""
+    columns = []
+    for i, a in np.ndindex(3, 13):
+        unit = np.zeros((1, 3, 13, 13), np.float32)
+        unit[0, i, a, a] = 1.0
+        columns.append(np.diagonal(averaged.apply(unit)[0], axis1=1, axis2=2).ravel().copy())
+    return np.array(columns).T
+
+
+def test_plain_conjugate_gradients_solve_several_systems_at_once():
+    """Against numpy; a right-hand side that is zero gives zero."""
+    random = np.random.default_rng(16)
+    root = random.standard_normal((18, 18))
+    matrix = root @ root.T / 18 + np.eye(18)
+    right = random.standard_normal((3, 2, 3, 3))
+    right[1] = 0.0
+    asked = []
+
+    def apply(x, accuracy):
+        asked.append(accuracy)
+        return (x.reshape(3, 18) @ matrix).reshape(x.shape)
+
+    found, used = plain_conjugate_gradients(apply, right.copy(), np.full(3, 1e-12), 50)
+    assert used == len(asked) <= 25
+    assert asked == sorted(asked)
+    np.testing.assert_allclose(found.reshape(3, 18), np.linalg.solve(matrix, right.reshape(3, 18).T).T, atol=1e-10)
+    assert plain_conjugate_gradients(apply, right.copy(), np.full(3, 1e-12), 4)[1] == 4
 
 
 PERIODIC = np.roll(np.eye(4), 1, axis=1)
