@@ -75,7 +75,9 @@ def run_agents(arguments: argparse.Namespace) -> None:
         prefer_throughput()
     rclpy.init()
     payload = bytes(68 + 8 * arguments.replicas - FRAME.size)
-    mine = range(arguments.worker, arguments.agents, arguments.processes)
+    # Neighbouring numbers share a process, as in the real network.
+    bounds = [(arguments.worker + end) * arguments.agents // arguments.processes for end in (0, 1)]
+    mine = range(*bounds)
     readers = min(2, arguments.agents - 1) + arguments.recorder
     agents = [Agent(i, arguments.agents, arguments.steps, readers, payload) for i in mine]
     spin = EventsExecutor()

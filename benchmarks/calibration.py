@@ -2,7 +2,7 @@
 
 Simulates many runs with the offline twin and compares each with its prediction. Runs that follow their law
 say how often intervals cover and how often "disagrees" is a false alarm; runs whose law differs a little from
-the one that their record claims say what the tests see. Prints Markdown; about eight minutes on one core.
+the one that their record claims say what the tests see. Prints Markdown; about ten minutes on one core.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
+from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from msg_analysis.inference.compare import Comparison, compare
@@ -22,9 +24,15 @@ from msg_analysis.twin import simulate
 
 
 def line_ring(
-    *, rate: float = 0.5, noise: float = 1.0, edge: float = 1.0, ring: float = 1.0, **run: Any
+    *,
+    rate: float = 0.5,
+    noise: float = 1.0,
+    edge: float = 1.0,
+    ring: float = 1.0,
+    air: Mapping[str, float] | None = None,
+    **run: Any,
 ) -> Mapping[str, Any]:
-    """The demo experiment, with weights of the ring's edge 1-2 and of all its edges."""
+    """The demo experiment, with weights of the ring's edge 1-2 and of all its edges, and noise on the air."""
     weights = [ring * edge, ring, ring, ring, ring]
     return {
         "name": "line_ring",
@@ -33,18 +41,20 @@ def line_ring(
             "ring": {"edges": [[i + 1, (i + 1) % 5 + 1, weight] for i, weight in enumerate(weights)]},
         },
         "switching": {"generator": [[-rate, rate], [rate, -rate]]},
-        "noise": {"process": noise},
+        "noise": {"process": noise, **(air or {})},
         "run": {"dt": 0.05, "duration": 100.0, "replicas": 4} | run,
     }
 
 
+AIR = {"broadcast": 0.5, "link": 0.5, "loss": 0.2}
 TRUE = {
     "rate 0.5, 100 units, 4 replicas": line_ring(),
     "rate 0.5, 400 units, 1 replica": line_ring(duration=400.0, replicas=1),
     "rate 0.02, 400 units, 1 replica": line_ring(rate=0.02, duration=400.0, replicas=1),
     "rate 0.02, 400 units, start at zero": line_ring(rate=0.02, duration=400.0, replicas=1, start="zero"),
+    "noise and loss on the air, rate 0.5, 100 units, 4 replicas": line_ring(air=AIR),
 }
-LONG = {"duration": 400.0, "replicas": 16}
+LONG: dict[str, Any] = {"duration": 400.0, "replicas": 16}
 FALSE = {
     "all noise 1 % larger": line_ring(noise=1.01, **LONG),
     "one of the ring's edges 5 % weaker": line_ring(edge=0.95, **LONG),
@@ -85,6 +95,21 @@ def print_calibration(runs: int) -> None:
         print(f"| {name} | {shares} |", flush=True)
 
 
+def print_evenness(runs: int) -> None:
+    """The p-values of runs with noise and loss on the air: even, if the tests are right."""
+    print("\n| noise and loss on the air | p below 5 % | p below 50 % | Kolmogorov-Smirnov p of the p-values |")
+    print("|---|---:|---:|---:|")
+    experiment = Experiment.parse(line_ring(air=AIR))
+    values: dict[str, list[float]] = {}
+    for comparison in comparisons(experiment, experiment, runs):
+        for test in comparison.tests:
+            values.setdefault(test.name, []).append(test.p)
+    for name, found in values.items():
+        p = np.array(found)
+        even = stats.kstest(p, "uniform").pvalue
+        print(f"| {name} | {100 * (p < 0.05).mean():.1f} % | {100 * (p < 0.5).mean():.1f} % | {even:.2f} |", flush=True)
+
+
 def print_power(runs: int) -> None:
     """Runs that do not."""
     print("\n| what is wrong | found | by (share of the runs) |")
@@ -102,12 +127,13 @@ def print_power(runs: int) -> None:
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print all tables."""
     parser = argparse.ArgumentParser(description="Coverage, false alarms and power of the comparison.")
     parser.add_argument("--runs", type=int, default=400, help="runs per line of the first table")
     arguments = parser.parse_args()
     with threadpool_limits(1):
         print_calibration(arguments.runs)
+        print_evenness(max(1, arguments.runs // 2))
         print_power(max(1, arguments.runs // 8))
 
 

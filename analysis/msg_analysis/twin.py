@@ -11,6 +11,7 @@ from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.law import step, weighted_sum
 from msg_analysis.model.noise import ProcessNoise
 from msg_analysis.model.path import mode_path
+from msg_analysis.model.reception import Reception, padded_inputs
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import StepModel, build_step_model
 from msg_analysis.model.streams import STEPS_PER_BLOCK, Stream, normals
@@ -69,12 +70,17 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
     modes = mode_path(experiment, model.initial)
     states = np.empty((experiment.steps + 1, *record.start.shape))
     states[0] = record.start
-    for k, state in enumerate(_states(experiment, model, modes, record.start), start=1):
+    reception = Reception(experiment, model) if experiment.noise.on_air else None
+    for k, state in enumerate(_states(experiment, model, modes, record.start, reception), start=1):
         states[k] = state
-    return Trajectory(record, states, modes, Completeness(expected := states.shape[0] * states.shape[1], expected, 0))
+    published, lost = reception.log(states, modes) if reception else (None, None)
+    expected = states.shape[0] * states.shape[1] * (1 if published is None else 2)
+    return Trajectory(record, states, modes, Completeness(expected, expected, 0), published=published, lost=lost)
 
 
-def _states(experiment: Experiment, model: StepModel, modes: IntArray, start: FloatArray) -> Iterator[FloatArray]:
+def _states(
+    experiment: Experiment, model: StepModel, modes: IntArray, start: FloatArray, reception: Reception | None
+) -> Iterator[FloatArray]:
     """x(1), x(2), ... of a path of graphs."""
     noise = ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas)
     rows = [_padded_rows(model, mode) for mode in range(model.modes)]
@@ -88,7 +94,8 @@ def _states(experiment: Experiment, model: StepModel, modes: IntArray, start: Fl
         if mode not in drives:
             drives[mode] = np.stack([of_agent[mode] for of_agent in noises], axis=1) + offsets[mode]
         weights, inputs = rows[mode]
-        state = step(weights, [state[j] for j in inputs], drives[mode][within])
+        values = reception.values(k, mode, state) if reception else [state[j] for j in inputs]
+        state = step(weights, values, drives[mode][within])
         yield state
 
 
@@ -97,11 +104,6 @@ def _padded_rows(model: StepModel, mode: int) -> tuple[list[FloatArray], list[In
 
     Adding 0 * x at the end of a row changes nothing, so every row comes out as the agent computes it alone.
     """
-    inputs = [model.inputs(mode, i) for i in range(model.agents)]
-    width = max(len(row) for row in inputs)
-    weights = np.zeros((width, model.agents, 1))
-    columns = np.zeros((width, model.agents), dtype=np.int64)
-    for i, row in enumerate(inputs):
-        weights[: len(row), i, 0] = model.weights[mode, i, row]
-        columns[: len(row), i] = row
-    return list(weights), list(columns)
+    columns, there = padded_inputs(model, mode)
+    weights = np.where(there, model.nominal[mode, np.arange(model.agents), columns], 0.0)
+    return list(weights[:, :, None]), list(columns)

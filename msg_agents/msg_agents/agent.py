@@ -3,48 +3,47 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
 from msg_agents_interfaces.msg import AgentState as AgentStateMsg
-from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.publisher import Publisher
 
 from msg_agents.checkpoint import Checkpoint
 from msg_agents.health import Health, Pace
-from msg_agents.node import (
-    GRAPH_TOPIC,
-    OTHER_RUN,
-    PROGRESS_TOPIC,
-    NetworkNode,
-    agent_name,
-    resend_topic,
-    state_topic,
-)
-from msg_agents.qos import LATCHED, STREAM
+from msg_agents.network import RECORDER
+from msg_agents.node import OTHER_RUN, NetworkNode, agent_name, longest_heard, state_topic, truth_topic
+from msg_agents.qos import STREAM
 from msg_agents.synchronizer import WINDOW, Synchronizer
-from msg_analysis.bags.cdr import ActiveGraph, CdrError, StateCodec, StateFrame
+from msg_analysis.bags.cdr import ActiveGraph, StateCodec, StateFrame, with_state
 from msg_analysis.errors import InputError
-from msg_analysis.model.agent import AgentLaw
+from msg_analysis.model.agent import agent_law
 from msg_analysis.model.payload import all_finite
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import StepModel
 
-PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages
+if TYPE_CHECKING:
+    from msg_agents.group import AgentGroup
+
 NOT_FINITE = "a state that is not finite"
 
 
 class Agent(NetworkNode):
     """Moves numbers between topics, the synchronizer and the law.
 
+    Others hear ``state``. With broadcast noise that is not the truth, which then goes to ``truth``, for the log.
+
     Parameters
     ----------
     record : of the run
     model : its step model
     agent : index from 0
+    peers : every other agent that it hears or is heard by, ascending
+    colleagues : the agents of its process, itself included
     readers : names of the nodes, besides the other agents, that must read the states before the run starts
     checkpoints : directory that keeps what it has published, from which it goes on if it has been there before
+    group : to which it belongs
     """
 
     def __init__(
@@ -53,51 +52,69 @@ class Agent(NetworkNode):
         record: RunRecord,
         model: StepModel,
         agent: int,
-        readers: list[str],
-        checkpoints: Path | None = None,
+        peers: Sequence[int],
+        colleagues: Collection[int],
+        readers: Sequence[str],
+        checkpoints: Path | None,
+        group: AgentGroup,
     ) -> None:
         super().__init__(agent_name(agent), record=record)
         experiment = record.experiment
-        self._law = AgentLaw(record, model, agent)
+        self._law = agent_law(record, model, agent)
         self._codec = StateCodec(self.run, agent + 1, experiment.run.replicas, experiment.step_length)
-        self._frame = StateFrame(self.run, experiment.run.replicas)
+        self._frame = StateFrame(self.run, experiment.run.replicas, longest_heard(record))
         self._published = Checkpoint(checkpoints and checkpoints / f"{agent_name(agent)}.states", self._frame.size)
         self._take_over()
-        listens = model.listens()
-        self._peers = [j for j in range(model.agents) if listens[agent, j] or listens[j, agent]]
+        self._group = group
+        self._turns = group.turns
         self._synchronizer: Synchronizer[bytes] = Synchronizer(
             agent=agent,
             steps=experiment.steps,
             inputs=[self._law.neighbours(mode) for mode in range(model.modes)],
-            peers=self._peers,
+            peers=peers,
             start=self._law.step,
         )
-        self._expected = [agent_name(j) for j in self._peers] + readers
+        near = set(peers).intersection(colleagues)
+        self._far = [j for j in peers if j not in near]
+        self._near = [j for j in peers if j in near]
+        self._listeners: list[Callable[[int, int, bytes], None]] = []
+        self._expected = [*map(agent_name, self._far), *readers]
         self._next_progress = 0.0
         self._pace = Pace()
-        self._resend: dict[int, Publisher] = {}
         self._states = self.create_publisher(AgentStateMsg, state_topic(agent), STREAM)
-        self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
-        self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._receive_graph, LATCHED, raw=True)
-        self.create_subscription(ProgressMsg, resend_topic(agent), self._receive_resend, LATCHED, raw=True)
-        for j in self._peers:
+        self._truth: Publisher | None = None
+        if experiment.noise.broadcast:
+            self._truth = self.create_publisher(AgentStateMsg, truth_topic(agent), STREAM)
+            self._awaits_truth = [name for name in readers if name == RECORDER]  # others may do with what all hear
+        for j in self._far:
             self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), STREAM, raw=True)
-        self.leave_at_end()
+
+    def meet(self, colleagues: Mapping[int, Agent]) -> None:
+        """Get to know the agents of the same process, by index, so as to hand them the state directly."""
+        self._listeners = [colleagues[j].hear for j in self._near]
+
+    def found(self) -> bool:
+        """See NetworkNode."""
+        return self.has_readers(self._states, self._expected) and (
+            self._truth is None or self.has_readers(self._truth, self._awaits_truth)
+        )
 
     def awaited(self) -> list[str]:
         """See NetworkNode."""
-        return self.missing_readers(self._states, self._expected)
+        missing = self.missing_readers(self._states, self._expected)
+        if self._truth is not None:
+            missing += self.missing_readers(self._truth, self._awaits_truth)
+        return missing
 
     def begin(self) -> None:
         """Publish x(0), or, after another process, all that may have been under way when that one went."""
         if self._law.step:
-            for _, message in self._published.read():
-                self.publish(self._states, message)
+            self.send_again(0)
             self._ask_again()
         else:
             self._publish_state(0)
         self._report()
-        self._advance()
+        self._turns.join(self)
 
     def _take_over(self) -> None:
         """Go on where a process before this one has been, if there was one."""
@@ -113,23 +130,33 @@ class Agent(NetworkNode):
             self._law.resume(step, frame[3])
 
     def _publish_state(self, mode: int) -> None:
-        message = self._codec.wrap(self._law.step, mode, self._law.state)
-        self._published.write(self._law.step, message)
+        law = self._law
+        message = self._codec.wrap(law.step, mode, law.state, law.heard)
+        self._published.write(law.step, message)
+        self._send(law.step, law.state, message)
+
+    def _send(self, step: int, state: bytes, message: bytes) -> None:
+        """Send a state: as it is, for the log, and as others hear it."""
+        if self._truth is not None:
+            self.publish(self._truth, message)
+            state = self._law.published(step, state)
+            message = with_state(message, state)
         self.publish(self._states, message)
+        for hear in self._listeners:
+            hear(self._law.agent, step, state)
+
+    def send_again(self, since: int) -> None:
+        """Send what was sent from a step on, as far as it is kept: the truth, from which follows what others hear."""
+        for step, message in self._published.read(since):
+            frame = self._frame.unwrap(message)
+            assert frame is not None, "of our own making"
+            self._send(step, frame[3], message)
 
     def _ask_again(self) -> None:
-        """Ask every peer for what it sent since the last step at which it can have been behind."""
+        """Ask every peer of another process for what it sent since the last step at which it can have been behind."""
         since = max(0, self._law.step - WINDOW - 1)
-        for j in self._peers:
-            if j not in self._resend:  # hardly ever needed; latched, so that it does not matter when it is matched
-                self._resend[j] = self.create_publisher(ProgressMsg, resend_topic(j), LATCHED)
-            self.publish(self._resend[j], self.progress(j + 1, since))
-
-    def _receive_resend(self, data: bytes) -> None:
-        request = self.decode_progress(data, resend_topic(self._law.agent))
-        if request is not None and request.agent == self._law.agent + 1:
-            for _, message in self._published.read(request.step):
-                self.publish(self._states, message)
+        for j in self._far:
+            self._group.ask_again(j, since)
 
     def health(self) -> Health:
         """See NetworkNode. Whoever does not get on says what he waits for, and asks for it again."""
@@ -151,6 +178,7 @@ class Agent(NetworkNode):
         unwrap = self._frame.unwrap
         offer = self._synchronizer.offer
         ready = self._synchronizer.ready
+        ask = self._turns.ask
         topic = state_topic(peer)
 
         def receive(data: bytes) -> None:
@@ -163,26 +191,23 @@ class Agent(NetworkNode):
             if reason:
                 self.refuse(reason, topic)
             elif ready():
-                self._advance()
+                ask(self)
 
         return receive
 
-    def _receive_graph(self, data: bytes) -> None:
-        try:
-            graph = ActiveGraph.decode(data)
-        except CdrError as error:
-            self.refuse(str(error), GRAPH_TOPIC)
-            return
-        if graph.run != self.run:
-            self.refuse(OTHER_RUN, GRAPH_TOPIC)
-            return
-        reason = self._synchronizer.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step)
-        if reason:
-            self.refuse(reason, GRAPH_TOPIC)
-        else:
-            self._advance()
+    def hear(self, peer: int, step: int, state: bytes) -> None:
+        """Take x_peer(step) from an agent of the same process."""
+        if not self._synchronizer.offer(peer, step, state) and self._synchronizer.ready():
+            self._turns.ask(self)
 
-    def _advance(self) -> None:
+    def learn(self, graph: ActiveGraph) -> str | None:
+        """Take note of a sojourn; None, or why not."""
+        reason = self._synchronizer.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step)
+        if not reason and self._synchronizer.ready():
+            self._turns.ask(self)
+        return reason
+
+    def advance(self) -> None:
         """Make every step that can be made."""
         synchronizer, law = self._synchronizer, self._law
         while synchronizer.ready():
@@ -194,5 +219,5 @@ class Agent(NetworkNode):
                 self._report()
 
     def _report(self) -> None:
-        self.publish(self._progress, self.progress(self._law.agent + 1, self._law.step))
-        self._next_progress = time.monotonic() + PROGRESS_PERIOD
+        self._group.report(self._law.agent, self._law.step)
+        self._next_progress = time.monotonic() + self._group.progress_period

@@ -17,7 +17,8 @@ MOST, LEAST, ROOM = 6000, 256, 1 << 24
 """States kept of each agent: as many as find room [bytes], between these. More than the 5,000 that a reader may be
 behind (what the middleware keeps of a writer), where that is possible; and always more than agents may be apart."""
 
-_MARK = struct.Struct("<Q")  # step + 1, written after the message: 0 or an older step's mark until it is whole
+# Length of the message, and step + 1, written after it: 0 or an older step's mark until it is whole.
+_MARK = struct.Struct("<QQ")
 
 
 class Checkpoint:
@@ -26,7 +27,7 @@ class Checkpoint:
     Parameters
     ----------
     path : of the file; made if there is none. None: in memory, for this process only
-    size : bytes of every message
+    size : bytes of the longest message
 
     Raises
     ------
@@ -56,22 +57,22 @@ class Checkpoint:
     def write(self, step: int, message: bytes) -> None:
         """Keep the message of a step; steps must come one after the other."""
         start = step % self._capacity * self._slot
-        end = start + self._size
-        self._map[start:end] = message
-        _MARK.pack_into(self._map, end, step + 1)
+        self._map[start : start + len(message)] = message
+        _MARK.pack_into(self._map, start + self._size, len(message), step + 1)
 
     def read(self, first: int = 0) -> list[tuple[int, bytes]]:
         """(step, message) of the newest unbroken row of steps, from a first one on, ascending.
 
         The slot after the newest is left out: it may be torn.
         """
-        marks = [_MARK.unpack_from(self._map, slot * self._slot + self._size)[0] for slot in range(self._capacity)]
-        newest = max(marks) - 1
+        marks = [_MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self._capacity)]
+        newest = max(mark for _, mark in marks) - 1
         found: list[tuple[int, bytes]] = []
         for step in range(newest, max(first - 1, newest - self._capacity + 1, -1), -1):
             slot = step % self._capacity
-            if marks[slot] != step + 1:
+            length, mark = marks[slot]
+            if mark != step + 1:
                 break
             start = slot * self._slot
-            found.append((step, self._map[start : start + self._size]))
+            found.append((step, self._map[start : start + length]))
         return found[::-1]

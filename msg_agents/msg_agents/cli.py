@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import msg_agents
+from msg_agents.environment import DISCOVERY_TIMEOUT
 from msg_analysis.console import CommandGroup, examples, result_console
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from msg_analysis.model.record import RunRecord
 
 DISAGREES, INCOMPLETE = 1, 3
-DISCOVERY_TIMEOUT = 30.0  # s
 
 
 @click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -270,13 +270,12 @@ def agent(
         raise InputError(f"--agent: {list(agents)}: expected each agent once")
 
     def nodes() -> list[NetworkNode]:
-        from msg_agents.agent import Agent
+        from msg_agents.group import AgentGroup
 
-        model = build_step_model(record.experiment)
-        directory = _make(checkpoint)
-        return [
-            Agent(record=record, model=model, agent=i - 1, readers=list(readers), checkpoints=directory) for i in agents
-        ]
+        indices = [number - 1 for number in agents]
+        model, directory = build_step_model(record.experiment), _make(checkpoint)
+        group = AgentGroup(record=record, model=model, agents=indices, readers=readers, checkpoints=directory)
+        return list(group.nodes)
 
     _run_nodes(nodes, **options)
 

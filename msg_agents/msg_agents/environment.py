@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 LOOPBACK_PROFILE = Path(__file__).with_name("loopback.xml")
+DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other, in small networks
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
 
 

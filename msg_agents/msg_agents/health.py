@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -46,22 +45,23 @@ class Health:
 
 
 class Reporter:
-    """Publishes the health of a node once a second; whether it gets on is judged between two reports.
+    """Publishes the health of all nodes of a process once a second; whether one gets on is judged between two reports.
 
     Parameters
     ----------
-    node : with a method ``health() -> Health`` and counters ``refused`` and ``repeated``
+    nodes : at least one; with a method ``health() -> Health`` and counters ``refused`` and ``repeated``
     """
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS_TOPIC, 10)
-        node.create_timer(PERIOD, self._report)
+    def __init__(self, nodes: Sequence[Node]) -> None:
+        self._nodes = nodes
+        self._publisher = nodes[0].create_publisher(DiagnosticArray, DIAGNOSTICS_TOPIC, 10)
+        nodes[0].create_timer(PERIOD, self._report)
 
     def _report(self) -> None:
-        refused: Counter[str] = self._node.refused
-        array = DiagnosticArray(status=[self._node.health().to_status(self._node, refused, self._node.repeated)])
-        array.header.stamp = self._node.get_clock().now().to_msg()
+        array = DiagnosticArray(
+            status=[node.health().to_status(node, node.refused, node.repeated) for node in self._nodes]
+        )
+        array.header.stamp = self._nodes[0].get_clock().now().to_msg()
         self._publisher.publish(array)
 
 

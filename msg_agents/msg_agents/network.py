@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from msg_agents.environment import DISCOVERY_TIMEOUT
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import Experiment
 
 RECORDER = "recorder"
-SMALL = 8  # agents up to which each one gets a process of its own
-MOST_PROCESSES = 28
-"""Agent processes. LOCALHOST discovery of the ROS 2 wheels finds about 32 participants and waits for more for ever."""
+SMALL = 8
+"""Agents up to which each one gets a process of its own, and which a process has at least in larger networks."""
+MOST_PROCESSES = 90
+"""Agent processes. Participants of one domain find each other on one machine up to the ``maxInitialPeersRange`` of
+loopback.xml, of which switcher, recorder and what the user watches the run with need some."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +46,24 @@ def count_processes(experiment: Experiment) -> int:
     """
     agents, wanted = experiment.agents, experiment.run.processes
     if wanted == "auto":
-        return agents if agents <= SMALL else min(agents, MOST_PROCESSES, max(2, 2 * (os.cpu_count() or 1)))
+        # A message to another process costs more than the step that it is for: no more processes than can run at once.
+        return agents if agents <= SMALL else min(math.ceil(agents / SMALL), MOST_PROCESSES, os.cpu_count() or 1)
     count = agents if wanted == "one_per_agent" else min(int(wanted), agents)
     if count > MOST_PROCESSES:
         raise InputError(
             f"run.processes: {wanted} ({count} processes): expected at most {MOST_PROCESSES}, because discovery on one "
-            "machine finds about 32 participants: give a smaller number, several agents share a process"
+            "machine finds about 100 participants: give a smaller number, several agents share a process"
         )
     return count
+
+
+def discovery_timeout(agents: int, processes: int) -> float:
+    """Seconds after which a node of a network says whom it has not found.
+
+    Who is started first waits for who is started last; processes start at two or more a second, and in large ones it
+    takes a while until every endpoint is known everywhere.
+    """
+    return max(DISCOVERY_TIMEOUT, 2.0 * processes + 0.1 * agents)
 
 
 def plan_network(
@@ -69,13 +83,17 @@ def plan_network(
     InputError : more processes than discovery can handle
     """
     count = count_processes(experiment)
-    options: tuple[str, ...] = ("--await", RECORDER) if bag is not None else ()
+    patience: tuple[str, ...] = ()
+    timeout = discovery_timeout(experiment.agents, count)
+    if timeout > DISCOVERY_TIMEOUT:
+        patience = ("--discovery-timeout", f"{timeout:g}")
+    options = patience + (("--await", RECORDER) if bag is not None else ())
     if checkpoints is not None:
         options += ("--checkpoint", str(checkpoints))
     resumes = checkpoints is not None
     plans = []
     if bag is not None:
-        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag))))
+        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *patience)))
     for index in range(count):
         # Neighbouring numbers share a process: in most graphs they are neighbours, and their messages stay inside.
         agents = tuple(range(index * experiment.agents // count, (index + 1) * experiment.agents // count))

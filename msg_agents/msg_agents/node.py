@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Sequence
 
 from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 
 from msg_agents.errors import RCLError
-from msg_agents.health import Health, Reporter
+from msg_agents.health import Health
 from msg_agents.qos import LATCHED
 from msg_agents.synchronizer import Refusal
 from msg_analysis.bags.cdr import CdrError, Progress, StepClock
@@ -21,6 +23,7 @@ EXPERIMENT_TOPIC = "experiment"
 GRAPH_TOPIC = "graph"
 PROGRESS_TOPIC = "progress"
 END_TOPIC = "end"
+RESEND_TOPIC = "resend"
 NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
 OTHER_RUN = "of another run, agent or layout"
 RECORDED = "recorded already"
@@ -32,14 +35,19 @@ def agent_name(agent: int) -> str:
     return f"agent_{agent + 1}"
 
 
-def resend_topic(agent: int) -> str:
-    """Topic on which an agent (index from 0) is asked for its states from some step on."""
-    return f"{agent_name(agent)}/resend"
-
-
 def state_topic(agent: int) -> str:
     """Topic of an agent's states (index from 0)."""
     return f"{agent_name(agent)}/state"
+
+
+def truth_topic(agent: int) -> str:
+    """Topic of an agent's states as they are, where it publishes them with noise (index from 0)."""
+    return f"{agent_name(agent)}/truth"
+
+
+def longest_heard(record: RunRecord) -> int:
+    """Most steps that ``heard`` of a state message can list in a run."""
+    return record.experiment.agents - 1 if record.experiment.noise.loss else 0
 
 
 class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
@@ -52,15 +60,20 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
     """
 
     def __init__(self, name: str, *, record: RunRecord) -> None:
-        # Each node would bring seven parameter services and /rosout: with many nodes they cost more than the network.
-        super().__init__(name, start_parameter_services=False, enable_rosout=False)
+        # Each node would bring eight services and /rosout: with many nodes they cost more than the network.
+        super().__init__(
+            name,
+            start_parameter_services=False,
+            enable_rosout=False,
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
+        )
         self.record = record
         self.run = record.run.bytes
         self._step_clock = StepClock(record.experiment.step_length)
         self.done: Future = Future()
         self.refused: Counter[str] = Counter()
         self.repeated = 0
-        Reporter(self)
+        self._leaving: list[NetworkNode] = [self]
 
     def refuse(self, reason: str, topic: str) -> None:
         """Count a message that is no part of this run; say so the first time.
@@ -93,8 +106,12 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         """How this node is, asked about once a second."""
         raise NotImplementedError
 
+    def found(self) -> bool:
+        """Whether all nodes have been found that should read what this node publishes. Asked again and again."""
+        return True
+
     def awaited(self) -> list[str]:
-        """Names of the nodes that should read what this node publishes, and have not been found yet."""
+        """Names of those who have not been found yet."""
         return []
 
     def begin(self) -> None:
@@ -108,17 +125,20 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         if not self.done.done():
             self.done.set_exception(error)
 
-    def leave_at_end(self) -> None:
-        """Be done when the switcher says that everybody is.
+    def leave_at_end(self, nodes: Iterable[NetworkNode] | None = None) -> None:
+        """Be done, with the other nodes of the process, when the switcher says that everybody is.
 
         Whoever leaves earlier may take with it what others still need: unread messages, or the acknowledgements that
         they wait for.
         """
+        self._leaving = [self] if nodes is None else list(nodes)
         self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LATCHED, raw=True)
 
     def _receive_end(self, data: bytes) -> None:
-        if self.decode_progress(data, END_TOPIC) and not self.done.done():
-            self.done.set_result(None)
+        if self.decode_progress(data, END_TOPIC):
+            for node in self._leaving:
+                if not node.done.done():
+                    node.done.set_result(None)
 
     def decode_progress(self, data: bytes, topic: str) -> Progress | None:
         """A Progress message of this run; None (and counted) if it is no such thing."""
@@ -136,7 +156,12 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         """A Progress message: number of the agent from 1 (or NOT_AN_AGENT), and step."""
         return Progress(self._step_clock.nanoseconds(step), self.run, agent, step).encode()
 
-    def missing_readers(self, publisher: Publisher, expected: list[str]) -> list[str]:
+    def has_readers(self, publisher: Publisher, expected: Sequence[str]) -> bool:
+        """Whether all the expected nodes read a topic of ours."""
+        # Names come out of a look at every endpoint of the network: not before they can all be there.
+        return publisher.get_subscription_count() >= len(expected) and not self.missing_readers(publisher, expected)
+
+    def missing_readers(self, publisher: Publisher, expected: Sequence[str]) -> list[str]:
         """Names of the expected nodes that do not read a topic of ours yet."""
         readers = self.get_subscriptions_info_by_topic(publisher.topic_name)
         found = {reader.node_name for reader in readers}

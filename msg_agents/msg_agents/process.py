@@ -15,6 +15,7 @@ import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 
 from msg_agents.errors import RCLError
+from msg_agents.health import Reporter
 from msg_agents.node import NetworkNode
 from msg_analysis.errors import InputError
 
@@ -98,6 +99,7 @@ def run_nodes(
     complete = False
     try:
         nodes = make_nodes()
+        Reporter(nodes)
         spinner = make_executor(executor)
         for node in nodes:
             spinner.add_node(node)
@@ -147,12 +149,11 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
     deadline = time.monotonic() + timeout
     waiting = list(nodes)
     while True:
-        awaited = {node: node.awaited() for node in waiting}
-        waiting = [node for node, missing in awaited.items() if missing]
+        waiting = [node for node in waiting if not node.found()]
         if not waiting:
             return
         if time.monotonic() > deadline:
-            missing = sorted({name for names in awaited.values() for name in names})
+            missing = sorted({name for node in waiting for name in node.awaited()})
             raise NotFoundError(
                 f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} had not found: "
                 f"{', '.join(missing)}. Are they running, in the same ROS_DOMAIN_ID "

@@ -21,7 +21,9 @@ from msg_agents.node import (
     PROGRESS_TOPIC,
     RECORDED,
     NetworkNode,
+    longest_heard,
     state_topic,
+    truth_topic,
 )
 from msg_agents.qos import LATCHED, STREAM
 from msg_analysis.bags.cdr import ActiveGraph, AgentState, CdrError, StateFrame, decode_string, stamp_ns
@@ -53,20 +55,25 @@ class Recorder(NetworkNode):
     def __init__(self, *, record: RunRecord, directory: Path) -> None:
         super().__init__("recorder", record=record)
         experiment = record.experiment
-        topics = network_topics(experiment.agents, self.get_namespace())
+        noisy = experiment.noise.broadcast > 0
+        topics = network_topics(experiment.agents, self.get_namespace(), truth=noisy)
         self.bag = BagWriter(directory, topics, record=record.to_json())
         self._last = experiment.steps
-        self._frame = StateFrame(self.run, experiment.run.replicas)
-        self._topics = [self.resolve_topic_name(state_topic(agent)) for agent in range(experiment.agents)]
-        self._known: list[dict[int, int]] = [{} for _ in range(experiment.agents)]  # step -> hash of what was written
+        self._frame = StateFrame(self.run, experiment.run.replicas, longest_heard(record))
+        self._sources = [  # of states: agent, and a topic of his
+            (agent, self.resolve_topic_name(topic(agent)))
+            for topic in ((state_topic, truth_topic) if noisy else (state_topic,))
+            for agent in range(experiment.agents)
+        ]
+        self._known: list[dict[int, int]] = [{} for _ in self._sources]  # step -> hash of what was written
         self._seen: set[bytes] = set()  # all but the states that have been written
-        self._pending: list[tuple[int, bytes]] = []  # states collected and not yet written, with their agents
+        self._pending: list[tuple[int, bytes]] = []  # states collected and not yet written, with their sources
         # Topics whose last message (last state, last sojourn, experiment) has not come.
         self._awaiting = {topic.name for topic in topics}
         self.create_subscription(String, EXPERIMENT_TOPIC, self._record_experiment, LATCHED, raw=True)
         self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._record_graph, LATCHED, raw=True)
-        for agent in range(experiment.agents):
-            self.create_subscription(AgentStateMsg, state_topic(agent), self._collector(agent), STREAM, raw=True)
+        for source, (_, topic) in enumerate(self._sources):
+            self.create_subscription(AgentStateMsg, topic, self._collector(source), STREAM, raw=True)
         self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
         self.leave_at_end()
         self.create_timer(WRITE_PERIOD, self._guarded(self._write_states))
@@ -82,12 +89,12 @@ class Recorder(NetworkNode):
         self._guarded(self._write_states)()
         self.bag.close(complete=not self._awaiting)
 
-    def _collector(self, agent: int) -> Callable[[bytes], None]:
-        """The callback for one agent's states: this is the hot path."""
+    def _collector(self, source: int) -> Callable[[bytes], None]:
+        """The callback for one topic of states: this is the hot path."""
         pending, write_states = self._pending, self._guarded(self._write_states)
 
         def collect(data: bytes) -> None:
-            pending.append((agent, data))
+            pending.append((source, data))
             if len(pending) >= BATCH:
                 write_states()
 
@@ -96,8 +103,8 @@ class Recorder(NetworkNode):
     def _write_states(self) -> None:
         """Write what has been collected. Many at once: that needs a fraction of the time that one by one would."""
         unwrap, write, last = self._frame.unwrap, self.bag.write, self._last
-        for agent, data in self._pending:
-            topic = self._topics[agent]
+        for source, data in self._pending:
+            agent, topic = self._sources[source]
             frame = unwrap(data)
             if frame is None or frame[0] != agent + 1:  # not what the agents of this run send: have a closer look
                 message = self._decode(AgentState, data, topic)
@@ -106,7 +113,7 @@ class Recorder(NetworkNode):
                 if message.agent != agent + 1:
                     self.refuse(OTHER_AGENT, topic)
                     continue
-            elif self._have(agent, frame[1], data):
+            elif self._have(source, frame[1], data):
                 self.refuse(RECORDED, topic)
                 continue
             write(topic, data, stamp_ns(data))
@@ -114,14 +121,14 @@ class Recorder(NetworkNode):
                 self._came(topic)
         self._pending.clear()
 
-    def _have(self, agent: int, step: int, data: bytes) -> bool:
+    def _have(self, source: int, step: int, data: bytes) -> bool:
         """Whether the very same message has been written: agents send theirs again when one of them was killed."""
-        known, mark = self._known[agent], hash(data)
+        known, mark = self._known[source], hash(data)
         if known.get(step) == mark:
             return True
         known[step] = mark
         if len(known) > 2 * MOST:
-            self._known[agent] = {k: v for k, v in known.items() if k > step - MOST}
+            self._known[source] = {k: v for k, v in known.items() if k > step - MOST}
         return False
 
     def _record_graph(self, data: bytes) -> None:

@@ -32,6 +32,16 @@ def test_the_newest_are_kept(tmp_path: Path, steps: int) -> None:
         assert ring.read(steps) == []
 
 
+def test_messages_of_different_length(tmp_path: Path) -> None:
+    """With lost messages, some list what was heard."""
+    ring = Checkpoint(tmp_path / "states", LARGE)
+    for step in range(LEAST + 5):
+        ring.write(step, message(step, LARGE - 8 * (step % 3)))
+    for again in (ring, Checkpoint(tmp_path / "states", LARGE)):
+        assert all(data == message(step, LARGE - 8 * (step % 3)) for step, data in again.read())
+        assert len(again.read()) == LEAST - 1
+
+
 def test_in_memory() -> None:
     ring = Checkpoint(None, 24)
     ring.write(0, message(0, 24))

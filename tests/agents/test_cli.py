@@ -71,11 +71,14 @@ def run_file(tmp_path: Path) -> Path:
     ("changes", "options", "words"),
     [
         ({"run": {"pace": "realtime"}}, [], ["run.pace", "realtime", "lockstep"]),
-        ({"noise": {"loss": 0.1}}, [], ["noise.loss", "0.1"]),
-        ({"noise": {"broadcast": 0.1}}, [], ["noise.broadcast"]),
+        ({"noise": {"delay": 2}}, [], ["noise.delay", "2"]),
         ({"run": {"dt": 0.3, "duration": 5}}, [], ["run.duration"]),
         ({"unknown": 1}, [], ["unknown"]),
-        ({"agents": 40, "run": {"dt": 0.01, "start": "zero", "processes": "one_per_agent"}}, [], ["40"]),
+        (
+            {"agents": 100, "run": {"dt": 0.01, "start": "zero", "processes": "one_per_agent"}},
+            [],
+            ["run.processes", "at most 90"],
+        ),
         ({}, ["--pace", "realtime"], ["run.pace"]),
         ({}, ["--pace", "fast"], ["run.pace", "fast"]),
         ({}, ["--processes", "many"], ["run.processes", "many"]),

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from msg_agents.environment import DISCOVERY_TIMEOUT
 from msg_agents.network import MOST_PROCESSES, ProcessPlan, count_processes, plan_network
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import Experiment
@@ -40,7 +41,7 @@ def numbers(process: ProcessPlan) -> list[int]:
     return [int(value) for option, value in pairwise(words) if option == "--agent"]
 
 
-@given(st.integers(2, 60), st.integers(1, MOST_PROCESSES))
+@given(st.integers(2, 110), st.integers(1, MOST_PROCESSES))
 def test_every_agent_exactly_once(agents: int, processes: int) -> None:
     hosts = [process for process in plan(agents, processes) if process.agents]
     assert len(hosts) == min(agents, processes)
@@ -52,7 +53,8 @@ def test_every_agent_exactly_once(agents: int, processes: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("cores", "agents", "expected"), [(2, 2, 2), (2, 8, 8), (2, 9, 4), (1, 100, 2), (8, 9, 9), (8, 100, 16)]
+    ("cores", "agents", "expected"),
+    [(2, 2, 2), (2, 8, 8), (2, 9, 2), (1, 9, 1), (1, 100, 1), (8, 9, 2), (8, 100, 8), (64, 100, 13)],
 )
 def test_auto(monkeypatch: pytest.MonkeyPatch, cores: int, agents: int, expected: int) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
@@ -70,6 +72,19 @@ def test_too_many_processes(processes: Any) -> None:
     with pytest.raises(InputError, match=rf"run\.processes: {processes} .*at most {MOST_PROCESSES}"):
         plan(MOST_PROCESSES + 1, processes)
     assert len(plan(MOST_PROCESSES, "one_per_agent")) == MOST_PROCESSES + 2
+
+
+def test_large_networks_are_given_time_to_find_each_other() -> None:
+    def timeouts(agents: int, processes: Any) -> set[str]:
+        return {
+            process.arguments[process.arguments.index("--discovery-timeout") + 1]
+            for process in plan(agents, processes)
+            if "--discovery-timeout" in process.arguments
+        }
+
+    assert timeouts(5, "auto") == set()
+    (timeout,) = timeouts(40, "one_per_agent")  # the same for all
+    assert float(timeout) > DISCOVERY_TIMEOUT
 
 
 def test_names_and_commands() -> None:

@@ -102,11 +102,12 @@ def test_bad_files_are_errors_of_the_user(command: str, tmp_path: Path) -> None:
 
 
 def test_what_is_not_available_is_refused(tmp_path: Path) -> None:
-    air = call("simulate", GOLDEN / "air.yaml", "--out", tmp_path / "out")
-    assert air.exit_code == 2
-    assert "noise.loss: 0.2: not available" in air.stderr
-    assert not (tmp_path / "out").exists()
     file = tmp_path / "file.yaml"
+    file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nnoise: {delay: 2}\n")
+    late = call("simulate", file, "--out", tmp_path / "out")
+    assert late.exit_code == 2
+    assert "noise.delay: 2: not available" in late.stderr
+    assert not (tmp_path / "out").exists()
     file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nrun: {pace: realtime}\n")
     assert "run.pace: 'realtime': not available yet" in call("predict", file).stderr
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from msg_analysis.model.agent import AgentLaw
+from msg_analysis.model.agent import agent_law
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.step import build_step_model
 from msg_analysis.model.streams import STEPS_PER_BLOCK, Stream, generator
@@ -99,7 +99,7 @@ def test_agents_alone_equal_the_whole(case: str) -> None:
     setup = experiment(case, replicas=2)
     trajectory = simulate(setup)
     model = build_step_model(setup)
-    laws = [AgentLaw(trajectory.record, model, i) for i in range(3)]
+    laws = [agent_law(trajectory.record, model, i) for i in range(3)]
     for k, mode in enumerate(trajectory.modes):
         x = trajectory.states[k]
         for i, law in enumerate(laws):

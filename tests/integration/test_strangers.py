@@ -36,17 +36,19 @@ from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress
 from std_msgs.msg import String
 from msg_agents.qos import LATCHED, STREAM
 
-AGENTS = 5
+AGENTS, PROCESSES = 5, 2
 rclpy.init()
 node = rclpy.create_node("stranger", enable_rosout=False)
 kinds = {"graph": ActiveGraph, "progress": Progress, "end": Progress, "experiment": String}
-readers = {"graph": AGENTS + 1, "progress": 1, "end": AGENTS + 1, "experiment": 1}
+readers = {"graph": PROCESSES + 1, "progress": 1, "end": PROCESSES + 1, "experiment": 1}
+readers |= {f"agent_{i}/state": 2 for i in (1, 2, 3, 5)}  # the recorder and the neighbour in the other process
+readers["agent_4/state"] = 1
 messages = [line.split() for line in Path(sys.argv[1]).read_text().splitlines()]
 publishers = {
     topic: node.create_publisher(kinds.get(topic, AgentState), topic, LATCHED) for topic in dict(messages)
 }
 for topic, publisher in publishers.items():
-    while publisher.get_subscription_count() < readers.get(topic, 3):  # the recorder and both neighbours
+    while publisher.get_subscription_count() < readers[topic]:
         time.sleep(0.1)
 for topic, data in messages:
     publishers[topic].publish(bytes.fromhex(data))

@@ -6,8 +6,8 @@ its length with the closing NUL (uint32), its UTF-8 bytes and the NUL; a sequenc
 its elements.
 
 Two ways in: the message classes read and write anything that is valid; :class:`StateCodec` and
-:class:`StateFrame` do the one layout that the agents themselves send (empty ``frame_id``, empty ``heard``),
-which has a fixed length, in half a microsecond.
+:class:`StateFrame` do the one layout that the agents themselves send (empty ``frame_id``), which without
+``heard`` has a fixed length, in half a microsecond.
 """
 
 from __future__ import annotations
@@ -36,6 +36,9 @@ _STAMP = {b"\x00\x01": struct.Struct("<4xiI"), b"\x00\x00": struct.Struct(">4xiI
 _STATE = struct.Struct("<4siIIB16s3xI4xQIII4x")
 # The same bytes for reading: without the stamp, frame_id and run in one piece.
 _STATE_FIXED = struct.Struct("<4s8x21s3xI4xQIII4x")
+# The steps in ``heard`` stand between its length and that of the state, eight bytes each, without any padding.
+_HEARD = struct.Struct("<I")
+_HEARD_START = _STATE.size - 8
 
 
 class CdrError(ValueError):
@@ -110,11 +113,15 @@ class StateCodec:
             raise ValueError(f"state: {state.dtype} of shape {state.shape}, expected float64 of shape {self._shape}")
         return self.wrap(step, mode, to_payload(state))
 
-    def wrap(self, step: int, mode: int, payload: bytes) -> bytes:
+    def wrap(self, step: int, mode: int, payload: bytes, heard: Sequence[int] = ()) -> bytes:
         """One AgentState of a state that is bytes already, of the right length."""
         seconds, nanoseconds = divmod(self._nanoseconds(step), _SECOND)
-        fixed = (1, 0, self._run, self._agent, step, mode, 0, self._replicas)
-        return _STATE.pack(LITTLE_ENDIAN, seconds, nanoseconds, *fixed) + payload
+        fixed = (1, 0, self._run, self._agent, step, mode, len(heard), self._replicas)
+        data = _STATE.pack(LITTLE_ENDIAN, seconds, nanoseconds, *fixed)
+        if heard:
+            steps = struct.pack(f"<{len(heard)}Q", *heard)
+            data = data[:_HEARD_START] + steps + data[_HEARD_START:]
+        return data + payload
 
 
 class StateFrame:
@@ -124,24 +131,45 @@ class StateFrame:
     ----------
     run : the 16 bytes of the run id
     replicas : length of every state
+    most_heard : largest length of ``heard``
+
+    Attributes
+    ----------
+    size : bytes of the longest message
     """
 
-    def __init__(self, run: bytes, replicas: int) -> None:
+    def __init__(self, run: bytes, replicas: int, most_heard: int = 0) -> None:
         self._fixed = b"\x01\x00\x00\x00\x00" + bytes(run)
         self._replicas = replicas
-        self.size = _STATE.size + 8 * replicas
+        self._least = _STATE.size + 8 * replicas
+        self.size = self._least + 8 * most_heard
 
     def unwrap(self, data: bytes) -> tuple[int, int, int, bytes] | None:
         """(agent, step, mode, state as a payload), or None where the bytes are not of this run and layout.
 
         None means: ask :meth:`AgentState.decode`, which tells what it is.
         """
-        if len(data) != self.size:
-            return None
+        if len(data) != self._least:
+            return self._unwrap_heard(data)
         header, fixed, agent, step, mode, heard, replicas = _STATE_FIXED.unpack_from(data)
         if fixed != self._fixed or heard or replicas != self._replicas or header != LITTLE_ENDIAN:
             return None
         return agent, step, mode, data[_STATE.size :]
+
+    def _unwrap_heard(self, data: bytes) -> tuple[int, int, int, bytes] | None:
+        """The same of a message whose ``heard`` is not empty: take that out, and it is one of fixed length."""
+        if not self._least < len(data) <= self.size:
+            return None
+        length = len(data) - self._least
+        if _HEARD.unpack_from(data, _HEARD_START - _HEARD.size)[0] * 8 != length:
+            return None
+        empty = data[: _HEARD_START - _HEARD.size] + bytes(_HEARD.size)
+        return self.unwrap(empty + data[_HEARD_START + length :])
+
+
+def with_state(data: bytes, payload: bytes) -> bytes:
+    """The same AgentState, as :class:`StateCodec` writes it, with another state of the same length."""
+    return data[: len(data) - len(payload)] + payload
 
 
 class _Reader:

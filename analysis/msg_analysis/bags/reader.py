@@ -16,16 +16,18 @@ from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
 from msg_analysis.bags.states import StateColumns, States
 from msg_analysis.bags.writer import RECORD_NAME, recording_pid
 from msg_analysis.errors import BagError, InputError
+from msg_analysis.model.air import LOST
 from msg_analysis.model.record import RunRecord
+from msg_analysis.model.step import StepModel, build_step_model
 from msg_analysis.model.trajectory import Completeness, Trajectory
-from msg_analysis.types import IntArray
+from msg_analysis.types import BoolArray, IntArray
 
 # Topics are told by type and by the end of their name: the network may run in any namespace.
-_STATE, _GRAPH, _EXPERIMENT = "state", "graph", "experiment"
+_STATE, _TRUTH, _GRAPH, _EXPERIMENT = "state", "truth", "graph", "experiment"
 _TOPICS = {
-    AGENT_STATE.full_name: (_STATE, re.compile(r"(^|/)agent_\d+/state$")),
-    ACTIVE_GRAPH.full_name: (_GRAPH, re.compile(r"(^|/)graph$")),
-    STRING.full_name: (_EXPERIMENT, re.compile(r"(^|/)experiment$")),
+    AGENT_STATE.full_name: re.compile(r"(?:^|/)agent_\d+/(state|truth)$"),
+    ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
+    STRING.full_name: re.compile(r"(?:^|/)(experiment)$"),
 }
 
 
@@ -107,6 +109,7 @@ class _Contents:
     """What the files of a bag hold of our topics."""
 
     states: StateColumns = field(default_factory=StateColumns)
+    truths: StateColumns = field(default_factory=StateColumns)
     graphs: list[ActiveGraph] = field(default_factory=list)
     experiments: dict[str, None] = field(default_factory=dict)  # texts, each once, in order
     records: dict[str, None] = field(default_factory=dict)  # the same from the metadata of our own files
@@ -118,8 +121,9 @@ class _Contents:
             for number, channel in file.channels.items():
                 if number not in kinds:
                     schema = file.schemas.get(channel.schema_id)
-                    kind, pattern = _TOPICS.get(schema.name if schema else "", (None, None))
-                    kinds[number] = kind if pattern and pattern.search(channel.topic) else None
+                    pattern = _TOPICS.get(schema.name if schema else "")
+                    found = pattern.search(channel.topic) if pattern else None
+                    kinds[number] = found[1] if found else None
             self._add(batch, kinds)
         self.records.update(
             (record.metadata["record"], None)
@@ -130,9 +134,10 @@ class _Contents:
         self.refused["damaged chunk"] += file.damaged_chunks
 
     def _add(self, batch: Batch, kinds: dict[int, str | None]) -> None:
-        states = np.isin(batch.channel, [number for number, kind in kinds.items() if kind == _STATE])
-        if states.any():
-            self.states.add(batch, np.flatnonzero(states))
+        for wanted, columns in ((_STATE, self.states), (_TRUTH, self.truths)):
+            states = np.isin(batch.channel, [number for number, kind in kinds.items() if kind == wanted])
+            if states.any():
+                columns.add(batch, np.flatnonzero(states))
         others = np.isin(batch.channel, [n for n, kind in kinds.items() if kind in (_GRAPH, _EXPERIMENT)])
         for index in np.flatnonzero(others).tolist():
             data = batch.message(index)
@@ -177,49 +182,116 @@ def _choose(contents: _Contents, path: Path) -> RunRecord:
 
 def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
     experiment = record.experiment
-    agents, replicas, steps = experiment.agents, experiment.run.replicas, experiment.steps
-    run = record.run.bytes
-    refused = contents.refused
-    refused["undecodable"] += contents.states.undecodable
-    counts = contents.states.runs()
-    refused["other run"] += sum(counts.values()) - counts.get(run, 0)
-    taken = contents.states.take(run, replicas)
-    refused["wrong length"] += counts.get(run, 0) - len(taken.step)
-
-    good = np.ones(len(taken.step), dtype=np.bool_)
-    for reason, bad in (
-        ("unknown agent", (taken.agent < 1) | (taken.agent > agents)),
-        ("step out of range", taken.step > steps),
-        ("unknown mode", taken.mode > len(experiment.graph_list)),
-        ("not finite", ~np.isfinite(taken.state).all(axis=1)),
-    ):
-        refused[reason] += int((good & bad).sum())
-        good &= ~bad
-    index = np.flatnonzero(good)
-    cell = taken.step[index] * agents + taken.agent[index] - 1
-    cells, first, owner = np.unique(cell, return_index=True, return_inverse=True)
-    kept = index[first]  # of several copies, the first in the bag
-    again = np.delete(np.arange(len(cell)), first)
-    differs = (taken.state[index[again]] != taken.state[kept[owner[again]]]).any(axis=1)
-    refused["contradicts an earlier copy"] += int(differs.sum())
-
-    states = np.full(((steps + 1) * agents, replicas), np.nan)
-    states[cells] = taken.state[kept]
-    agent_modes = np.full((steps + 1) * agents, -1, dtype=np.int64)
-    agent_modes[cells] = taken.mode[kept] - 1
-    modes = _modes(contents, run, steps, len(experiment.graph_list))
-    expected = (steps + 1) * agents
+    modes = _modes(contents, record.run.bytes, experiment.steps, len(experiment.graph_list))
+    published = None
+    if experiment.noise.broadcast:
+        published = _Collected(contents.states, record, contents.refused)
+        truth = _Collected(contents.truths, record, contents.refused)
+    else:
+        truth = _Collected(contents.states, record, contents.refused)
+    parts = [truth] if published is None else [truth, published]
+    expected = len(parts) * (experiment.steps + 1) * experiment.agents
+    received = sum(part.received for part in parts)
     completeness = Completeness(
         expected=expected,
-        received=len(cells),
-        missing=expected - len(cells),
-        duplicates=len(cell) - len(cells),
-        out_of_order=_out_of_order(taken, kept),
+        received=received,
+        missing=expected - received,
+        duplicates=sum(part.duplicates for part in parts),
+        out_of_order=sum(part.out_of_order for part in parts),
         missing_modes=int((modes < 0).sum()),
-        refused={reason: count for reason, count in sorted(refused.items()) if count},
+        refused={reason: count for reason, count in sorted(contents.refused.items()) if count},
     )
-    shape = (steps + 1, agents)
-    return Trajectory(record, states.reshape(*shape, replicas), modes, completeness, agent_modes.reshape(shape))
+    return Trajectory(
+        record,
+        truth.states,
+        modes,
+        completeness,
+        truth.modes,
+        published=published.states if published else None,
+        lost=truth.lost,
+    )
+
+
+class _Collected:
+    """The states of a run that a bag holds on one kind of topic, each once, ordered by step.
+
+    Attributes
+    ----------
+    states : (N + 1, m, replicas); NaN where a state is missing
+    modes : (N + 1, m) from 0; -1 where missing
+    lost : see ``Trajectory.lost``
+    received, duplicates, out_of_order : see ``Completeness``
+    """
+
+    def __init__(self, columns: StateColumns, record: RunRecord, refused: Counter[str]) -> None:
+        experiment = record.experiment
+        agents, replicas, steps = experiment.agents, experiment.run.replicas, experiment.steps
+        run = record.run.bytes
+        refused["undecodable"] += columns.undecodable
+        counts = columns.runs()
+        refused["other run"] += sum(counts.values()) - counts.get(run, 0)
+        links = _Links(build_step_model(experiment)) if experiment.noise.loss else None
+        taken = columns.take(run, replicas, links.most if links else 0)
+        refused["wrong length"] += counts.get(run, 0) - len(taken.step)
+
+        good = np.ones(len(taken.step), dtype=np.bool_)
+        for reason, bad in (
+            ("unknown agent", (taken.agent < 1) | (taken.agent > agents)),
+            ("step out of range", taken.step > steps),
+            ("unknown mode", taken.mode > len(experiment.graph_list)),
+            ("not finite", ~np.isfinite(taken.state).all(axis=1)),
+        ):
+            refused[reason] += int((good & bad).sum())
+            good &= ~bad
+        index = np.flatnonzero(good)
+        if links:
+            fits = links.fit(taken, index)
+            refused["heard what it cannot have"] += int((~fits).sum())
+            index = index[fits]
+        cell = taken.step[index] * agents + taken.agent[index] - 1
+        cells, first, owner = np.unique(cell, return_index=True, return_inverse=True)
+        kept = index[first]  # of several copies, the first in the bag
+        again = np.delete(np.arange(len(cell)), first)
+        copy, original = index[again], kept[owner[again]]
+        differs = (taken.state[copy] != taken.state[original]).any(axis=1)
+        differs |= (taken.heard[copy] != taken.heard[original]).any(axis=1)
+        refused["contradicts an earlier copy"] += int(differs.sum())
+
+        states = np.full(((steps + 1) * agents, replicas), np.nan)
+        states[cells] = taken.state[kept]
+        modes = np.full((steps + 1) * agents, -1, dtype=np.int64)
+        modes[cells] = taken.mode[kept] - 1
+        self.states, self.modes = states.reshape(steps + 1, agents, replicas), modes.reshape(steps + 1, agents)
+        self.lost: BoolArray | None = None
+        if links:
+            lost = np.zeros(((steps + 1) * agents, links.most), dtype=np.bool_)
+            lost[cells] = taken.heard[kept] == LOST
+            self.lost = lost.reshape(steps + 1, agents, links.most)[1:]
+        self.received, self.duplicates = len(cells), len(cell) - len(cells)
+        self.out_of_order = _out_of_order(taken, kept)
+
+
+class _Links:
+    """What ``heard`` can be in a lockstep run in which messages are lost.
+
+    Attributes
+    ----------
+    most : largest number of neighbours
+    """
+
+    def __init__(self, model: StepModel) -> None:
+        self.most = model.most_neighbours
+        self._neighbours = np.zeros((model.modes + 1, model.agents), dtype=np.int64)  # no graph led to step 0
+        for mode in range(model.modes):
+            self._neighbours[mode + 1] = [len(model.neighbours(mode, i)) for i in range(model.agents)]
+
+    def fit(self, states: States, index: IntArray) -> BoolArray:
+        """Whether what they heard is empty, or for each neighbour under their graph the step before, or ``LOST``."""
+        heard, count = states.heard[index], states.heard_count[index]
+        neighbours = self._neighbours[states.mode[index], states.agent[index] - 1]
+        known = (heard == LOST) | (heard == (states.step[index].astype(np.uint64) - np.uint64(1))[:, None])
+        known |= np.arange(self.most) >= count[:, None]
+        return np.asarray((count == 0) | ((count == neighbours) & known.all(axis=1)))
 
 
 def _out_of_order(states: States, index: IntArray) -> int:

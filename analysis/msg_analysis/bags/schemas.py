@@ -99,8 +99,8 @@ class Topic:
         ]
 
 
-def network_topics(agents: int, namespace: str = "") -> Sequence[Topic]:
-    """What a recorder of the network records: ``experiment``, ``graph``, ``agent_<i>/state``.
+def network_topics(agents: int, namespace: str = "", *, truth: bool = False) -> Sequence[Topic]:
+    """What a recorder of the network records: ``experiment``, ``graph``, ``agent_<i>/state``, ``agent_<i>/truth``.
 
     Parameters
     ----------
@@ -108,15 +108,23 @@ def network_topics(agents: int, namespace: str = "") -> Sequence[Topic]:
         their number m
     namespace : str
         of the network, such as ``/lab``; empty for the root
+    truth : bool
+        whether the states are published with noise, and as they are on a topic of their own
     """
     root = "/" + namespace.strip("/") + "/" if namespace.strip("/") else "/"
     return (
         Topic(f"{root}experiment", STRING, latched=True),
         Topic(f"{root}graph", ACTIVE_GRAPH, latched=True),
         *(Topic(state_topic(root, agent), AGENT_STATE, latched=False) for agent in range(1, agents + 1)),
+        *(Topic(truth_topic(root, agent), AGENT_STATE, latched=False) for agent in range(1, agents + 1) if truth),
     )
 
 
 def state_topic(root: str, agent: int) -> str:
     """Topic of the states of an agent (from 1) below a root that ends with a slash."""
     return f"{root}agent_{agent}/state"
+
+
+def truth_topic(root: str, agent: int) -> str:
+    """Topic of the states as they are, where others are published, of an agent (from 1) below a root."""
+    return f"{root}agent_{agent}/truth"

@@ -11,10 +11,12 @@ from msg_analysis.bags.mcapfile import Batch
 from msg_analysis.types import AnyArray, FloatArray, IntArray
 
 _FIXED_SIZE = 68  # bytes of an AgentState before its state, where frame_id and heard are empty
+_HEARD_COUNT = 56  # where the length of heard is
 
 
-def _layout(replicas: int) -> np.dtype[np.void]:
-    """Of an AgentState with empty ``frame_id`` and ``heard``; its own bytes, padding left out."""
+def _layout(replicas: int, heard: int) -> np.dtype[np.void]:
+    """Of an AgentState with empty ``frame_id`` and so many steps in ``heard``; its own bytes, padding left out."""
+    longer = 8 * heard
     fields = {
         "header": ("V4", 0),
         "frame_id": ("V5", 12),
@@ -22,16 +24,17 @@ def _layout(replicas: int) -> np.dtype[np.void]:
         "agent": ("<u4", 36),
         "step": ("<u8", 44),
         "mode": ("<u4", 52),
-        "heard": ("<u4", 56),
-        "replicas": ("<u4", 60),
-        "state": (("<f8", (replicas,)), _FIXED_SIZE),
+        "heard_count": ("<u4", _HEARD_COUNT),
+        "heard": (("<u8", (heard,)), 60),
+        "replicas": ("<u4", 60 + longer),
+        "state": (("<f8", (replicas,)), _FIXED_SIZE + longer),
     }
     return np.dtype(
         {
             "names": list(fields),
             "formats": [kind for kind, _ in fields.values()],
             "offsets": [offset for _, offset in fields.values()],
-            "itemsize": _FIXED_SIZE + 8 * replicas,
+            "itemsize": _FIXED_SIZE + longer + 8 * replicas,
         }
     )
 
@@ -45,6 +48,8 @@ class States:
     position : (messages,) place in the bag
     agent, step, mode : (messages,) as sent: agents and modes from 1; clipped to the range of int64
     state : (messages, replicas)
+    heard_count : (messages,) length of ``heard``
+    heard : (messages, D) its first D entries; 0 beyond its end
     """
 
     position: IntArray
@@ -52,6 +57,8 @@ class States:
     step: IntArray
     mode: IntArray
     state: FloatArray
+    heard_count: IntArray
+    heard: AnyArray
 
 
 @dataclass(slots=True)
@@ -80,12 +87,22 @@ class StateColumns:
         extent = batch.extent[chosen]
         for size in np.unique(extent[:, 1]).tolist():
             alike = np.flatnonzero(extent[:, 1] == size)
-            replicas, rest = divmod(size - _FIXED_SIZE, 8)
-            if replicas >= 0 and rest == 0:
-                alike = self._add_fixed(batch, chosen, alike, _layout(replicas))
+            numbers, rest = divmod(size - _FIXED_SIZE, 8)
+            if numbers >= 0 and rest == 0:
+                alike = self._add_all_fixed(batch, chosen, alike, numbers)
             for index in alike.tolist():
                 self._add_any(batch.message(int(chosen[index])), self._position + index)
         self._position += len(chosen)
+
+    def _add_all_fixed(self, batch: Batch, chosen: IntArray, alike: IntArray, numbers: int) -> IntArray:
+        """Take the messages of fixed layouts with so many numbers in ``heard`` and ``state``; the others come back."""
+        at = batch.extent[chosen[alike], :1] + np.arange(_HEARD_COUNT, _HEARD_COUNT + 4)
+        counts = np.ascontiguousarray(np.frombuffer(batch.data, np.uint8)[at]).view("<u4")[:, 0]
+        others = [alike[counts > numbers]]
+        for heard in np.unique(counts[counts <= numbers]).tolist():
+            layout = _layout(numbers - heard, heard)
+            others.append(self._add_fixed(batch, chosen, alike[counts == heard], layout))
+        return np.sort(np.concatenate(others))
 
     def _add_fixed(self, batch: Batch, chosen: IntArray, alike: IntArray, layout: np.dtype[np.void]) -> IntArray:
         """Take the messages of the fixed layout; the indices of the others come back."""
@@ -96,7 +113,6 @@ class StateColumns:
         fixed = (
             (table["header"] == np.void(LITTLE_ENDIAN))
             & (table["frame_id"] == np.void(b"\x01\x00\x00\x00\x00"))
-            & (table["heard"] == 0)
             & (table["replicas"] == table["state"].shape[1])
         )
         runs, owner = np.unique(table["run"][fixed], return_inverse=True)
@@ -109,7 +125,8 @@ class StateColumns:
     def _append(self, run: bytes, position: IntArray, table: AnyArray) -> None:
         agent, mode = table["agent"].astype(np.int64), table["mode"].astype(np.int64)
         step = np.minimum(table["step"], np.uint64(2**63 - 1)).astype(np.int64)
-        states = States(position, agent, step, mode, table["state"].astype(np.float64))
+        count, heard = table["heard_count"].astype(np.int64), table["heard"].astype(np.uint64)
+        states = States(position, agent, step, mode, table["state"].astype(np.float64), count, heard)
         self._columns.setdefault((run, states.state.shape[1]), []).append(states)
 
     def _add_any(self, data: bytes, position: int) -> None:
@@ -118,9 +135,9 @@ class StateColumns:
         except CdrError:
             self.undecodable += 1
             return
-        table = np.zeros(1, _layout(len(message.state)))
+        table = np.zeros(1, _layout(len(message.state), len(message.heard)))
         table["agent"], table["step"], table["mode"] = message.agent, message.step, message.mode
-        table["state"] = message.state
+        table["state"], table["heard"], table["heard_count"] = message.state, message.heard, len(message.heard)
         self._append(message.run, np.array([position]), table)
 
     def runs(self) -> dict[bytes, int]:
@@ -130,7 +147,7 @@ class StateColumns:
             counts[run] = counts.get(run, 0) + sum(len(part.step) for part in parts)
         return counts
 
-    def take(self, run: bytes, replicas: int) -> States:
+    def take(self, run: bytes, replicas: int, most_heard: int = 0) -> States:
         """The states of a run with so many replicas, in the order of the bag; they are gone from here
         afterwards.
 
@@ -140,15 +157,23 @@ class StateColumns:
             16 bytes of its id
         replicas : int
             length of a state
+        most_heard : int
+            how many entries of ``heard`` are wanted
         """
         none = np.empty(0, np.int64)
-        empty = States(none, none, none, none, np.empty((0, replicas)))
+        empty = States(none, none, none, none, np.empty((0, replicas)), none, np.empty((0, 0), np.uint64))
         parts = self._columns.pop((run, replicas), []) or [empty]
         position = np.concatenate([part.position for part in parts])
         order = np.argsort(position, kind="stable")
-        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in ("agent", "step", "mode"))
-        agent, step, mode = (column[order] for column in columns)
+        names = ("agent", "step", "mode", "heard_count")
+        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+        agent, step, mode, heard_count = (column[order] for column in columns)
         state = np.concatenate([part.state for part in parts])
+        heard = np.zeros((len(order), most_heard), np.uint64)
+        ends = np.cumsum([len(part.step) for part in parts]).tolist()
+        for part, end in zip(parts, ends, strict=True):
+            width = min(most_heard, part.heard.shape[1])
+            heard[end - len(part.step) : end, :width] = part.heard[:, :width]
         if not np.array_equal(order, np.arange(len(order))):
-            state = state[order]
-        return States(position[order], agent, step, mode, state)
+            state, heard = state[order], heard[order]
+        return States(position[order], agent, step, mode, state, heard_count, heard)

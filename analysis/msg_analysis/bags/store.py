@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from msg_analysis.bags.cdr import ActiveGraph, StateCodec, StepClock, encode_string
-from msg_analysis.bags.schemas import network_topics, state_topic
+from msg_analysis.bags.schemas import network_topics, state_topic, truth_topic
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
+from msg_analysis.model.air import LOST
+from msg_analysis.model.payload import to_payload
+from msg_analysis.model.step import build_step_model
 from msg_analysis.model.trajectory import Trajectory
+from msg_analysis.types import IntArray
 
 
 def write_trajectory(trajectory: Trajectory, directory: str | Path) -> None:
@@ -38,7 +42,8 @@ def write_trajectory(trajectory: Trajectory, directory: str | Path) -> None:
         with tempfile.TemporaryDirectory(prefix=f".{directory.name}.", dir=directory.parent) as workshop:
             # The bag gets its own name at once: that of its file derives from it.
             unfinished = Path(workshop) / directory.name
-            topics = network_topics(trajectory.record.experiment.agents)
+            noisy = trajectory.published is not None
+            topics = network_topics(trajectory.record.experiment.agents, truth=noisy)
             with BagWriter(unfinished, topics, record=record) as bag:
                 bag.write("/experiment", encode_string(record), 0)
                 for topic, data, time in _messages(trajectory):
@@ -54,11 +59,15 @@ def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
     run, dt, modes = trajectory.record.run.bytes, experiment.step_length, trajectory.modes
     time = StepClock(dt).nanoseconds
     codecs = [StateCodec(run, i + 1, experiment.run.replicas, dt) for i in range(experiment.agents)]
-    topics = [state_topic("/", i + 1) for i in range(experiment.agents)]
     used = trajectory.agent_modes
     if used is None:
         used = np.repeat(np.concatenate(([-1], modes))[:, None], experiment.agents, axis=1)
-    present = trajectory.present
+    truth = state_topic if trajectory.published is None else truth_topic
+    streams = [(_names(truth, experiment.agents), trajectory.states)]
+    if trajectory.published is not None:
+        streams.append((_names(state_topic, experiment.agents), trajectory.published))
+    present = [np.asarray(~np.isnan(states).any(axis=2)) for _, states in streams]
+    heard = _heard(trajectory, used)
     sojourns = _sojourns(trajectory)
     sojourn = next(sojourns, None)
     for k in range(len(trajectory.states)):
@@ -66,8 +75,31 @@ def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
         if sojourn is not None and sojourn.first_step == k:
             yield "/graph", sojourn.encode(), now
             sojourn = next(sojourns, None)
-        for i in np.flatnonzero(present[k]).tolist():
-            yield topics[i], codecs[i].encode(k, int(used[k, i]) + 1, trajectory.states[k, i]), now
+        for (topics, states), there in zip(streams, present, strict=True):
+            for i in np.flatnonzero(there[k]).tolist():
+                payload = to_payload(states[k, i])
+                yield topics[i], codecs[i].wrap(k, int(used[k, i]) + 1, payload, heard(k, i)), now
+
+
+def _names(topic: Callable[[str, int], str], agents: int) -> list[str]:
+    return [topic("/", i + 1) for i in range(agents)]
+
+
+def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[int]]:
+    """What an agent says at step k that it heard in the step that led there: nothing, where nothing was lost."""
+    lost = trajectory.lost
+    if lost is None:
+        return lambda _k, _i: []
+    model = build_step_model(trajectory.record.experiment)
+    modes, agents = range(model.modes), range(model.agents)
+    counts = [[len(model.neighbours(mode, i)) for i in agents] for mode in modes]
+
+    def heard(k: int, i: int) -> list[int]:
+        if k == 0 or not lost[k - 1, i].any():
+            return []
+        return [LOST if gone else k - 1 for gone in lost[k - 1, i, : counts[used[k, i]][i]].tolist()]
+
+    return heard
 
 
 def _sojourns(trajectory: Trajectory) -> Iterator[ActiveGraph]:

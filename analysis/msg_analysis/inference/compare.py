@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy import stats
 
+from msg_analysis.inference.air import LossTest, broadcast_p, loss_test
 from msg_analysis.inference.batch import batch_interval
 from msg_analysis.inference.innovations import InnovationTests, innovation_tests, quadratic_form
 from msg_analysis.inference.martingale import TimeMeans, time_means
@@ -96,6 +97,8 @@ class Comparison:
     batch : model-free interval for the system error
     tests : the family, in the order of the report
     running : "time" [simulated time], "system_error" and "standard_error" of the mean up to then (400 points)
+    loss : of the messages that were lost; None where none can be
+    p_broadcast : of the noise in what was published; None without
     """
 
     trajectory: Trajectory
@@ -110,6 +113,8 @@ class Comparison:
     batch: tuple[float, float] | None
     tests: list[Test]
     running: dict[str, FloatArray]
+    loss: LossTest | None = None
+    p_broadcast: float | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -151,6 +156,8 @@ class Comparison:
                 "expected": switching.expected if switching else None,
                 "p": switching.p if switching else None,
             },
+            "loss": asdict(self.loss) if self.loss else dict.fromkeys(("lost", "expected", "p")),
+            "broadcast": {"p": self.p_broadcast},
             "continuous": {"system_error": self.continuous_error},
             "batch_means": {"interval": self.batch or (None, None)},
             "tests": [asdict(test) for test in self.tests],
@@ -162,7 +169,7 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     """Compare a run with what theory predicts for it.
 
     Every test assumes exactly the law that the record says was run; the family of all of them is wrong with
-    probability at most ``level`` (Holm). A test with nothing to test (no noise, one graph) is left out of it.
+    probability at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out.
 
     Parameters
     ----------
@@ -184,6 +191,7 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     covariance = _covariance(means, prediction)
     innovations = innovation_tests(observation)
     switching = switching_test(observation.modes, prediction.step.transition)
+    loss, p_broadcast = loss_test(observation), broadcast_p(observation)
     family = [("system error", system_error.p)]
     family += [(f"error of agent {i}", node.p) for i, node in enumerate(node_errors, start=1)]
     family += [
@@ -192,6 +200,8 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
         ("innovations: whiteness", innovations.p_whiteness),
         ("innovations: gains", innovations.p_gain),
         ("switching", switching.p),
+        ("loss", loss.p if loss else None),
+        ("broadcast", p_broadcast),
     ]
     return Comparison(
         trajectory=trajectory,
@@ -206,6 +216,8 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
         batch=batch_interval(means.system_series),
         tests=_judge(family, level),
         running=_running(means, prediction.step.dt),
+        loss=loss,
+        p_broadcast=p_broadcast,
     )
 
 
@@ -259,7 +271,15 @@ def _covariance(means: TimeMeans, prediction: Prediction) -> CovarianceTest:
         note = "too many agents for a joint test; the node errors are tested one by one"
         return CovarianceTest(measured, predicted, note=note)
     chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
-    return CovarianceTest(measured, predicted, chi2, dof, float(stats.chi2.sf(chi2, dof)) if dof else None)
+    p: float | None = None
+    if dof and not means.squares:
+        p = float(stats.chi2.sf(chi2, dof))
+    elif dof and means.squares > dof:
+        # The covariance is itself estimated, from so many squares. Chi-square would reject too often, and Hotelling's
+        # law, which takes all of it for estimated, a little too seldom.
+        rest = means.squares - dof
+        p = float(stats.f.sf(chi2 * rest / (dof * (means.squares - 1)), dof, rest))
+    return CovarianceTest(measured, predicted, chi2, dof, p)
 
 
 def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:

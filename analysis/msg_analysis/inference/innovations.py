@@ -1,7 +1,8 @@
 """What a step adds that its mean does not explain: e(k) = x(k+1) - W_g(k) x(k) - offset_g(k).
 
 Under the model the e(k) are independent N(0, N_g(k)), whatever the graphs do; so these tests are exact or
-nearly so, and find what the time means hardly see.
+nearly so, and find what the time means hardly see. With noise or loss on the air, what the agents heard takes
+the place of others' states (see ``reception``), and the same holds given that.
 """
 
 from __future__ import annotations
@@ -11,14 +12,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from msg_analysis.inference.gaussian import covariance_statistic
 from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.reception import (
+    NO_NOISE,
+    Equalizer,
+    HeardRegression,
+    Reception,
+    full_reception_noise,
+    process_noise,
+)
 from msg_analysis.model.step import StepModel
 from msg_analysis.types import FloatArray, IntArray
 
 LAGS = 10
 MAX_REGRESSORS = 400
-NO_NOISE = 1e-13
-"""Directions with less variance than this, relative to the noisiest one, count as free of noise."""
 ROUNDING = 1e-9
 """Relative size of what counts as rounding in such directions."""
 
@@ -41,22 +49,18 @@ class InnovationTests:
 
 @dataclass(slots=True, eq=False)
 class _Sums:
-    """Sums over the steps and replicas of each graph; z is the deviation of the agents, then a constant 1.
+    """Sums over the steps and replicas of each graph.
 
     Attributes
     ----------
     samples : (n,)
     noise : (n, m, m) sum of e e^T
-    score : (n, m, m + 1) sum of e z^T
-    inputs : (n, m + 1, m + 1) sum of z z^T
     quiet : largest |e| in directions without noise
     largest : largest |x|
     """
 
     samples: IntArray
     noise: FloatArray
-    score: FloatArray
-    inputs: FloatArray
     quiet: float = 0.0
     largest: float = 0.0
 
@@ -76,23 +80,34 @@ class _Directions:
 
 
 def innovation_tests(observation: Observation) -> InnovationTests:
-    """Test the innovations of a run; all None with lost messages, which make them depend on the state."""
-    step = observation.step
-    if step.loss:
-        return InnovationTests(None, None, None)
-    directions = [_directions(noise) for noise in step.noise]
-    sums, p_whiteness = _pass(observation, directions)
+    """Test the innovations of a run."""
+    step, on_air = observation.step, observation.prediction.experiment.noise.on_air
+    noises = full_reception_noise(observation) if on_air else step.noise
+    directions = [_directions(noise) for noise in noises]
+    regression: _StateRegression | HeardRegression = (
+        HeardRegression(observation, MAX_REGRESSORS) if on_air else _StateRegression(observation)
+    )
+    varies = step.loss > 0.0 and observation.prediction.experiment.noise.link > 0.0
+    equalizer = Equalizer(process_noise(step), noises) if varies else None
+    sums, p_whiteness = _pass(observation, directions, regression, equalizer)
     # What NO_NOISE hides may be there: ten standard deviations of it.
-    hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in step.noise))
-    moved = sums.quiet > max(ROUNDING * sums.largest, hidden)
-    p_covariance = 0.0 if moved else _covariance_p(step, directions, sums)
-    return InnovationTests(p_covariance, p_whiteness, _gain_p(step, sums))
+    hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in noises))
+    if sums.quiet > max(ROUNDING * sums.largest, hidden):
+        p_covariance: float | None = 0.0
+    elif equalizer and not equalizer.possible:
+        p_covariance = equalizer.p_size()
+    else:
+        p_covariance = _covariance_p(noises, directions, sums)
+    chi2, dof = quadratic_form(*regression.statistic())
+    return InnovationTests(p_covariance, p_whiteness, float(stats.chi2.sf(chi2, dof)) if dof else None)
 
 
-def innovations(observation: Observation, first: int, last: int) -> FloatArray:
-    """(last - first, m, R): e of the steps first..last-1."""
+def innovations(observation: Observation, first: int, last: int, reception: Reception | None = None) -> FloatArray:
+    """(last - first, m, R): e of the steps first..last-1, given what was heard, if that was not the states."""
     step, now = observation.step, observation.states[first:last]
     after = observation.states[first + 1 : last + 1].copy()
+    if reception is not None:
+        return np.asarray(after - reception.mean() - step.offsets[reception.modes][:, :, None])
     for mode in range(step.modes):
         at = np.flatnonzero(observation.modes[first:last] == mode)
         after[at] -= step.weights[mode] @ now[at] + step.offsets[mode][:, None]
@@ -106,34 +121,43 @@ def _directions(noise: FloatArray) -> _Directions:
     return _Directions((vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:])
 
 
-def _pass(observation: Observation, directions: list[_Directions]) -> tuple[_Sums, float | None]:
-    """One pass over the run: the sums of each graph, and the whiteness test."""
-    step, n, m = observation.step, observation.step.modes, observation.step.agents
-    consensus = observation.prediction.experiment.problem == "consensus"
-    sums = _Sums(np.zeros(n, np.int64), np.zeros((n, m, m)), np.zeros((n, m, m + 1)), np.zeros((n, m + 1, m + 1)))
+def _pass(
+    observation: Observation,
+    directions: list[_Directions],
+    regression: _StateRegression | HeardRegression,
+    equalizer: Equalizer | None,
+) -> tuple[_Sums, float | None]:
+    """One pass over the run: the sums of each graph, the regression, and the whiteness test."""
+    n, m = observation.step.modes, observation.step.agents
+    sums = _Sums(np.zeros(n, np.int64), np.zeros((n, m, m)))
     # Graphs may differ in the number of noisy directions; the strongest ones that all have are iid N(0, I) in
     # any case.
     whitened = _Whiteness(min(len(d.whitener) for d in directions))
-    for first, last in observation.blocks(observation.states[0].size):
-        e, x = innovations(observation, first, last), observation.states[first:last]
-        sums.largest = max(sums.largest, float(np.abs(x).max()))
-        z = np.ones((last - first, m + 1, observation.replicas))
-        z[:, :m] = x - (x.mean(axis=1, keepdims=True) if consensus else step.reference)
+    for first, last in observation.blocks(max(observation.states[0].size, regression.numbers_per_step)):
+        modes = observation.modes[first:last]
+        if isinstance(regression, HeardRegression):
+            reception = Reception.of(observation, first, last)
+            e = innovations(observation, first, last, reception)
+            regression.add(reception, e)
+            if equalizer:
+                e = equalizer.equalize(e, modes, reception.link_variance)
+                sums.quiet = max(sums.quiet, equalizer.quiet)
+        else:
+            e = innovations(observation, first, last)
+            regression.add(modes, observation.states[first:last], e)
+        sums.largest = max(sums.largest, float(np.abs(observation.states[first:last]).max()))
         white = np.empty((last - first, whitened.rank, observation.replicas))
         for mode, direction in enumerate(directions):
-            at = np.flatnonzero(observation.modes[first:last] == mode)
+            at = np.flatnonzero(modes == mode)
             if not at.size:
                 continue
-            flat_e = e[at].transpose(1, 0, 2).reshape(m, -1)
-            flat_z = z[at].transpose(1, 0, 2).reshape(m + 1, -1)
-            sums.samples[mode] += flat_e.shape[1]
-            sums.noise[mode] += flat_e @ flat_e.T
-            sums.score[mode] += flat_e @ flat_z.T
-            sums.inputs[mode] += flat_z @ flat_z.T
-            sums.quiet = max(sums.quiet, float(np.abs(direction.quiet.T @ flat_e).max(initial=0.0)))
+            flat = e[at].transpose(1, 0, 2).reshape(m, -1)
+            sums.samples[mode] += flat.shape[1]
+            sums.noise[mode] += flat @ flat.T
+            sums.quiet = max(sums.quiet, float(np.abs(direction.quiet.T @ flat).max(initial=0.0)))
             white[at] = direction.whitener[: whitened.rank] @ e[at]
         whitened.add(white)
-    return sums, whitened.p_value()
+    return sums, None if equalizer and not equalizer.possible else whitened.p_value()
 
 
 class _Whiteness:
@@ -181,51 +205,62 @@ class _Whiteness:
         return float(stats.chi2.sf(chi2, dof))
 
 
-def _covariance_p(step: StepModel, directions: list[_Directions], sums: _Sums) -> float | None:
-    """Likelihood-ratio test of the whitened covariance against I, with Bartlett's correction.
-
-    Anderson, An Introduction to Multivariate Statistical Analysis, section 10.8. Over all steps when the
-    noise is the same in every graph, else per graph and added up. With too few samples for a determinant: the
-    exact chi-square of the total size.
-    """
-    groups = [list(range(step.modes))] if (step.noise == step.noise[0]).all() else [[g] for g in range(step.modes)]
+def _covariance_p(noises: FloatArray, directions: list[_Directions], sums: _Sums) -> float | None:
+    """Of all steps together when the noise is the same in every graph, else per graph and added up."""
+    modes = range(len(noises))
+    groups = [list(modes)] if (noises == noises[0]).all() else [[g] for g in modes]
     statistic, dof = 0.0, 0.0
     for group in groups:
         whitener = directions[group[0]].whitener
-        rank, samples = len(whitener), int(sums.samples[group].sum())
-        if not rank or not samples:
-            continue
-        scatter = whitener @ sums.noise[group].sum(axis=0) @ whitener.T
-        if samples < 10 * rank:
-            # A chi-square of its own many degrees of freedom, brought to one so that the sum stays one.
-            p = stats.chi2.sf(np.trace(scatter), samples * rank)
-            statistic, dof = statistic + stats.chi2.isf(min(2 * min(p, 1 - p), 1.0), 1), dof + 1
-            continue
-        covariance = scatter / samples
-        sign, logdet = np.linalg.slogdet(covariance)
-        if sign <= 0:
-            return 0.0
-        correction = 1 - (2 * rank**2 + 3 * rank - 1) / (6 * samples * (rank + 1))
-        statistic += correction * samples * (np.trace(covariance) - logdet - rank)
-        dof += rank * (rank + 1) / 2
+        samples = int(sums.samples[group].sum())
+        if len(whitener) and samples:
+            scatter = whitener @ sums.noise[group].sum(axis=0) @ whitener.T
+            part = covariance_statistic(scatter, samples)
+            statistic, dof = statistic + part[0], dof + part[1]
     return float(stats.chi2.sf(statistic, dof)) if dof else None
 
 
-def _gain_p(step: StepModel, sums: _Sums) -> float | None:
+class _StateRegression:
     """Score test: the innovations of row i do not depend on what row i of W_g uses.
 
     The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a
     phi_b given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated
-    noise too.
+    noise too. All regressors are linear in z, the deviations of the agents and a constant 1.
     """
-    rows, inputs = _regressors(step)
-    score = np.einsum("gac,gac->a", sums.score[:, rows], inputs)
-    covariance = np.zeros((len(rows), len(rows)))
-    for mode in range(step.modes):
-        products = inputs[mode] @ sums.inputs[mode] @ inputs[mode].T
-        covariance += step.noise[mode][np.ix_(rows, rows)] * products
-    chi2, dof = quadratic_form(score, covariance)
-    return float(stats.chi2.sf(chi2, dof)) if dof else None
+
+    def __init__(self, observation: Observation) -> None:
+        self._step = step = observation.step
+        self._centred = observation.prediction.experiment.problem == "consensus"
+        size = step.agents + 1
+        self._scores = np.zeros((step.modes, step.agents, size))  # sum of e z^T
+        self._inputs = np.zeros((step.modes, size, size))  # sum of z z^T
+
+    @property
+    def numbers_per_step(self) -> int:
+        """Size of the largest temporary array."""
+        return 0
+
+    def add(self, modes: IntArray, states: FloatArray, innovations: FloatArray) -> None:
+        """Take a block of steps: graphs (b,), states and innovations (b, m, R)."""
+        m = self._step.agents
+        z = np.ones((len(modes), m + 1, states.shape[2]))
+        z[:, :m] = states - (states.mean(axis=1, keepdims=True) if self._centred else self._step.reference)
+        for mode in range(self._step.modes):
+            at = np.flatnonzero(modes == mode)
+            flat_e = innovations[at].transpose(1, 0, 2).reshape(m, -1)
+            flat_z = z[at].transpose(1, 0, 2).reshape(m + 1, -1)
+            self._scores[mode] += flat_e @ flat_z.T
+            self._inputs[mode] += flat_z @ flat_z.T
+
+    def statistic(self) -> tuple[FloatArray, FloatArray]:
+        """U (K,) and Cov (K, K)."""
+        rows, inputs = _regressors(self._step)
+        score = np.einsum("gac,gac->a", self._scores[:, rows], inputs)
+        covariance = np.zeros((len(rows), len(rows)))
+        for mode in range(self._step.modes):
+            products = inputs[mode] @ self._inputs[mode] @ inputs[mode].T
+            covariance += self._step.noise[mode][np.ix_(rows, rows)] * products
+        return score, covariance
 
 
 def _regressors(step: StepModel) -> tuple[IntArray, FloatArray]:

@@ -12,6 +12,14 @@ those that did, so that the standard errors do not break down in runs with a few
 second moments s_k packed, and a_k = (s_k, 1), it is exact.
 Replicas share the path of the graphs: they are averaged inside h, and share the part of Cov(D_k) that is due
 to the jump.
+
+Replicas also share lost messages, on which the noise of a step depends too. Then D_k is split at the moment when
+the step has been made and the graph has not jumped yet: with F_k = E[f(y_k+1, g_k+1) | y_k+1, g_k],
+
+    D_k = (F_k - E[f(next) | now])  +  (f(next) - F_k).
+
+The variance of the second part, the jump's, given y_k+1 and g_k is known as before; the first part is squared:
+every step adds to it, so its squares do add up to its variance.
 """
 
 from __future__ import annotations
@@ -43,9 +51,10 @@ class TimeMeans:
     measured : (q,) time means, replicas averaged
     predicted : (q,) their exact expectation under the run's start and length
     covariance : (q, q) of measured under the model
+    squares : number of steps whose squares make up ``covariance``; 0 where it is known from the model
     nodes : (m, q) the node errors as combinations of them
     system_series : (N,) system error of every step, replicas averaged
-    system_variances : (N,) Var(D_k | y_k, g_k) of the system error
+    system_variances : (N,) of the system error: Var(D_k | y_k, g_k), or what stands for it with lost messages
     """
 
     second_moments: FloatArray
@@ -54,6 +63,7 @@ class TimeMeans:
     measured: FloatArray
     predicted: FloatArray
     covariance: FloatArray
+    squares: int
     nodes: FloatArray
     system_series: FloatArray
     system_variances: FloatArray
@@ -121,6 +131,41 @@ class _Value:
         return np.asarray(total + a @ linear / replicas)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _SharedValue:
+    """The same where replicas share lost messages; b = (s, 1) is that of the next state, before the jump.
+
+    Attributes
+    ----------
+    probability : (n,) P_gj
+    surprises : (n, q, p + 1): f(next) - F_k = surprises[j] @ b for the next graph j
+    reached : (q, p + 1): F_k = reached @ b
+    expected : (q, p + 1): E[f(next)] = expected @ a
+    """
+
+    probability: FloatArray
+    surprises: FloatArray
+    reached: FloatArray
+    expected: FloatArray
+
+    def increments(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """(steps, q): F_k - E[f(next)] of steps with these a and b, both (steps, p + 1)."""
+        return np.asarray(b @ self.reached.T - a @ self.expected.T)
+
+    def jumps(self, b: FloatArray) -> FloatArray:
+        """(q, q): sum over steps of Cov(f(next) - F_k), with b (steps, p + 1)."""
+        total = np.zeros((self.surprises.shape[1],) * 2)
+        for probability, surprise in zip(self.probability, self.surprises, strict=True):
+            surprised = b @ surprise.T
+            total += probability * (surprised.T @ surprised)
+        return total
+
+    def jump_variances(self, combination: FloatArray, b: FloatArray) -> FloatArray:
+        """(steps,): Var(f(next) - F_k) of one combination (q,) of the forms."""
+        parts = [(b @ (combination @ surprise)) ** 2 for surprise in self.surprises]
+        return np.asarray(self.probability @ np.array(parts))
+
+
 def expected_mean(observation: Observation) -> FloatArray:
     """(d, d) exact mean of E[y(k) y(k)^T] over the run's steps: steady, or transient from the known start.
 
@@ -157,16 +202,23 @@ def time_means(observation: Observation) -> TimeMeans:
     covariance = np.zeros((len(forms), len(forms)))
     series, variances = np.empty(steps), np.empty(steps)
     for first, last in observation.blocks(max(p, observation.states[0].size)):
-        a = np.ones((last - first, p + 1))
-        a[:, :p] = _moments(observation, first, last)
-        series[first:last] = a[:, :p] @ (trace @ forms)
+        a = np.ones((last + 1 - first, p + 1))
+        a[:, :p] = _moments(observation, first, last + 1)
+        series[first:last] = a[:-1, :p] @ (trace @ forms)
         for mode, value in enumerate(values):
             at = np.flatnonzero(observation.modes[first:last] == mode)
             totals[mode] += a[at].sum(axis=0)
-            covariance += value.jumps(a[at])
-            variances[first + at] = value.variances(trace, a[at], observation.replicas)
+            if isinstance(value, _Value):
+                covariance += value.jumps(a[at])
+                variances[first + at] = value.variances(trace, a[at], observation.replicas)
+            else:
+                b = a[at + 1]
+                increments = value.increments(a[at], b)
+                covariance += increments.T @ increments + value.jumps(b)
+                variances[first + at] = (increments @ trace) ** 2 + value.jump_variances(trace, b)
     for value, total in zip(values, totals, strict=True):
-        covariance += value.spread(total) / observation.replicas
+        if isinstance(value, _Value):
+            covariance += value.spread(total) / observation.replicas
     moments = totals.sum(axis=0)[:p] / steps
     expected = expected_mean(observation)
     return TimeMeans(
@@ -176,22 +228,21 @@ def time_means(observation: Observation) -> TimeMeans:
         measured=forms @ moments,
         predicted=forms @ symmetric.pack(expected),
         covariance=covariance / steps**2,
+        squares=0 if system.loss_variance is None else steps,
         nodes=nodes,
         system_series=series,
         system_variances=variances,
     )
 
 
-def _values(prediction: Prediction, forms: FloatArray) -> list[_Value]:
-    """One for each graph. The spread that lost messages add to the noise enters with its steady mean."""
+def _values(prediction: Prediction, forms: FloatArray) -> list[_Value | _SharedValue]:
+    """One for each graph."""
     system = prediction.system
     dual = prediction.solver.dual(symmetric.unpack(forms, system.dimension))
     _, kappa = mode_potential(system, dual)
     packed = np.moveaxis(symmetric.pack(dual), 1, 0)
-    usual = prediction.steady / system.stationary[:, None, None]
-    moved = system.matrices @ usual @ system.matrices.transpose(0, 2, 1)
-    noise = system.noise + (system.propagate(usual) - moved)
-    values = []
+    here = np.concatenate([packed, kappa.T[:, :, None]], axis=2)  # f(y, j) = here[j] @ (s, 1)
+    values: list[_Value | _SharedValue] = []
     for mode, step in enumerate(system.matrices):
         before = step.T @ dual @ step  # (q, n, d, d): the adjoint of what this graph's step does
         if system.loss_variance is not None:
@@ -199,8 +250,12 @@ def _values(prediction: Prediction, forms: FloatArray) -> list[_Value]:
         constant = packed @ symmetric.pack(system.noise[mode]) + kappa.T
         ahead = np.concatenate([np.moveaxis(symmetric.pack(before), 1, 0), constant[:, :, None]], axis=2)
         law = system.chain[mode]
-        surprises = ahead - np.tensordot(law, ahead, axes=1)
-        values.append(_Value(law, surprises, np.moveaxis(dual, 1, 0), step, noise[mode]))
+        expected = np.tensordot(law, ahead, axes=1)
+        if system.loss_variance is None:
+            values.append(_Value(law, ahead - expected, np.moveaxis(dual, 1, 0), step, system.noise[mode]))
+        else:
+            reached = np.tensordot(law, here, axes=1)
+            values.append(_SharedValue(law, here - reached, reached, expected))
     return values
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from msg_analysis.model.step import StepModel
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 BLOCK_NUMBERS = 2_000_000
 """Numbers of temporary arrays per block of steps: 16 MB each, however long the run."""
@@ -24,18 +24,30 @@ class Observation:
     states : (N + 1, m, R) x(0..N)
     modes : (N,) g(0..N-1)
     start : (m, R) x(0) of the record
+    published : (N + 1, m, R) what others heard of x(0..N), where that is not the truth; else None
+    lost : (N, m, D) see ``Trajectory.lost``
     """
 
     prediction: Prediction
     states: FloatArray
     modes: IntArray
     start: FloatArray
+    published: FloatArray | None = None
+    lost: BoolArray | None = None
 
     @classmethod
     def of(cls, trajectory: Trajectory, prediction: Prediction) -> Observation:
         """Everything before the first gap."""
         steps = trajectory.prefix
-        return cls(prediction, trajectory.states[: steps + 1], trajectory.modes[:steps], trajectory.record.start)
+        published, lost = trajectory.published, trajectory.lost
+        return cls(
+            prediction,
+            trajectory.states[: steps + 1],
+            trajectory.modes[:steps],
+            trajectory.record.start,
+            None if published is None else published[: steps + 1],
+            None if lost is None else lost[:steps],
+        )
 
     @property
     def step(self) -> StepModel:

@@ -124,11 +124,8 @@ class Experiment:
         lines = []
         if self.run.pace == "realtime":
             lines.append(problem("run.pace", "'realtime'", "not available yet", "use lockstep"))
-        if purpose == "run":
-            for key in ("broadcast", "link", "loss", "delay"):
-                value = getattr(self.noise, key)
-                if value > 0:
-                    lines.append(problem(f"noise.{key}", value, "not available in runs yet", "use 0"))
+        if purpose == "run" and self.noise.delay > 0:
+            lines.append(problem("noise.delay", self.noise.delay, "not available in runs yet", "use 0"))
         return lines
 
     def require_available(self, purpose: Purpose = "run") -> None:
@@ -323,8 +320,10 @@ class _Sections:
         assert self.agents is not None
         steps = round(run.duration / run.dt) if run else 1
         replicas = run.replicas if run else 1
-        delay = self.values["noise"].delay if self.values["noise"] else 0
-        found = validation.memory_problems(self.agents, len(self.values["graphs"]), steps, replicas, delay)
+        noise = self.values["noise"]
+        delay, broadcast = (noise.delay, noise.broadcast) if noise else (0, 0.0)
+        modes = len(self.values["graphs"])
+        found = validation.memory_problems(self.agents, modes, steps, replicas, delay, broadcast)
         self.problems += found
         return not found
 

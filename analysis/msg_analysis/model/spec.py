@@ -215,9 +215,14 @@ class NoiseSpec(_Section):
     )
 
     @property
+    def on_air(self) -> bool:
+        """Whether something becomes of values between the agents: broadcast noise, link noise or loss."""
+        return bool(self.broadcast or self.link or self.loss)
+
+    @property
     def steps_only(self) -> bool:
         """Whether there is something that only steps can have: noise on the air, loss or delay."""
-        return bool(self.broadcast or self.link or self.loss or self.delay)
+        return self.on_air or self.delay > 0
 
 
 class LeadersSpec(_Section):

@@ -24,15 +24,16 @@ class StepModel:
 
     Attributes
     ----------
-    weights : (n, m, m) mean W_g: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time); rows of grounded
-        leaders are zero
+    weights : (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
+    nominal : (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time); rows
+        of grounded leaders are zero
     offsets : (n, m) what the reference adds, so that the reference is a fixed point
     noise_gain : (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
     noise : (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
     delay : age d, in steps, of the states of others that a step uses
-    loss : probability that a directed message is ignored in a step. ``weights`` is the mean over it already; the
-        spread adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment (``loss_variance``)
-    loss_variance : (n, m, m) p (1 - p) (W_g)_ij^2 off the diagonal
+    loss : probability that a directed message is ignored in a step. ``weights`` is the mean over it; the spread adds
+        sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment (``loss_variance``)
+    loss_variance : (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal
     transition : (n, n) P
     stationary : (n,) pi
     initial : (n,) law of g(0)
@@ -42,6 +43,7 @@ class StepModel:
     """
 
     weights: FloatArray
+    nominal: FloatArray
     offsets: FloatArray
     noise_gain: FloatArray
     noise: FloatArray
@@ -67,13 +69,23 @@ class StepModel:
 
     def inputs(self, mode: int, agent: int) -> IntArray:
         """Agents, ascending, whose states row ``agent`` of W_mode uses; the agent itself always among them."""
-        used = self.weights[mode, agent] != 0.0
+        used = self.nominal[mode, agent] != 0.0
         used[agent] = True
         return np.flatnonzero(used)
 
+    def neighbours(self, mode: int, agent: int) -> IntArray:
+        """The other agents, ascending, whose states row ``agent`` of W_mode uses."""
+        used = self.inputs(mode, agent)
+        return np.asarray(used[used != agent])
+
+    @property
+    def most_neighbours(self) -> int:
+        """Largest number D of neighbours that any agent has in any graph."""
+        return int((self.nominal != 0.0).sum(axis=2, where=~np.eye(self.agents, dtype=bool)).max())
+
     def listens(self) -> BoolArray:
         """(m, m): whether agent i uses the state of agent j != i in any graph."""
-        used: BoolArray = (self.weights != 0.0).any(axis=0)
+        used: BoolArray = (self.nominal != 0.0).any(axis=0)
         np.fill_diagonal(used, False)
         return used
 
@@ -125,6 +137,7 @@ def build_step_model(experiment: Experiment) -> StepModel:
         initial = np.array([float(graph.name == experiment.switching.initial) for graph in graphs])
     return StepModel(
         weights=mean,
+        nominal=weights,
         offsets=offsets,
         noise_gain=gain,
         noise=noise,

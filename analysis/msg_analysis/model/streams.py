@@ -23,6 +23,9 @@ class Stream(IntEnum):
     SWITCHING = 1
     START = 2
     PROCESS = 3
+    BROADCAST = 4
+    LINK = 5
+    LOSS = 6
 
 
 def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.random.Generator:
@@ -32,11 +35,16 @@ def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.r
     ----------
     seed : the experiment's seed, >= 0
     stream : what the numbers are for
-    agent : index of the agent from 0 (0 where the stream belongs to nobody)
+    agent : index of the agent from 0 (0 where the stream belongs to nobody), or number of the link
     block : number of the block of steps, step // STEPS_PER_BLOCK
     """
     key = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     return np.random.Generator(np.random.Philox(key=key, counter=[0, block, agent, int(stream)]))
+
+
+def link_number(receiver: int, sender: int) -> int:
+    """What stands for the agent in the streams of a directed link, from sender to receiver (indices from 0)."""
+    return receiver << 32 | sender
 
 
 def normals(seed: int, stream: Stream, agent: int, block: int, shape: tuple[int, ...]) -> FloatArray:

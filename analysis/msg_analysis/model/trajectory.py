@@ -14,6 +14,8 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 class Completeness:
     """What came and what did not, counted in states x_i(k): m (N + 1) are expected of a run of N steps.
 
+    With broadcast noise every state is expected twice: as it is, and as it was published.
+
     Attributes
     ----------
     expected, received, missing : states; received counts each (agent, step) once
@@ -48,6 +50,11 @@ class Trajectory:
     modes : (N,) index from 0 of the graph used in the step k -> k+1; -1 where not known
     agent_modes : (N + 1, m) graph that each agent says it used in the step that led to this state (from 0; -1 at
         step 0 and where missing), or None where nobody logged it
+    published : (N + 1, m, replicas) what the agents published of their states, NaN where missing; None without
+        broadcast noise: the states themselves
+    lost : (N, m, D) whether in the step k -> k+1 agent i did not get the message of its d-th neighbour, ascending,
+        under the graph of that step (see ``StepModel.neighbours``); D is the largest number of neighbours. None
+        where messages cannot be lost
     completeness : the account of what is there
     """
 
@@ -56,11 +63,16 @@ class Trajectory:
     modes: IntArray
     completeness: Completeness
     agent_modes: IntArray | None = None
+    published: FloatArray | None = None
+    lost: BoolArray | None = None
 
     @property
     def present(self) -> BoolArray:
-        """(N + 1, m): which states are there."""
-        return np.asarray(~np.isnan(self.states).any(axis=2))
+        """(N + 1, m): which states are there, with what was published of them."""
+        there = ~np.isnan(self.states).any(axis=2)
+        if self.published is not None:
+            there &= ~np.isnan(self.published).any(axis=2)
+        return np.asarray(there)
 
     @property
     def prefix(self) -> int:

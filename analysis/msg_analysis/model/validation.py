@@ -308,9 +308,15 @@ def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
     return found
 
 
-def memory_needed(agents: int, modes: int, steps: int, replicas: int, delay: int = 0) -> tuple[int, int]:
-    """Bytes for the states of a run, and for the matrices of all graphs, which a delay makes larger."""
-    return (steps + 1) * agents * replicas * 8, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
+def memory_needed(
+    agents: int, modes: int, steps: int, replicas: int, delay: int = 0, broadcast: float = 0.0
+) -> tuple[int, int]:
+    """Bytes for the states of a run, and for the matrices of all graphs, which a delay makes larger.
+
+    With broadcast noise the states are there twice: as they are, and as they were published.
+    """
+    states = (steps + 1) * agents * replicas * 8 * (2 if broadcast else 1)
+    return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
 
 
 def available_memory() -> int:
@@ -324,10 +330,12 @@ def available_memory() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int) -> list[str]:
+def memory_problems(
+    agents: int, modes: int, steps: int, replicas: int, delay: int, broadcast: float = 0.0
+) -> list[str]:
     """States and matrices that cannot fit in memory."""
     available = available_memory()
-    states, matrices = memory_needed(agents, modes, steps, replicas, delay)
+    states, matrices = memory_needed(agents, modes, steps, replicas, delay, broadcast)
     if states + matrices <= available:
         return []
     room = f"expected at most {amount(available)}, the memory available"

@@ -30,7 +30,12 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     document = experiment.to_document()
     chain = experiment.chain
     states, matrices = validation.memory_needed(
-        experiment.agents, chain.modes, experiment.steps, experiment.run.replicas, experiment.noise.delay
+        experiment.agents,
+        chain.modes,
+        experiment.steps,
+        experiment.run.replicas,
+        experiment.noise.delay,
+        experiment.noise.broadcast,
     )
     limits = [_stability_limit(experiment, graph) for graph in experiment.graph_list]
     return {

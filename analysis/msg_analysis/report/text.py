@@ -76,6 +76,9 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
     )
     _print_errors(document, console)
     _print_tests(document, console)
+    loss = document.get("loss") or {}
+    if loss.get("lost") is not None:
+        console.print(f"{loss['lost']} messages lost, {loss['expected']:.6g} expected")
     interval = document["batch_means"]["interval"]
     console.print(f"95 % interval of batch means, free of the model: {_interval(interval)}", style="dim")
     continuous = document["continuous"]["system_error"]

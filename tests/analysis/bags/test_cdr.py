@@ -24,6 +24,7 @@ from msg_analysis.bags.cdr import (
     decode_string,
     encode_string,
     stamp_ns,
+    with_state,
 )
 
 RUN = bytes(range(16))
@@ -200,6 +201,34 @@ def test_frame_refuses_what_is_not_its_own() -> None:
     ]
     assert all(frame.unwrap(other.encode()) is None for other in others)
     assert frame.unwrap(b"") is None
+
+
+@pytest.mark.parametrize("replicas", [1, 16])
+@pytest.mark.parametrize("heard", [[8], [8, 2**64 - 1, 8]])
+def test_fast_codec_with_heard_is_the_general_one(typestore: Any, replicas: int, heard: list[int]) -> None:
+    payload = struct.pack(f"<{replicas}d", *range(replicas))
+    data = StateCodec(RUN, 7, replicas, 0.25).wrap(9, 1, payload, heard)
+    state = np.arange(replicas, dtype=float)
+    message = AgentState(2_250_000_000, RUN, 7, 9, 1, state, np.array(heard, np.uint64))
+    assert data == _oracle(typestore, message)
+    frame = StateFrame(RUN, replicas, 3)
+    assert frame.unwrap(data) == (7, 9, 1, payload)
+    assert len(data) <= frame.size
+    other = struct.pack(f"<{replicas}d", *range(1, replicas + 1))
+    assert frame.unwrap(with_state(data, other)) == (7, 9, 1, other)
+    assert AgentState.decode(with_state(data, other)).heard.tolist() == heard
+    assert StateFrame(RUN, replicas).unwrap(data) is None  # of a run in which nothing can be lost
+    if len(heard) > 1:
+        assert StateFrame(RUN, replicas, len(heard) - 1).unwrap(data) is None
+
+
+def test_frame_with_heard_refuses_what_is_not_its_own() -> None:
+    """Every length, every byte before the state changed: refused or, where the field may be anything, another one."""
+    frame, good = StateFrame(RUN, 2, 3), StateCodec(RUN, 1, 2, 0.1).wrap(2, 1, bytes(16), [1, 1])
+    assert frame.unwrap(good) == (1, 2, 1, bytes(16))
+    assert all(frame.unwrap(good[:length]) is None for length in range(len(good)))
+    for place in [*range(4), *range(12, 33), *range(56, 60), *range(76, 80)]:  # header, frame_id, run, both lengths
+        assert frame.unwrap(good[:place] + bytes([good[place] ^ 0xFF]) + good[place + 1 :]) is None, place
 
 
 def test_codec_refuses_a_state_that_would_be_another_message() -> None:

@@ -52,6 +52,12 @@ def test_topics() -> None:
         "/agent_1/state",
         "/agent_2/state",
     ]
+    assert [topic.name for topic in network_topics(2, truth=True)][2:] == [
+        "/agent_1/state",
+        "/agent_2/state",
+        "/agent_1/truth",
+        "/agent_2/truth",
+    ]
     named = network_topics(1, "/lab/")
     assert [topic.name for topic in named] == ["/lab/experiment", "/lab/graph", "/lab/agent_1/state"]
     assert [topic.qos[0]["durability"] for topic in named] == ["transient_local", "transient_local", "volatile"]

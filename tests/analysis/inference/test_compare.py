@@ -90,28 +90,34 @@ def simulate_air(experiment, seed):
     modes = [int(random.choice(chain.modes, p=chain.stationary))]
     while len(modes) < experiment.steps:
         modes.append(int(random.choice(chain.modes, p=chain.transition(dt)[modes[-1]])))
-    states = np.zeros((experiment.steps + 1, m, replicas))
+    states, published = np.zeros((2, experiment.steps + 1, m, replicas))
+    lost = np.zeros((experiment.steps, m, max(int((a > 0).sum(axis=1).max()) for a in adjacency)), dtype=bool)
     for k, g in enumerate(modes):
         x = states[k]
-        sent = x + noise.broadcast * random.standard_normal(x.shape)
+        sent = published[k] = x + noise.broadcast * random.standard_normal(x.shape)
         heard = sent[None] + noise.link * random.standard_normal((m, m, replicas))
-        arrived = random.random((m, m, replicas)) >= noise.loss
-        pull = (adjacency[g][:, :, None] * arrived * (heard - x[:, None])).sum(axis=1)
+        arrived = random.random((m, m)) >= noise.loss
+        pull = (adjacency[g][:, :, None] * arrived[:, :, None] * (heard - x[:, None])).sum(axis=1)
         process = experiment.noise_gain[g] @ random.standard_normal(x.shape)
         states[k + 1] = x + dt * pull + np.sqrt(dt) * process
+        for i in range(m):
+            links = np.flatnonzero(adjacency[g][i])
+            lost[k, i, : len(links)] = ~arrived[i, links]
+    published[-1] = states[-1] + noise.broadcast * random.standard_normal(x.shape)
     record = RunRecord(uuid.UUID(int=seed), experiment, states[0])
-    count = states[:, :, 0].size
-    return Trajectory(record, states, np.array(modes), Completeness(count, count, 0))
+    count = 2 * states[:, :, 0].size
+    complete = Completeness(count, count, 0)
+    return Trajectory(record, states, np.array(modes), complete, None, published, lost if noise.loss else None)
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_calibration_with_noise_that_depends_on_the_graph(loss):
-    """60 runs; levels as in test_calibration. Lost messages leave the innovations untested."""
+    """60 runs; levels as in test_calibration, 10 or 11 tests."""
     noise = {"process": 0.2, "broadcast": 0.3, "link": 0.2, "loss": loss}
     air = changed(golden("air", duration=50, replicas=3, start="zero"), noise=noise)
     results = [compare(simulate_air(air, seed)) for seed in SEEDS]
     collected = [p_values(result) for result in results]
-    assert len(collected[0]) == (9 if loss == 0.0 else 6)
+    assert len(collected[0]) == (10 if loss == 0.0 else 11)
     for name in collected[0]:
         assert stats.kstest([p[name] for p in collected], "uniform").pvalue > 2e-4, name
     assert sum(r.verdict == "disagrees" for r in results) <= stats.binom.isf(1e-4, len(results), 0.01)
@@ -238,6 +244,8 @@ def test_too_little_data_get_no_numbers(short_run, step):
     assert document["system_error"]["predicted"] > 0
     assert document["innovations"] == {"p_covariance": None, "p_whiteness": None, "p_gain": None}
     assert document["switching"] == {"counts": None, "expected": None, "p": None}
+    assert document["loss"] == {"lost": None, "expected": None, "p": None}
+    assert document["broadcast"] == {"p": None}
     assert document["batch_means"]["interval"] == [None, None]
     assert document["tests"] == []
 

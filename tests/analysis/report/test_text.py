@@ -140,9 +140,9 @@ def test_experiment_explained() -> None:
 
 
 def test_experiment_that_cannot_be_run_yet() -> None:
-    document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"loss": 0.1}}))
+    document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"delay": 1}}))
     assert document["predicted_system_error"] > 0
-    assert "noise.loss: 0.1: not available in runs yet" in shown(text.print_experiment, document)
+    assert "noise.delay: 1: not available in runs yet" in shown(text.print_experiment, document)
 
 
 def test_noise_by_graph_and_delay_explained() -> None:

@@ -1,0 +1,85 @@
+"""Networks of processes with noise and loss on the air: equal to the twin, and as predicted."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msg_agents.check import check
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.inference.compare import compare
+from msg_analysis.twin import simulate
+
+GRID = [
+    {"broadcast": broadcast, "link": link, "loss": loss}
+    for broadcast, link, loss in product([0.0, 0.5], [0.0, 0.4], [0.0, 0.25])
+    if broadcast or link or loss
+]
+LEADERS = {"problem": "tracking", "leaders": {"agents": [1, 4], "gain": 0.7, "reference": 2.0}}
+ALL = GRID[-1]
+
+
+@pytest.mark.parametrize("noise", GRID, ids=json.dumps)
+def test_grid(network: Any, noise: dict[str, float]) -> None:
+    """800 steps: the bits of the twin, and |z| < 4 for the system and 5 agents: 4e-4 false alarms a case."""
+    what = network.experiment(noise=noise, run={"duration": 40, "replicas": 8, "processes": 2})
+    result = network.run(what)
+    assert result.failures == []
+    trajectory, twin = result.trajectory, simulate(what)
+    assert trajectory is not None
+    assert trajectory.completeness == twin.completeness
+    assert trajectory.completeness.expected == 5 * 801 * (2 if noise["broadcast"] else 1)
+    outcome = check(trajectory)
+    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert np.array_equal(trajectory.states, twin.states)
+    for mine, other in ((trajectory.published, twin.published), (trajectory.lost, twin.lost)):
+        assert (mine is None) == (other is None)
+        assert mine is None or np.array_equal(mine, other)
+    comparison = compare(trajectory)
+    assert all(abs(estimate.z) < 4 for estimate in [comparison.system_error, *comparison.node_errors])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {**LEADERS, "run": {"processes": "one_per_agent"}},
+        {
+            "time": "discrete",
+            "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
+            "run": {"dt": 1, "duration": 300, "processes": 1},
+        },
+    ],
+    ids=["tracking", "discrete"],
+)
+def test_other_laws_equal_the_twin(network: Any, changes: dict[str, Any]) -> None:
+    what = network.experiment(noise=ALL, **changes)
+    result = network.run(what)
+    assert result.failures == []
+    assert result.trajectory.completeness.complete
+    assert check(result.trajectory).difference is None
+
+
+def test_killed_agents_come_back_with_their_noise(network: Any) -> None:
+    """What a new process publishes again is computed from the truth that the old one kept."""
+    run = {"duration": 120, "replicas": 64, "processes": 3}
+    file = network.file(noise=ALL, run=run)
+    process = network.start("run", file, "--out", network.directory / "runs", "--restarts", "3", "--json")
+    network.wait_until_moving()
+    for _ in range(2):
+        victims = network.wait_for(lambda: network.processes("agent"), 30, "a living agent")
+        random.Random(1).choice(victims).kill(signal.SIGKILL)
+    stdout, stderr = process.communicate(timeout=120)
+    assert process.returncode in (0, 1), stderr  # by chance one run in a hundred disagrees
+    result = json.loads(stdout)
+    assert len(result["restarts"]) >= 1
+    trajectory = read_bag(result["bag"])
+    assert trajectory.completeness.complete
+    assert trajectory.completeness.duplicates == 0
+    assert trajectory.completeness.refused == {}
+    assert check(trajectory).difference is None

@@ -1,0 +1,43 @@
+"""Large networks: many processes, and many agents in a few."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from msg_agents.check import check
+from msg_analysis.bags.reader import read_bag
+
+
+def grid(rows: int, columns: int) -> dict[str, Any]:
+    """Agents on a grid, so that processes hear processes that are not next to them, and on a path along its rows."""
+    return {"graphs": {"grid": {"grid": [rows, columns]}, "path": {"path": list(range(1, rows * columns + 1))}}}
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "processes"), [(5, 8, "one_per_agent"), (10, 10, 4)], ids=["40 in 40", "100 in 4"]
+)
+def test_complete_and_equal_to_the_twin(network: Any, rows: int, columns: int, processes: Any) -> None:
+    agents = rows * columns
+    run = {"duration": 5, "start": "zero", "processes": processes}
+    result = network.run(network.experiment(**grid(rows, columns), run=run))
+    assert result.failures == []
+    assert result.trajectory.completeness.complete
+    assert result.trajectory.completeness.duplicates == 0
+    outcome = check(result.trajectory)
+    assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, agents * 101)
+
+
+def test_a_killed_process_of_many_agents_comes_back(network: Any) -> None:
+    """What its agents had told each other directly has gone with it."""
+    file = network.file(**grid(6, 5), run={"duration": 100, "start": "zero", "processes": 2, "replicas": 16})
+    run = network.start("run", file, "--out", network.directory / "runs", "--restarts", "1", "--json")
+    network.wait_until_moving()
+    network.processes("agent")[0].kill()
+    stdout, stderr = run.communicate(timeout=110)
+    result = json.loads(stdout)
+    assert (len(result["restarts"]), result["failures"]) == (1, []), stderr
+    outcome = check(read_bag(result["bag"]))
+    assert (outcome.difference, outcome.missing) == (None, 0)
