@@ -55,6 +55,7 @@ format: setup ## Rewrite the code in the house style
 
 bench: setup ## Measure speed side by side with the bare middleware, and with other solvers
 	$(BIN)/python benchmarks/network.py
+	$(BIN)/python benchmarks/precision.py
 	$(BIN)/python benchmarks/moments.py
 	$(BIN)/python benchmarks/leaders.py
 
