@@ -5,6 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INTERFACES := ros_ws/src/msg_agents_interfaces
+EXAMPLES := ros_ws/src/msg_agents_example_protocols
 EXPERIMENTS := ros_ws/src/msg_agents_bringup/experiments
 RUNS := runs
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
@@ -28,8 +29,8 @@ $(VENV)/.interfaces: $(VENV)/.locked $(wildcard $(INTERFACES)/msg/*) $(INTERFACE
 	$(PIP) install $(LOCAL) --force-reinstall ./$(INTERFACES)
 	@touch $@
 
-$(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_analysis/model/*.c msg_agents/setup.* analysis/package.xml msg_agents/package.xml)
-	$(PIP) install $(LOCAL) --editable analysis --editable msg_agents
+$(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_analysis/model/*.c msg_agents/setup.* analysis/package.xml msg_agents/package.xml $(EXAMPLES)/setup.* $(EXAMPLES)/package.xml)
+	$(PIP) install $(LOCAL) --editable analysis --editable msg_agents --editable $(EXAMPLES)
 	@touch $@
 
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report

@@ -7,21 +7,27 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from msg_analysis.model.agent import ProtocolLaw
+from msg_analysis.model.air import LOST
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.law import step, weighted_sum
 from msg_analysis.model.noise import ProcessNoise
 from msg_analysis.model.path import mode_path
+from msg_analysis.model.payload import from_payload
+from msg_analysis.model.protocols import AgentProtocol
 from msg_analysis.model.reception import Reception, padded_inputs
 from msg_analysis.model.record import RunRecord
-from msg_analysis.model.step import StepModel, build_step_model
+from msg_analysis.model.step import StepModel, Wiring, build_model, build_step_model
 from msg_analysis.model.streams import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.model.trajectory import Completeness, Trajectory
 from msg_analysis.theory.prediction import stationary_start_factor
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
-def draw_start(experiment: Experiment, model: StepModel, first_mode: int) -> FloatArray:
+def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatArray:
     """(m, replicas) x(0): zero, the given values, or drawn from N(reference, C_g0 / pi_g0).
+
+    The last one needs a linear law.
 
     Parameters
     ----------
@@ -33,6 +39,7 @@ def draw_start(experiment: Experiment, model: StepModel, first_mode: int) -> Flo
         return np.zeros((experiment.agents, replicas))
     if start != "stationary":
         return np.repeat(np.array(start, dtype=float)[:, None], replicas, axis=1)
+    assert isinstance(model, StepModel), "experiments without a prediction start from given values"
     factor = stationary_start_factor(model, experiment.problem, first_mode)
     sources = [normals(experiment.run.seed, Stream.START, j, 0, (replicas,)) for j in range(experiment.agents)]
     deviations = np.array([weighted_sum([float(w) for w in row], sources) for row in factor])
@@ -46,9 +53,11 @@ def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecor
     ----------
     run : run id; a new random one if not given
     """
-    model = build_step_model(experiment)
+    model = build_model(experiment)
     modes = mode_path(experiment, model.initial)
     start = draw_start(experiment, model, int(modes[0]))
+    if experiment.protocol and not isinstance(model, StepModel):
+        start = np.array([AgentProtocol(experiment.protocol, i).start(x).ravel() for i, x in enumerate(start)])
     return RunRecord(run or uuid.uuid4(), experiment, start)
 
 
@@ -66,6 +75,8 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
     experiment = record.experiment if record else experiment
     experiment.require_available()
     record = record or new_record(experiment)
+    if experiment.protocol and not experiment.protocol.linear:
+        return _simulate_agents(record, build_model(experiment))
     model = build_step_model(experiment)
     modes = mode_path(experiment, model.initial)
     states = np.empty((experiment.steps + 1, *record.start.shape))
@@ -76,6 +87,36 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
     published, lost = reception.log(states, modes) if reception else (None, None)
     expected = states.shape[0] * states.shape[1] * (1 if published is None else 2)
     return Trajectory(record, states, modes, Completeness(expected, expected, 0), published=published, lost=lost)
+
+
+def _simulate_agents(record: RunRecord, model: Wiring) -> Trajectory:
+    """The same by the laws of the single agents, one after the other, as the network has them."""
+    experiment, agents = record.experiment, range(model.agents)
+    modes = mode_path(experiment, model.initial)
+    laws = [ProtocolLaw(record, model, i) for i in agents]
+    neighbours = [[law.neighbours(mode) for mode in range(model.modes)] for law in laws]
+    states = np.empty((experiment.steps + 1, *record.start.shape))
+    published = np.empty((experiment.steps + 1, model.agents, experiment.run.replicas))
+    lost: BoolArray = np.zeros((experiment.steps, model.agents, model.most_neighbours), dtype=np.bool_)
+    for k in range(experiment.steps + 1):
+        values = [law.published(k, law.state) for law in laws]
+        for i, law in enumerate(laws):
+            states[k, i], published[k, i] = from_payload(law.state), from_payload(values[i])
+        if k == experiment.steps:
+            break
+        mode = int(modes[k])
+        for i, law in enumerate(laws):
+            law.advance(mode, [values[j] for j in neighbours[i][mode]])
+            lost[k, i, : len(law.heard)] = [step == LOST for step in law.heard]
+    expected = states.shape[0] * states.shape[1] * (2 if experiment.truth else 1)
+    return Trajectory(
+        record,
+        states,
+        modes,
+        Completeness(expected, expected, 0),
+        published=published if experiment.truth else None,
+        lost=lost if experiment.noise.loss else None,
+    )
 
 
 def _states(

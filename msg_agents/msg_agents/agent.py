@@ -20,8 +20,9 @@ from msg_analysis.bags.cdr import ActiveGraph, StateCodec, StateFrame, with_stat
 from msg_analysis.errors import InputError
 from msg_analysis.model.agent import agent_law
 from msg_analysis.model.payload import all_finite
+from msg_analysis.model.protocols import ProtocolError
 from msg_analysis.model.record import RunRecord
-from msg_analysis.model.step import StepModel
+from msg_analysis.model.step import Wiring
 
 if TYPE_CHECKING:
     from msg_agents.group import AgentGroup
@@ -32,12 +33,13 @@ NOT_FINITE = "a state that is not finite"
 class Agent(NetworkNode):
     """Moves numbers between topics, the synchronizer and the law.
 
-    Others hear ``state``. With broadcast noise that is not the truth, which then goes to ``truth``, for the log.
+    Others hear ``state``. Where that is not the whole truth, because of broadcast noise or a protocol that keeps
+    something to itself, the truth goes to ``truth``, for the log.
 
     Parameters
     ----------
     record : of the run
-    model : its step model
+    model : its step model, or wiring
     agent : index from 0
     peers : every other agent that it hears or is heard by, ascending
     colleagues : the agents of its process, itself included
@@ -50,7 +52,7 @@ class Agent(NetworkNode):
         self,
         *,
         record: RunRecord,
-        model: StepModel,
+        model: Wiring,
         agent: int,
         peers: Sequence[int],
         colleagues: Collection[int],
@@ -61,9 +63,10 @@ class Agent(NetworkNode):
         super().__init__(agent_name(agent), record=record)
         experiment = record.experiment
         self._law = agent_law(record, model, agent)
-        self._codec = StateCodec(self.run, agent + 1, experiment.run.replicas, experiment.step_length)
+        self._codec = StateCodec(self.run, agent + 1, experiment.width, experiment.step_length)
         self._frame = StateFrame(self.run, experiment.run.replicas, longest_heard(record))
-        self._published = Checkpoint(checkpoints and checkpoints / f"{agent_name(agent)}.states", self._frame.size)
+        self._whole = StateFrame(self.run, experiment.width, longest_heard(record))
+        self._published = Checkpoint(checkpoints and checkpoints / f"{agent_name(agent)}.states", self._whole.size)
         self._take_over()
         self._group = group
         self._turns = group.turns
@@ -83,7 +86,7 @@ class Agent(NetworkNode):
         self._pace = Pace()
         self._states = self.create_publisher(AgentStateMsg, state_topic(agent), STREAM)
         self._truth: Publisher | None = None
-        if experiment.noise.broadcast:
+        if experiment.truth:
             self._truth = self.create_publisher(AgentStateMsg, truth_topic(agent), STREAM)
             self._awaits_truth = [name for name in readers if name == RECORDER]  # others may do with what all hear
         for j in self._far:
@@ -121,7 +124,7 @@ class Agent(NetworkNode):
         published = self._published.read()
         if published:
             step, message = published[-1]
-            frame = self._frame.unwrap(message)
+            frame = self._whole.unwrap(message)
             if frame is None or frame[:2] != (self._law.agent + 1, step):
                 raise InputError(
                     f"--checkpoint: what is kept for {self.get_name()} is of another run than the run record: remove "
@@ -139,8 +142,8 @@ class Agent(NetworkNode):
         """Send a state: as it is, for the log, and as others hear it."""
         if self._truth is not None:
             self.publish(self._truth, message)
-            state = self._law.published(step, state)
-            message = with_state(message, state)
+            whole, state = state, self._law.published(step, state)
+            message = with_state(message, state, len(whole))
         self.publish(self._states, message)
         for hear in self._listeners:
             hear(self._law.agent, step, state)
@@ -148,7 +151,7 @@ class Agent(NetworkNode):
     def send_again(self, since: int) -> None:
         """Send what was sent from a step on, as far as it is kept: the truth, from which follows what others hear."""
         for step, message in self._published.read(since):
-            frame = self._frame.unwrap(message)
+            frame = self._whole.unwrap(message)
             assert frame is not None, "of our own making"
             self._send(step, frame[3], message)
 
@@ -209,6 +212,12 @@ class Agent(NetworkNode):
 
     def advance(self) -> None:
         """Make every step that can be made."""
+        try:
+            self._advance()
+        except ProtocolError as error:
+            self._group.fail(error)
+
+    def _advance(self) -> None:
         synchronizer, law = self._synchronizer, self._law
         while synchronizer.ready():
             mode, heard = synchronizer.inputs()

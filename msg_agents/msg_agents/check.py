@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.model.step import build_step_model
+from msg_analysis.model.step import build_model
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.twin import simulate
 from msg_analysis.types import BoolArray, FloatArray
@@ -45,8 +45,8 @@ def check(trajectory: Trajectory) -> Check:
     graphs = [graph.name for graph in trajectory.record.experiment.graph_list]
     # What is there at step k comes out of the graph and the losses of the steps before. First come, first named.
     found = [
-        _first_state(trajectory.states, twin.states, "logged"),
-        _first_state(trajectory.published, twin.published, "published"),
+        _first_state(trajectory, trajectory.states, twin.states, "logged"),
+        _first_state(trajectory, trajectory.published, twin.published, "published"),
         _first_loss(trajectory, twin),
         _first(
             known & (trajectory.modes != twin.modes),
@@ -70,17 +70,21 @@ def _first(wrong: BoolArray, describe: Callable[..., str]) -> tuple[float, str] 
     return where[0], describe(*where)
 
 
-def _first_state(logged: FloatArray | None, law: FloatArray | None, what: str) -> tuple[float, str] | None:
+def _first_state(
+    trajectory: Trajectory, logged: FloatArray | None, law: FloatArray | None, what: str
+) -> tuple[float, str] | None:
     if logged is None or law is None:
         return None
     there = ~np.isnan(logged).any(axis=2)
 
     def describe(step: int, agent: int) -> str:
         here, expected = logged[step, agent], law[step, agent]
-        replica = int(np.argmax(here != expected))
+        where = int(np.argmax(here != expected))
+        row, replica = divmod(where, trajectory.record.experiment.run.replicas)
+        number = f", number {row + 1} of the state" if row else ""
         return (
-            f"agent {agent + 1} at step {step}, replica {replica + 1}: {what} {float(here[replica])!r}, "
-            f"the law gives {float(expected[replica])!r}"
+            f"agent {agent + 1} at step {step}, replica {replica + 1}{number}: {what} {float(here[where])!r}, "
+            f"the law gives {float(expected[where])!r}"
         )
 
     return _first(there & (logged != law).any(axis=2), describe)
@@ -89,7 +93,7 @@ def _first_state(logged: FloatArray | None, law: FloatArray | None, what: str) -
 def _first_loss(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] | None:
     if trajectory.lost is None or twin.lost is None or trajectory.agent_modes is None:
         return None
-    model = build_step_model(trajectory.record.experiment)
+    model = build_model(trajectory.record.experiment)
     # Of states that are there, and came out of the right graph: without it the neighbours are others.
     comparable = trajectory.agent_modes[1:] == twin.modes[:, None]
     logged, law = trajectory.lost, twin.lost

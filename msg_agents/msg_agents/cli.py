@@ -259,9 +259,10 @@ def agent(
 ) -> None:
     """Run one or more agents of the run in RUN_RECORD in one process."""
     from msg_analysis.errors import InputError
-    from msg_analysis.model.step import build_step_model
+    from msg_analysis.model.step import build_model
 
     record = _load_record(run_record)
+    record.experiment.require_available()
     total = record.experiment.agents
     for number in agents:
         if not 1 <= number <= total:
@@ -273,7 +274,7 @@ def agent(
         from msg_agents.group import AgentGroup
 
         indices = [number - 1 for number in agents]
-        model, directory = build_step_model(record.experiment), _make(checkpoint)
+        model, directory = build_model(record.experiment), _make(checkpoint)
         group = AgentGroup(record=record, model=model, agents=indices, readers=readers, checkpoints=directory)
         return list(group.nodes)
 
@@ -289,7 +290,7 @@ def switcher(
     run_record: Path, *, readers: tuple[str, ...], checkpoint: Path | None, status: int | None, **options: Any
 ) -> None:
     """Run the switcher of the run in RUN_RECORD: it publishes the experiment and the active graph."""
-    from msg_analysis.model.step import build_step_model
+    from msg_analysis.model.step import build_model
 
     record = _load_record(run_record)
 
@@ -300,7 +301,7 @@ def switcher(
     def nodes() -> list[NetworkNode]:
         from msg_agents.switcher import Switcher
 
-        model = build_step_model(record.experiment)
+        model = build_model(record.experiment)
         directory = _make(checkpoint)
         return [Switcher(record=record, model=model, readers=list(readers), on_progress=report, checkpoints=directory)]
 

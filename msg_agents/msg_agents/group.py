@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from msg_agents.qos import LATCHED
 from msg_agents.turns import Turns
 from msg_analysis.bags.cdr import ActiveGraph, CdrError
 from msg_analysis.model.record import RunRecord
-from msg_analysis.model.step import StepModel
+from msg_analysis.model.step import Wiring
 
 PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages of an agent, in a small network
 MOST_REPORTS = 250.0  # of them a second from a whole network: the switcher reads them all
@@ -31,7 +33,7 @@ class AgentGroup:
     Parameters
     ----------
     record : of the run
-    model : its step model
+    model : its step model, or wiring
     agents : indices from 0, at least one
     readers : names of the nodes, besides the other agents, that must read the states before the run starts
     checkpoints : directory that keeps what the agents have published, from which they go on if they have been there
@@ -48,7 +50,7 @@ class AgentGroup:
         self,
         *,
         record: RunRecord,
-        model: StepModel,
+        model: Wiring,
         agents: Sequence[int],
         readers: Sequence[str],
         checkpoints: Path | None = None,
@@ -81,6 +83,13 @@ class AgentGroup:
 
     def _defer(self, callback: Callable[[], None]) -> None:
         self._host.executor.create_task(callback)
+
+    def fail(self, error: Exception) -> None:
+        """End the process because an agent cannot go on. Why is in full in what the process prints, its log."""
+        if not self._host.done.done():
+            traceback.print_exception(error, file=sys.stderr)
+        for agent in self.nodes:
+            agent.fail(error)
 
     def report(self, agent: int, step: int) -> None:
         """Tell the switcher how far an agent is."""

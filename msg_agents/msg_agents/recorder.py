@@ -55,14 +55,15 @@ class Recorder(NetworkNode):
     def __init__(self, *, record: RunRecord, directory: Path) -> None:
         super().__init__("recorder", record=record)
         experiment = record.experiment
-        noisy = experiment.noise.broadcast > 0
-        topics = network_topics(experiment.agents, self.get_namespace(), truth=noisy)
+        topics = network_topics(experiment.agents, self.get_namespace(), truth=experiment.truth)
         self.bag = BagWriter(directory, topics, record=record.to_json())
         self._last = experiment.steps
-        self._frame = StateFrame(self.run, experiment.run.replicas, longest_heard(record))
-        self._sources = [  # of states: agent, and a topic of his
-            (agent, self.resolve_topic_name(topic(agent)))
-            for topic in ((state_topic, truth_topic) if noisy else (state_topic,))
+        kinds = [(state_topic, experiment.run.replicas)]
+        if experiment.truth:
+            kinds.append((truth_topic, experiment.width))
+        self._sources = [  # of states: agent, a topic of his, and what is on it
+            (agent, self.resolve_topic_name(topic(agent)), StateFrame(self.run, width, longest_heard(record)))
+            for topic, width in kinds
             for agent in range(experiment.agents)
         ]
         self._known: list[dict[int, int]] = [{} for _ in self._sources]  # step -> hash of what was written
@@ -72,7 +73,7 @@ class Recorder(NetworkNode):
         self._awaiting = {topic.name for topic in topics}
         self.create_subscription(String, EXPERIMENT_TOPIC, self._record_experiment, LATCHED, raw=True)
         self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._record_graph, LATCHED, raw=True)
-        for source, (_, topic) in enumerate(self._sources):
+        for source, (_, topic, _) in enumerate(self._sources):
             self.create_subscription(AgentStateMsg, topic, self._collector(source), STREAM, raw=True)
         self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
         self.leave_at_end()
@@ -102,10 +103,10 @@ class Recorder(NetworkNode):
 
     def _write_states(self) -> None:
         """Write what has been collected. Many at once: that needs a fraction of the time that one by one would."""
-        unwrap, write, last = self._frame.unwrap, self.bag.write, self._last
+        write, last = self.bag.write, self._last
         for source, data in self._pending:
-            agent, topic = self._sources[source]
-            frame = unwrap(data)
+            agent, topic, layout = self._sources[source]
+            frame = layout.unwrap(data)
             if frame is None or frame[0] != agent + 1:  # not what the agents of this run send: have a closer look
                 message = self._decode(AgentState, data, topic)
                 if message is None:

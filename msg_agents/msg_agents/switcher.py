@@ -26,7 +26,7 @@ from msg_agents.qos import LATCHED
 from msg_analysis.bags.cdr import ActiveGraph, encode_string
 from msg_analysis.model.path import Sojourn, sojourns
 from msg_analysis.model.record import RunRecord
-from msg_analysis.model.step import StepModel
+from msg_analysis.model.step import Wiring
 
 AHEAD = 1000
 """Sojourns that are published before the slowest agent reaches them. Enough never to be waited for; bounded, so that a
@@ -50,7 +50,7 @@ class Switcher(NetworkNode):
     Parameters
     ----------
     record : of the run
-    model : its step model
+    model : its step model, or wiring
     readers : names of the nodes, besides the agents, that must read the graph before the run starts
     on_progress : called with the newest step of every agent (-1: none yet) a few times a second, if one has reported
     checkpoints : directory in which it leaves a mark; whoever finds one there takes over from a process that has gone
@@ -60,7 +60,7 @@ class Switcher(NetworkNode):
         self,
         *,
         record: RunRecord,
-        model: StepModel,
+        model: Wiring,
         readers: list[str],
         on_progress: Callable[[Sequence[int]], None] = lambda _: None,
         checkpoints: Path | None = None,

@@ -52,6 +52,8 @@ def room(name: str) -> str:
     if "twin" in parts[:2]:  # the twin needs the theory for its start
         return "twin"
     top = parts[0].partition("_")[0]  # cli_theory is part of the command line
+    if top == "protocol":  # the public half of model.protocols
+        return "model"
     return top if top in ROOMS else "base"
 
 

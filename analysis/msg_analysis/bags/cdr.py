@@ -39,6 +39,7 @@ _STATE_FIXED = struct.Struct("<4s8x21s3xI4xQIII4x")
 # The steps in ``heard`` stand between its length and that of the state, eight bytes each, without any padding.
 _HEARD = struct.Struct("<I")
 _HEARD_START = _STATE.size - 8
+_LENGTH = struct.Struct("<I4x")  # of the state, before it
 
 
 class CdrError(ValueError):
@@ -167,9 +168,17 @@ class StateFrame:
         return self.unwrap(empty + data[_HEARD_START + length :])
 
 
-def with_state(data: bytes, payload: bytes) -> bytes:
-    """The same AgentState, as :class:`StateCodec` writes it, with another state of the same length."""
-    return data[: len(data) - len(payload)] + payload
+def with_state(data: bytes, payload: bytes, size: int | None = None) -> bytes:
+    """The same AgentState, as :class:`StateCodec` writes it, with another state.
+
+    Parameters
+    ----------
+    data, payload : the message, and the bytes of the new state
+    size : bytes of the old state; as many as those of the new one if not given
+    """
+    if size is None or size == len(payload):
+        return data[: len(data) - len(payload)] + payload
+    return data[: len(data) - size - _LENGTH.size] + _LENGTH.pack(len(payload) // 8) + payload
 
 
 class _Reader:

@@ -18,7 +18,7 @@ from msg_analysis.bags.writer import RECORD_NAME, recording_pid
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.model.air import LOST
 from msg_analysis.model.record import RunRecord
-from msg_analysis.model.step import StepModel, build_step_model
+from msg_analysis.model.step import Wiring, build_model
 from msg_analysis.model.trajectory import Completeness, Trajectory
 from msg_analysis.types import BoolArray, IntArray
 
@@ -184,11 +184,11 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
     experiment = record.experiment
     modes = _modes(contents, record.run.bytes, experiment.steps, len(experiment.graph_list))
     published = None
-    if experiment.noise.broadcast:
-        published = _Collected(contents.states, record, contents.refused)
-        truth = _Collected(contents.truths, record, contents.refused)
+    if experiment.truth:
+        published = _Collected(contents.states, record, experiment.run.replicas, contents.refused)
+        truth = _Collected(contents.truths, record, experiment.width, contents.refused)
     else:
-        truth = _Collected(contents.states, record, contents.refused)
+        truth = _Collected(contents.states, record, experiment.width, contents.refused)
     parts = [truth] if published is None else [truth, published]
     expected = len(parts) * (experiment.steps + 1) * experiment.agents
     received = sum(part.received for part in parts)
@@ -217,21 +217,21 @@ class _Collected:
 
     Attributes
     ----------
-    states : (N + 1, m, replicas); NaN where a state is missing
+    states : (N + 1, m, width); NaN where a state is missing
     modes : (N + 1, m) from 0; -1 where missing
     lost : see ``Trajectory.lost``
     received, duplicates, out_of_order : see ``Completeness``
     """
 
-    def __init__(self, columns: StateColumns, record: RunRecord, refused: Counter[str]) -> None:
+    def __init__(self, columns: StateColumns, record: RunRecord, width: int, refused: Counter[str]) -> None:
         experiment = record.experiment
-        agents, replicas, steps = experiment.agents, experiment.run.replicas, experiment.steps
+        agents, steps = experiment.agents, experiment.steps
         run = record.run.bytes
         refused["undecodable"] += columns.undecodable
         counts = columns.runs()
         refused["other run"] += sum(counts.values()) - counts.get(run, 0)
-        links = _Links(build_step_model(experiment)) if experiment.noise.loss else None
-        taken = columns.take(run, replicas, links.most if links else 0)
+        links = _Links(build_model(experiment)) if experiment.noise.loss else None
+        taken = columns.take(run, width, links.most if links else 0)
         refused["wrong length"] += counts.get(run, 0) - len(taken.step)
 
         good = np.ones(len(taken.step), dtype=np.bool_)
@@ -257,11 +257,11 @@ class _Collected:
         differs |= (taken.heard[copy] != taken.heard[original]).any(axis=1)
         refused["contradicts an earlier copy"] += int(differs.sum())
 
-        states = np.full(((steps + 1) * agents, replicas), np.nan)
+        states = np.full(((steps + 1) * agents, width), np.nan)
         states[cells] = taken.state[kept]
         modes = np.full((steps + 1) * agents, -1, dtype=np.int64)
         modes[cells] = taken.mode[kept] - 1
-        self.states, self.modes = states.reshape(steps + 1, agents, replicas), modes.reshape(steps + 1, agents)
+        self.states, self.modes = states.reshape(steps + 1, agents, width), modes.reshape(steps + 1, agents)
         self.lost: BoolArray | None = None
         if links:
             lost = np.zeros(((steps + 1) * agents, links.most), dtype=np.bool_)
@@ -279,7 +279,7 @@ class _Links:
     most : largest number of neighbours
     """
 
-    def __init__(self, model: StepModel) -> None:
+    def __init__(self, model: Wiring) -> None:
         self.most = model.most_neighbours
         self._neighbours = np.zeros((model.modes + 1, model.agents), dtype=np.int64)  # no graph led to step 0
         for mode in range(model.modes):

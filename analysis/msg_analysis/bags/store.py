@@ -14,7 +14,7 @@ from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
 from msg_analysis.model.air import LOST
 from msg_analysis.model.payload import to_payload
-from msg_analysis.model.step import build_step_model
+from msg_analysis.model.step import build_model
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.types import IntArray
 
@@ -58,7 +58,6 @@ def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
     experiment = trajectory.record.experiment
     run, dt, modes = trajectory.record.run.bytes, experiment.step_length, trajectory.modes
     time = StepClock(dt).nanoseconds
-    codecs = [StateCodec(run, i + 1, experiment.run.replicas, dt) for i in range(experiment.agents)]
     used = trajectory.agent_modes
     if used is None:
         used = np.repeat(np.concatenate(([-1], modes))[:, None], experiment.agents, axis=1)
@@ -67,6 +66,8 @@ def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
     if trajectory.published is not None:
         streams.append((_names(state_topic, experiment.agents), trajectory.published))
     present = [np.asarray(~np.isnan(states).any(axis=2)) for _, states in streams]
+    widths = [states.shape[2] for _, states in streams]
+    codecs = [[StateCodec(run, i + 1, width, dt) for i in range(experiment.agents)] for width in widths]
     heard = _heard(trajectory, used)
     sojourns = _sojourns(trajectory)
     sojourn = next(sojourns, None)
@@ -75,10 +76,10 @@ def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
         if sojourn is not None and sojourn.first_step == k:
             yield "/graph", sojourn.encode(), now
             sojourn = next(sojourns, None)
-        for (topics, states), there in zip(streams, present, strict=True):
+        for (topics, states), there, codec in zip(streams, present, codecs, strict=True):
             for i in np.flatnonzero(there[k]).tolist():
                 payload = to_payload(states[k, i])
-                yield topics[i], codecs[i].wrap(k, int(used[k, i]) + 1, payload, heard(k, i)), now
+                yield topics[i], codec[i].wrap(k, int(used[k, i]) + 1, payload, heard(k, i)), now
 
 
 def _names(topic: Callable[[str, int], str], agents: int) -> list[str]:
@@ -90,7 +91,7 @@ def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[
     lost = trajectory.lost
     if lost is None:
         return lambda _k, _i: []
-    model = build_step_model(trajectory.record.experiment)
+    model = build_model(trajectory.record.experiment)
     modes, agents = range(model.modes), range(model.agents)
     counts = [[len(model.neighbours(mode, i)) for i in agents] for mode in modes]
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import stats
 
 from msg_analysis.inference.gaussian import covariance_statistic
+from msg_analysis.inference.measurement import Measurement
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.reception import mode_links
 from msg_analysis.types import BoolArray, FloatArray, IntArray
@@ -32,7 +33,7 @@ class LossTest:
     p: float | None
 
 
-def loss_test(observation: Observation) -> LossTest | None:
+def loss_test(observation: Observation | Measurement) -> LossTest | None:
     """Test that every message is lost with the same probability, whatever happens to others; None without loss.
 
     Given the graphs, the losses of each link are binomial, exactly. Added to the chi-squares of the links come those of
@@ -76,7 +77,7 @@ class _Tally:
     same_step, same_step_pairs : sum of xi xi' of pairs of messages in one step, and their number
     """
 
-    def __init__(self, observation: Observation) -> None:
+    def __init__(self, observation: Observation | Measurement) -> None:
         self._observation = observation
         step = observation.step
         numbers = np.cumsum(step.listens().ravel()).reshape(step.agents, step.agents) - 1

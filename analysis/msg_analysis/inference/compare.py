@@ -13,16 +13,17 @@ from msg_analysis.inference.air import LossTest, broadcast_p, loss_test
 from msg_analysis.inference.batch import batch_interval
 from msg_analysis.inference.innovations import InnovationTests, innovation_tests, quadratic_form
 from msg_analysis.inference.martingale import TimeMeans, time_means
+from msg_analysis.inference.measurement import Measurement
 from msg_analysis.inference.multiplicity import holm
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.switching import SwitchingTest, switching_test
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
-from msg_analysis.types import FloatArray
+from msg_analysis.types import FloatArray, IntArray
 
-Verdict = Literal["agrees", "disagrees", "incomplete"]
+Verdict = Literal["agrees", "disagrees", "incomplete", "unpredicted"]
 
-EXIT_CODES: dict[Verdict, int] = {"agrees": 0, "disagrees": 1, "incomplete": 3}
+EXIT_CODES: dict[Verdict, int] = {"agrees": 0, "disagrees": 1, "incomplete": 3, "unpredicted": 0}
 MIN_STEPS = 100
 """Fewest steps for which numbers are given."""
 RUNNING_POINTS = 400
@@ -99,6 +100,8 @@ class Comparison:
     running : "time" [simulated time], "system_error" and "standard_error" of the mean up to then (400 points)
     loss : of the messages that were lost; None where none can be
     p_broadcast : of the noise in what was published; None without
+    unpredicted : why there is no prediction; None where there is one
+    transient : steps at the start that are left out of the measured errors; None with a prediction, which knows them
     """
 
     trajectory: Trajectory
@@ -115,17 +118,24 @@ class Comparison:
     running: dict[str, FloatArray]
     loss: LossTest | None = None
     p_broadcast: float | None = None
+    unpredicted: str | None = None
+    transient: int | None = None
 
     @property
     def verdict(self) -> Verdict:
-        """Incomplete data get no verdict; else one rejected test of the family is a disagreement."""
+        """Incomplete data get no verdict; else one rejected test of the family is a disagreement.
+
+        Without a prediction, what is left of the family cannot say that a run agrees with it.
+        """
         if not self.trajectory.completeness.complete:
             return "incomplete"
-        return "disagrees" if any(test.rejected for test in self.tests) else "agrees"
+        if any(test.rejected for test in self.tests):
+            return "disagrees"
+        return "unpredicted" if self.unpredicted else "agrees"
 
     @property
     def exit_code(self) -> int:
-        """0 agrees, 1 disagrees, 3 incomplete."""
+        """0 agrees or unpredicted, 1 disagrees, 3 incomplete."""
         return EXIT_CODES[self.verdict]
 
     def to_json(self) -> dict[str, Any]:
@@ -133,6 +143,8 @@ class Comparison:
         record, covariance, switching = self.trajectory.record, self.covariance, self.switching
         document = {
             "verdict": self.verdict,
+            "unpredicted": self.unpredicted,
+            "transient": self.transient,
             "run": str(record.run),
             "experiment": record.experiment.name,
             "seed": record.experiment.run.seed,
@@ -177,10 +189,17 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
         beginning
     level : chance of calling a run that follows its law one that disagrees
 
+    Where the law has no prediction (a protocol that is not linear, or not here), the run is measured, and only its
+    graphs and losses are tested.
+
     Raises
     ------
     InputError : no prediction (too large, unbounded)
     """
+    protocol = trajectory.record.experiment.protocol
+    unpredicted = protocol.unpredictable() if protocol else None
+    if unpredicted:
+        return _measured(trajectory, level, unpredicted)
     prediction = predict(trajectory.record.experiment)
     continuous = prediction.continuous.system_error if prediction.continuous else None
     if trajectory.prefix < MIN_STEPS and not trajectory.completeness.complete:
@@ -218,6 +237,41 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
         running=_running(means, prediction.step.dt),
         loss=loss,
         p_broadcast=p_broadcast,
+    )
+
+
+def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Comparison:
+    """What can be said without a prediction."""
+    measurement = Measurement.of(trajectory)
+    agents, enough = measurement.step.agents, True
+    if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
+        enough = False
+    series, covariance = measurement.system_series, measurement.covariance if enough else None
+    switching = switching_test(measurement.modes, measurement.step.transition) if enough else None
+    loss = loss_test(measurement) if enough else None
+    family = [("switching", switching.p if switching else None), ("loss", loss.p if loss else None)]
+    nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]
+    counts = _spaced(len(series)) if enough else np.empty(0, np.int64)
+    return Comparison(
+        trajectory=trajectory,
+        level=level,
+        steps=measurement.steps,
+        system_error=Estimate() if covariance is None else Estimate(float(np.trace(covariance))),
+        node_errors=nodes,
+        covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
+        innovations=InnovationTests(None, None, None),
+        switching=switching,
+        continuous_error=None,
+        batch=batch_interval(series) if enough else None,
+        tests=_judge(family, level),
+        running={
+            "time": np.asarray((measurement.first + counts) * measurement.step.dt, dtype=float),
+            "system_error": np.cumsum(series)[counts - 1] / counts if enough else np.empty(0),
+            "standard_error": np.zeros(len(counts)),
+        },
+        loss=loss,
+        unpredicted=unpredicted,
+        transient=measurement.first if enough else None,
     )
 
 
@@ -290,14 +344,18 @@ def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
 
 def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:
     """Mean of the system error up to some steps, denser at the beginning, and its standard error."""
-    steps = len(means.system_series)
-    spaced = np.concatenate([np.geomspace(1, steps, RUNNING_POINTS // 2), np.linspace(1, steps, RUNNING_POINTS // 2)])
-    counts = np.unique(np.rint(spaced).astype(int))
+    counts = _spaced(len(means.system_series))
     return {
-        "time": counts * dt,
+        "time": np.asarray(counts * dt, dtype=float),
         "system_error": np.cumsum(means.system_series)[counts - 1] / counts,
         "standard_error": np.sqrt(np.cumsum(means.system_variances)[counts - 1]) / counts,
     }
+
+
+def _spaced(steps: int) -> IntArray:
+    """Numbers of steps up to all of them, denser at the beginning."""
+    spaced = np.concatenate([np.geomspace(1, steps, RUNNING_POINTS // 2), np.linspace(1, steps, RUNNING_POINTS // 2)])
+    return np.unique(np.rint(spaced).astype(np.int64))
 
 
 def _plain(value: Any) -> Any:

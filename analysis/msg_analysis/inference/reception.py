@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from msg_analysis.inference.observation import Observation
-from msg_analysis.model.step import StepModel
+from msg_analysis.model.step import StepModel, Wiring
 from msg_analysis.types import FloatArray, IntArray
 
 NO_NOISE = 1e-13
@@ -68,7 +68,7 @@ class Reception:
         return np.asarray(self.own[:, :, None] * self.states + self.weights @ self.values)
 
 
-def mode_links(step: StepModel, mode: int) -> tuple[IntArray, IntArray, IntArray]:
+def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
     """Receiver, sender, and place of the sender among the receiver's neighbours, of every link of a graph."""
     links = [(i, j, d) for i in range(step.agents) for d, j in enumerate(step.neighbours(mode, i).tolist())]
     receiver, sender, which = np.array(links, dtype=np.int64).reshape(-1, 3).T

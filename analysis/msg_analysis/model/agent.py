@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import lru_cache
+
+import numpy as np
 
 from msg_analysis.model.air import LOST, Air
 from msg_analysis.model.noise import ProcessNoise
 from msg_analysis.model.payload import combine, from_payload, to_payload
+from msg_analysis.model.protocols import AgentProtocol
 from msg_analysis.model.record import RunRecord
-from msg_analysis.model.step import StepModel
+from msg_analysis.model.step import StepModel, Wiring
 from msg_analysis.model.streams import STEPS_PER_BLOCK
-from msg_analysis.types import FloatArray
+from msg_analysis.protocol import Heard
+from msg_analysis.types import FloatArray, IntArray
 
 
 class AgentLaw:
@@ -88,14 +93,7 @@ class AgentLawOnAir(AgentLaw):
         super().__init__(record, model, agent)
         self._air = air = Air(record.experiment)
         self._neighbours = [self.neighbours(mode) for mode in range(model.modes)]
-        links = int(model.listens()[agent].sum())
-
-        @lru_cache(maxsize=max(1, links))
-        def link(sender: int, block: int) -> tuple[FloatArray | None, list[bool]]:
-            noise = air.link_noise(agent, sender, block) if air.link else None
-            return noise, air.losses(agent, sender, block).tolist()
-
-        self._link = link
+        self._link = _links(air, model, agent)
 
     def published(self, step: int, state: bytes) -> bytes:
         """See AgentLaw."""
@@ -121,7 +119,106 @@ class AgentLawOnAir(AgentLaw):
         return super().advance(mode, values)
 
 
-def agent_law(record: RunRecord, model: StepModel, agent: int) -> AgentLaw:
+class ProtocolLaw:
+    """The same for an agent whose protocol is not linear; a message that is lost is not among what it has heard.
+
+    Parameters
+    ----------
+    record : of the run
+    model : its wiring
+    agent : index of the agent from 0
+
+    Attributes
+    ----------
+    step, state, heard : see AgentLaw; the state is all of it, row by row
+    """
+
+    def __init__(self, record: RunRecord, model: Wiring, agent: int) -> None:
+        experiment = record.experiment
+        assert experiment.protocol is not None
+        self.agent = agent
+        self.step = 0
+        self.state = to_payload(record.start[agent])
+        self.heard: tuple[int, ...] = ()
+        self._protocol = AgentProtocol(experiment.protocol, agent)
+        self._shape = (self._protocol.states, experiment.run.replicas)
+        modes = range(model.modes)
+        self._neighbours = [model.neighbours(mode, agent) for mode in modes]
+        self._weights = [experiment.graph_list[mode].adjacency[agent, self._neighbours[mode]] for mode in modes]
+        self._noise = ProcessNoise(
+            experiment.run.seed, np.sqrt(experiment.step_length) * experiment.noise_gain, experiment.run.replicas
+        )
+        for shared in (*self._neighbours, *self._weights):
+            shared.flags.writeable = False
+        self._noises = self._draw(0)
+        self._air = Air(experiment)
+        self._link = _links(self._air, model, agent)
+
+    def resume(self, step: int, state: bytes) -> None:
+        """See AgentLaw."""
+        self.step, self.state = step, state
+        self._noises = self._draw(step // STEPS_PER_BLOCK)
+
+    def neighbours(self, mode: int) -> list[int]:
+        """See AgentLaw."""
+        return [int(j) for j in self._neighbours[mode]]
+
+    def published(self, step: int, state: bytes) -> bytes:
+        """See AgentLaw."""
+        value = self._protocol.publish(step, from_payload(state).reshape(self._shape))
+        return to_payload(self._air.published(self.agent, step, value) if self._air.broadcast else value)
+
+    def advance(self, mode: int, heard: list[bytes]) -> bytes:
+        """See AgentLaw."""
+        within = self.step % STEPS_PER_BLOCK
+        agents, weights = self._neighbours[mode], self._weights[mode]
+        values = from_payload(b"".join(heard)).reshape(len(heard), self._shape[1])
+        self.heard = ()
+        if self._air.link or self._air.loss:
+            agents, weights, values = self._receive(mode, values)
+        state = from_payload(self.state).reshape(self._shape)
+        message = Heard(agents, weights, values)
+        self.state = to_payload(self._protocol.step(self.step, mode, state, message, self._noises[mode][within]))
+        self.step += 1
+        if self.step % STEPS_PER_BLOCK == 0:
+            self._noises = self._draw(self.step // STEPS_PER_BLOCK)
+        return self.state
+
+    def _draw(self, block: int) -> list[FloatArray]:
+        """For each mode, the process noise of every step of a block."""
+        noises = self._noise.block(self.agent, block)
+        for noise in noises:
+            noise.flags.writeable = False
+        return noises
+
+    def _receive(self, mode: int, values: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Of the messages that come through the air: senders, weights, and values with the noise of their links."""
+        block, within = divmod(self.step, STEPS_PER_BLOCK)
+        values, came = values.copy(), np.ones(len(values), dtype=np.bool_)
+        for d, sender in enumerate(self._neighbours[mode]):
+            noise, losses = self._link(int(sender), block)
+            came[d] = not losses[within]
+            if noise is not None:
+                values[d] += noise[within]
+        if not came.all():
+            self.heard = tuple(self.step if there else LOST for there in came)
+        return self._neighbours[mode][came], self._weights[mode][came], values[came]
+
+
+def _links(air: Air, model: Wiring, agent: int) -> Callable[[int, int], tuple[FloatArray | None, Sequence[bool]]]:
+    """Of a sender and a block of steps: link noise, None without, and which messages to the agent are lost."""
+
+    @lru_cache(maxsize=max(1, int(model.listens()[agent].sum())))
+    def link(sender: int, block: int) -> tuple[FloatArray | None, Sequence[bool]]:
+        noise = air.link_noise(agent, sender, block) if air.link else None
+        return noise, air.losses(agent, sender, block).tolist()
+
+    return link
+
+
+def agent_law(record: RunRecord, model: Wiring, agent: int) -> AgentLaw | ProtocolLaw:
     """The law of one agent of a run: see AgentLaw for the parameters."""
+    if not isinstance(model, StepModel):
+        return ProtocolLaw(record, model, agent)
     kind = AgentLawOnAir if record.experiment.noise.on_air else AgentLaw
     return kind(record, model, agent)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,12 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from msg_analysis.errors import NotAvailableError
-from msg_analysis.model import topology, validation
+from msg_analysis.model import protocols, topology, validation
 from msg_analysis.model.chain import MarkovChain, Time
 from msg_analysis.model.document import read_yaml
 from msg_analysis.model.graphs import Graph
 from msg_analysis.model.problems import ExperimentError, problem, show, translate
+from msg_analysis.model.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.model.spec import (
     ExperimentSpec,
     GraphSpec,
@@ -41,6 +42,7 @@ class Experiment:
     chain : the Markov chain that switches between them
     noise_gain : (n, m, m) F_i; Q_i = F_i F_i^T
     source : where it came from, for messages
+    protocol : what the agents do instead of the built-in law, if anything
     """
 
     spec: ExperimentSpec
@@ -48,6 +50,7 @@ class Experiment:
     chain: MarkovChain = field(repr=False)
     noise_gain: FloatArray = field(repr=False)
     source: str = "experiment"
+    protocol: ChosenProtocol | None = field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -71,7 +74,14 @@ class Experiment:
         return cls.parse(read_yaml(path), source=str(path), directory=path.parent)
 
     @classmethod
-    def parse(cls, mapping: Any, *, source: str = "experiment", directory: Path | None = None) -> Experiment:
+    def parse(
+        cls,
+        mapping: Any,
+        *,
+        source: str = "experiment",
+        directory: Path | None = None,
+        recorded: ProtocolInfo | None = None,
+    ) -> Experiment:
         """Check a document and make it an experiment.
 
         Parameters
@@ -79,6 +89,7 @@ class Experiment:
         mapping : the document, as a YAML or JSON reader gives it
         source : where it came from, for messages
         directory : what the paths in it are relative to; by default the current directory
+        recorded : of a recorded run, the protocol that was used, which need not be installed
 
         Raises
         ------
@@ -89,15 +100,22 @@ class Experiment:
                 source,
                 [problem("experiment", show(mapping), "expected keys with values", "start with `name:`")],
             )
-        sections = _Sections(mapping)
+        sections = _Sections(mapping, recorded)
         sections.resolve(directory or Path())
         if sections.problems:
             raise ExperimentError(source, sections.problems)
-        return sections.experiment(source)
+        experiment = sections.experiment(source)
+        if sections.problems:
+            raise ExperimentError(source, sections.problems)
+        return experiment
 
     def to_document(self) -> dict[str, Any]:
         """The normalised document: self-contained, fit for JSON; parsed again it gives an equal one."""
-        return self.spec.model_dump(mode="json", exclude_none=True)
+        document: dict[str, Any] = self.spec.model_dump(mode="json", exclude_none=True)
+        if self.spec.protocol:
+            # A parameter that is None need not be so by default.
+            document["protocol"] = self.spec.protocol.model_dump(mode="json")
+        return document
 
     def with_run(self, **changes: Any) -> Experiment:
         """The same experiment with other values of ``run``, checked again.
@@ -126,6 +144,8 @@ class Experiment:
             lines.append(problem("run.pace", "'realtime'", "not available yet", "use lockstep"))
         if purpose == "run" and self.noise.delay > 0:
             lines.append(problem("noise.delay", self.noise.delay, "not available in runs yet", "use 0"))
+        if self.protocol:
+            lines += self.protocol.unavailable(purpose)
         return lines
 
     def require_available(self, purpose: Purpose = "run") -> None:
@@ -136,6 +156,8 @@ class Experiment:
         NotAvailableError : lists it
         """
         lines = self.unavailable(purpose)
+        if lines and self.protocol and lines == self.protocol.unavailable(purpose):
+            raise NotAvailableError(f"{self.source}: {lines[0]}")
         if lines:
             raise NotAvailableError("\n  ".join([f"{self.source}: not available in this version", *lines]))
 
@@ -180,6 +202,23 @@ class Experiment:
         return self.spec.run
 
     @property
+    def steps_only(self) -> bool:
+        """Whether only its steps are defined, and no law in continuous time."""
+        return self.noise.steps_only or self.protocol is not None
+
+    @property
+    def width(self) -> int:
+        """Numbers of an agent's whole state: one per replica, or as many for each as its protocol has."""
+        protocol = self.protocol
+        return self.run.replicas * (protocol.info.states if protocol else 1)
+
+    @property
+    def truth(self) -> bool:
+        """Whether others hear something else than the whole state, which then goes on a topic of its own."""
+        protocol = self.protocol
+        return self.noise.broadcast > 0 or (protocol is not None and protocol.info.hidden)
+
+    @property
     def leader_gains(self) -> FloatArray:
         """(m,) kappa; 0 for followers, inf for grounded leaders."""
         return _leader_gains(self.leaders, self.agents)
@@ -218,7 +257,7 @@ class _Sections:
     So a mistake in one section does not hide those in the others.
     """
 
-    def __init__(self, mapping: Mapping[Any, Any]) -> None:
+    def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
         self.problems: list[str] = []
         bad: set[str] = set()
         try:
@@ -245,10 +284,13 @@ class _Sections:
         self.graphs: tuple[Graph, ...] = ()
         self.chain: MarkovChain | None = None
         self.noise_gain: FloatArray | None = None
+        self._recorded = recorded
+        self._protocol: ChosenProtocol | None = None
 
     def resolve(self, directory: Path) -> None:
         """Find everything that several keys say together, and every mistake in it."""
         time, run, leaders = self.values["time"], self.values["run"], self.values["leaders"]
+        self._find_protocol()
         self._count_agents(directory)
         leaders_good = self.values["problem"] is not None and "leaders" in self.known
         if leaders_good:
@@ -273,7 +315,8 @@ class _Sections:
         if not self.graphs or not leaders_good:
             return
         self.problems += validation.connection_problems(self.graphs, leaders)
-        if time == "continuous" and run:
+        built_in = "protocol" in self.known and self.values["protocol"] is None
+        if time == "continuous" and run and built_in:
             gains = _leader_gains(leaders, self.agents)
             self.problems += validation.stability_problems(self.graphs, gains, run.dt)
 
@@ -282,7 +325,28 @@ class _Sections:
         assert self.chain is not None
         assert self.noise_gain is not None
         spec = ExperimentSpec.model_construct(**(self.values | {"agents": self.agents}))
-        return Experiment(spec, self.graphs, self.chain, self.noise_gain, source)
+        experiment = Experiment(spec, self.graphs, self.chain, self.noise_gain, source, self._protocol)
+        return self._with_protocol(experiment, self._protocol) if self._protocol else experiment
+
+    def _find_protocol(self) -> None:
+        """The protocol and its parameters, with their defaults written out."""
+        spec = self.values["protocol"]
+        if spec is None:
+            return
+        self._protocol, found = protocols.find(spec, self._recorded)
+        self.problems += found
+        if self._protocol and self._protocol.parameters is not None:
+            parameters = self._protocol.parameters.model_dump(mode="json")
+            self.values["protocol"] = type(spec).model_validate({"name": spec.name, **parameters})
+
+    def _with_protocol(self, experiment: Experiment, protocol: ChosenProtocol) -> Experiment:
+        """The same with a protocol that knows its network."""
+        bound, found = protocols.bind(protocol, experiment, self._recorded)
+        self.problems += found
+        experiment = replace(experiment, protocol=bound)
+        size = experiment.agents, len(self.graphs), experiment.steps, experiment.width
+        self.problems += validation.memory_problems(*size, 0, experiment.truth)
+        return experiment
 
     def _count_agents(self, directory: Path) -> None:
         """The number of agents, once every graph says which it needs; GraphML files are read here."""
@@ -321,9 +385,9 @@ class _Sections:
         steps = round(run.duration / run.dt) if run else 1
         replicas = run.replicas if run else 1
         noise = self.values["noise"]
-        delay, broadcast = (noise.delay, noise.broadcast) if noise else (0, 0.0)
+        delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)
         modes = len(self.values["graphs"])
-        found = validation.memory_problems(self.agents, modes, steps, replicas, delay, broadcast)
+        found = validation.memory_problems(self.agents, modes, steps, replicas, delay, truth)
         self.problems += found
         return not found
 

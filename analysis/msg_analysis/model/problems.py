@@ -91,23 +91,34 @@ _EXPECTED = {
 }
 
 
-def translate(error: ErrorDetails) -> str:
-    """One of pydantic's errors in the style of this module."""
+def translate(error: ErrorDetails, root: type[BaseModel] = ExperimentSpec, section: str = "") -> str:
+    """One of pydantic's errors in the style of this module.
+
+    Parameters
+    ----------
+    error : of the validation of ``root``
+    root : model of the whole document, or of a section
+    section : key of that section
+    """
     kind, location, value = error["type"], error["loc"], error["input"]
+    if not location:
+        location = (section or "experiment",)
+    elif section:
+        location = (section, *location)
     if kind == "invalid_key" or location[-1] == "[key]":
         place = dotted(location[:-1] if kind == "invalid_key" else location[:-2]) or "experiment"
         remedy = "rename it" if isinstance(value, str) else "put quotes around it"
         return problem(place, f"key {show(value)}", "expected a text without spaces around it as key", remedy)
     key = dotted(location)
-    model, example = _context(location)
+    model, example = _context(location, root)
     if kind == "missing":
-        return problem(key, "missing", f"expected {_description(location)}", example)
+        return problem(key, "missing", f"expected {_description(location, root)}", example)
     if kind == "extra_forbidden":
         known = list(model.model_fields)
         return problem(
             key,
             "unknown key",
-            f"expected one of {', '.join(known)}",
+            f"expected one of {', '.join(known)}" if known else "expected none",
             _did_you_mean(location[-1], known) or "remove it",
         )
     wanted = _EXPECTED.get(kind)
@@ -128,10 +139,10 @@ def _plain(limit: object) -> object:
     return str(limit).strip("^$").replace("True", "true")
 
 
-def _context(location: Sequence[int | str]) -> tuple[type[BaseModel], str]:
+def _context(location: Sequence[int | str], root: type[BaseModel]) -> tuple[type[BaseModel], str]:
     """The model that a place belongs to, and an example of the last key of it that is known."""
-    model: type[BaseModel] = ExperimentSpec
-    example = "see `msg-analysis schema`"
+    model = root
+    example = "see `msg-analysis schema`" if root is ExperimentSpec else "see the documentation of the package"
     for part in location:
         field = model.model_fields.get(str(part))
         if field is None:
@@ -149,6 +160,6 @@ def _model_in(annotation: object) -> type[BaseModel] | None:
     return next((found for inner in get_args(annotation) if (found := _model_in(inner))), None)
 
 
-def _description(location: Sequence[int | str]) -> str:
-    model, _ = _context(location[:-1])
+def _description(location: Sequence[int | str], root: type[BaseModel]) -> str:
+    model, _ = _context(location[:-1], root)
     return model.model_fields[str(location[-1])].description or "a value"

@@ -18,6 +18,7 @@ import scipy
 import msg_analysis
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.protocols import info_of
 from msg_analysis.types import FloatArray
 
 FORMAT = 1
@@ -42,7 +43,7 @@ class RunRecord:
     ----------
     run : run id
     experiment : what is run
-    start : (m, replicas) x(0). Computed once and carried along, because it comes out of linear algebra whose last bits
+    start : (m, width) x(0). Computed once and carried along, because it comes out of linear algebra whose last bits
         depend on the machine
     versions : versions of the software that started the run
     """
@@ -54,15 +55,16 @@ class RunRecord:
 
     def to_json(self) -> str:
         """The document; numbers survive the round trip to the last bit."""
-        return json.dumps(
-            {
-                "format": FORMAT,
-                "run": str(self.run),
-                "experiment": self.experiment.to_document(),
-                "start": self.start.tolist(),
-                "versions": self.versions,
-            }
-        )
+        document: dict[str, Any] = {
+            "format": FORMAT,
+            "run": str(self.run),
+            "experiment": self.experiment.to_document(),
+            "start": self.start.tolist(),
+            "versions": self.versions,
+        }
+        if self.experiment.protocol:
+            document["protocol"] = self.experiment.protocol.info.to_json()
+        return json.dumps(document)
 
     @classmethod
     def from_json(cls, text: str, source: str) -> RunRecord:
@@ -84,14 +86,14 @@ class RunRecord:
                     f"{source}: run record of format {document['format']}, expected {FORMAT}: "
                     "read it with the version of msg_analysis that wrote it"
                 )
-            experiment = Experiment.parse(document["experiment"], source=source)
+            experiment = Experiment.parse(document["experiment"], source=source, recorded=info_of(document))
             start = np.array(document["start"], dtype=float)
             record = cls(uuid.UUID(document["run"]), experiment, start, dict(document["versions"]))
         except InputError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"{source}: not a run record ({type(error).__name__}: {error})") from error
-        expected = (experiment.agents, experiment.run.replicas)
+        expected = (experiment.agents, experiment.width)
         if start.shape != expected or not np.isfinite(start).all():
             raise InputError(f"{source}: start has shape {start.shape}, expected finite numbers of shape {expected}")
         return record

@@ -237,6 +237,14 @@ class LeadersSpec(_Section):
     reference: Number = Field(0.0, description="the value to track", examples=[0.0])
 
 
+class ProtocolSpec(_Section):
+    """A law of agents that a package offers, instead of the built-in one. What stands beside its name is for it."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    name: str = Field(min_length=1, description="the name under which the package offers it", examples=["metropolis"])
+
+
 class RunSpec(_Section):
     """How long, how often and how to run."""
 
@@ -294,5 +302,10 @@ class ExperimentSpec(_Section):
         default_factory=SwitchingSpec, examples=[{"generator": [[-0.5, 0.5], [0.5, -0.5]]}]
     )
     noise: NoiseSpec = Field(default_factory=NoiseSpec, examples=[{"process": 1.0}])
+    protocol: ProtocolSpec | None = Field(
+        None,
+        description="what agents do, from an installed package, with parameters of its own; default: the built-in law",
+        examples=[{"name": "metropolis"}],
+    )
     leaders: LeadersSpec | None = Field(None, examples=[{"agents": [3], "gain": 1.0, "reference": 0.0}])
     run: RunSpec = Field(default_factory=RunSpec, examples=[{"dt": 0.05, "duration": 400}])

@@ -16,30 +16,81 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StepModel:
+class Wiring:
+    """Who uses whose values under which graph, and how the graphs follow each other: all that is true of any law.
+
+    Modes and agents count from 0 here.
+
+    Attributes
+    ----------
+    links : (n, m, m) whether agent i uses what agent j publishes; the diagonal means nothing
+    transition : (n, n) P
+    stationary : (n,) pi
+    initial : (n,) law of g(0)
+    dt : simulated time of a step
+    loss : probability that a directed message is ignored in a step
+    """
+
+    links: BoolArray
+    transition: FloatArray
+    stationary: FloatArray
+    initial: FloatArray
+    dt: float
+    loss: float
+
+    @property
+    def modes(self) -> int:
+        """Number of graphs n."""
+        return int(self.links.shape[0])
+
+    @property
+    def agents(self) -> int:
+        """Number of agents m."""
+        return int(self.links.shape[1])
+
+    def inputs(self, mode: int, agent: int) -> IntArray:
+        """Agents, ascending, whose values an agent uses under a mode; the agent itself always among them."""
+        used = self.links[mode, agent].copy()
+        used[agent] = True
+        return np.flatnonzero(used)
+
+    def neighbours(self, mode: int, agent: int) -> IntArray:
+        """The other agents, ascending, whose values an agent uses under a mode."""
+        used = self.inputs(mode, agent)
+        return np.asarray(used[used != agent])
+
+    @property
+    def most_neighbours(self) -> int:
+        """Largest number D of neighbours that any agent has in any graph."""
+        return int(self.links.sum(axis=2, where=~np.eye(self.agents, dtype=bool)).max())
+
+    def listens(self) -> BoolArray:
+        """(m, m): whether agent i uses the state of agent j != i in any graph."""
+        used: BoolArray = np.asarray(self.links.any(axis=0))
+        np.fill_diagonal(used, False)
+        return used
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepModel(Wiring):
     """x(k+1) = W_g(k) x(k) + offset_g(k) + noise, then g jumps with P: "what the network actually does".
 
-    Convention: the step k -> k+1 uses g(k). Modes and agents count from 0 here. With a delay d, the entries of W_g(k)
-    off the diagonal take x(k - d) instead of x(k), and x(k) = x(0) before the start.
+    Convention: the step k -> k+1 uses g(k). With a delay d, the entries of W_g(k) off the diagonal take x(k - d)
+    instead of x(k), and x(k) = x(0) before the start.
 
     Attributes
     ----------
     weights : (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
-    nominal : (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time); rows
-        of grounded leaders are zero
+    nominal : (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time), or
+        what a linear protocol says; rows of grounded leaders are zero
     offsets : (n, m) what the reference adds, so that the reference is a fixed point
     noise_gain : (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
     noise : (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
     delay : age d, in steps, of the states of others that a step uses
-    loss : probability that a directed message is ignored in a step. ``weights`` is the mean over it; the spread adds
-        sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment (``loss_variance``)
-    loss_variance : (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal
-    transition : (n, n) P
-    stationary : (n,) pi
-    initial : (n,) law of g(0)
+    loss_variance : (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and
+        their spread adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
     grounded : (m,) True for leaders of infinite gain
     reference : what tracking agents should hold; 0 for consensus
-    dt : simulated time of a step
     """
 
     weights: FloatArray
@@ -48,46 +99,24 @@ class StepModel:
     noise_gain: FloatArray
     noise: FloatArray
     delay: int
-    loss: float
     loss_variance: FloatArray
-    transition: FloatArray
-    stationary: FloatArray
-    initial: FloatArray
     grounded: BoolArray
     reference: float
-    dt: float
 
-    @property
-    def modes(self) -> int:
-        """Number of graphs n."""
-        return int(self.weights.shape[0])
 
-    @property
-    def agents(self) -> int:
-        """Number of agents m."""
-        return int(self.weights.shape[1])
-
-    def inputs(self, mode: int, agent: int) -> IntArray:
-        """Agents, ascending, whose states row ``agent`` of W_mode uses; the agent itself always among them."""
-        used = self.nominal[mode, agent] != 0.0
-        used[agent] = True
-        return np.flatnonzero(used)
-
-    def neighbours(self, mode: int, agent: int) -> IntArray:
-        """The other agents, ascending, whose states row ``agent`` of W_mode uses."""
-        used = self.inputs(mode, agent)
-        return np.asarray(used[used != agent])
-
-    @property
-    def most_neighbours(self) -> int:
-        """Largest number D of neighbours that any agent has in any graph."""
-        return int((self.nominal != 0.0).sum(axis=2, where=~np.eye(self.agents, dtype=bool)).max())
-
-    def listens(self) -> BoolArray:
-        """(m, m): whether agent i uses the state of agent j != i in any graph."""
-        used: BoolArray = (self.nominal != 0.0).any(axis=0)
-        np.fill_diagonal(used, False)
-        return used
+def build_model(experiment: Experiment) -> Wiring:
+    """What a run needs to know of its network: a ``StepModel`` where the law is linear, else its wiring alone."""
+    if experiment.protocol is None or experiment.protocol.linear:
+        return build_step_model(experiment)
+    transition, stationary, initial = _chain(experiment)
+    return Wiring(
+        links=_arcs(experiment),
+        transition=transition,
+        stationary=stationary,
+        initial=initial,
+        dt=experiment.step_length,
+        loss=experiment.noise.loss,
+    )
 
 
 def build_step_model(experiment: Experiment) -> StepModel:
@@ -95,31 +124,25 @@ def build_step_model(experiment: Experiment) -> StepModel:
 
     One thread of linear algebra: the matrix exponential of a discrete-time experiment must come out the same, to the
     last bit, in every process of a run, whatever number of threads it was given.
+
+    Raises
+    ------
+    InputError : the experiment has a protocol that is not linear, not here, or fails
     """
-    graphs = experiment.graph_list
-    agents = experiment.agents
-    dt = experiment.step_length
-    gains = experiment.leader_gains
-    grounded = np.isinf(gains)
-    follows = ~grounded
-    finite_gains = np.where(grounded, 0.0, gains)
-    weights = np.zeros((len(graphs), agents, agents))
-    with threadpool_limits(1):
-        for mode, graph in enumerate(graphs):
-            z = graph.laplacian + np.diag(finite_gains)
-            if experiment.time == "continuous":
-                weights[mode] = np.eye(agents) - dt * z
-                weights[mode, grounded] = 0.0
-            else:
-                # The limit of exp(-(L + K)) for gains to infinity: leaders forget, followers no longer hear them.
-                block = np.ix_(follows, follows)
-                weights[mode][block] = scipy.linalg.expm(-z[block])
-        transition = experiment.chain.transition(dt)
-    gain = np.sqrt(dt) * experiment.noise_gain
+    agents, dt = experiment.agents, experiment.step_length
+    grounded = np.isinf(experiment.leader_gains)
+    if experiment.protocol:
+        weights, gain = experiment.protocol.matrices()
+        weights[:, range(agents), range(agents)] -= dt * np.where(grounded, 0.0, experiment.leader_gains)
+        weights[:, grounded] = 0.0
+        links = _arcs(experiment) & ~grounded[:, None]
+    else:
+        weights, gain = _built_in(experiment), np.sqrt(dt) * experiment.noise_gain
+        links = weights != 0.0
     if experiment.time == "continuous":
         gain[:, grounded] = 0.0  # a leader held at the reference has no noise either
     reference = experiment.reference
-    offsets = reference * (1.0 - weights.sum(axis=2)) if reference else np.zeros((len(graphs), agents))
+    offsets = reference * (1.0 - weights.sum(axis=2)) if reference else np.zeros(weights.shape[:2])
 
     coupling = weights * ~np.eye(agents, dtype=bool)
     loss = experiment.noise.loss
@@ -131,11 +154,9 @@ def build_step_model(experiment: Experiment) -> StepModel:
     lost = loss * coupling
     mean = weights - lost
     mean[:, range(agents), range(agents)] += lost.sum(axis=2)
-    stationary = experiment.chain.stationary
-    initial = stationary.copy()
-    if experiment.switching.initial != "stationary":
-        initial = np.array([float(graph.name == experiment.switching.initial) for graph in graphs])
+    transition, stationary, initial = _chain(experiment)
     return StepModel(
+        links=links,
         weights=mean,
         nominal=weights,
         offsets=offsets,
@@ -151,3 +172,38 @@ def build_step_model(experiment: Experiment) -> StepModel:
         reference=reference,
         dt=dt,
     )
+
+
+def _built_in(experiment: Experiment) -> FloatArray:
+    """(n, m, m): W_g of the law that the agents have by themselves, with its leaders."""
+    gains, agents = experiment.leader_gains, experiment.agents
+    grounded = np.isinf(gains)
+    follows = ~grounded
+    weights = np.zeros((len(experiment.graph_list), agents, agents))
+    with threadpool_limits(1):
+        for mode, graph in enumerate(experiment.graph_list):
+            z = graph.laplacian + np.diag(np.where(grounded, 0.0, gains))
+            if experiment.time == "continuous":
+                weights[mode] = np.eye(agents) - experiment.step_length * z
+                weights[mode, grounded] = 0.0
+            else:
+                # The limit of exp(-(L + K)) for gains to infinity: leaders forget, followers no longer hear them.
+                block = np.ix_(follows, follows)
+                weights[mode][block] = scipy.linalg.expm(-z[block])
+    return weights
+
+
+def _chain(experiment: Experiment) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """P, pi, and the law of g(0)."""
+    chain, first = experiment.chain, experiment.switching.initial
+    with threadpool_limits(1):
+        transition = chain.transition(experiment.step_length)
+    initial = chain.stationary
+    if first != "stationary":
+        initial = np.array([float(graph.name == first) for graph in experiment.graph_list])
+    return transition, chain.stationary, initial
+
+
+def _arcs(experiment: Experiment) -> BoolArray:
+    """(n, m, m): whether agent i hears agent j, as the graphs say."""
+    return np.array([graph.adjacency != 0.0 for graph in experiment.graph_list])

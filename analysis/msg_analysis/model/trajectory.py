@@ -14,7 +14,7 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 class Completeness:
     """What came and what did not, counted in states x_i(k): m (N + 1) are expected of a run of N steps.
 
-    With broadcast noise every state is expected twice: as it is, and as it was published.
+    Where others hear something else than the state, every state is expected twice: as it is, and as it was published.
 
     Attributes
     ----------
@@ -46,12 +46,13 @@ class Trajectory:
     Attributes
     ----------
     record : what the run was started from
-    states : (N + 1, m, replicas); NaN where a state is missing
+    states : (N + 1, m, width); NaN where a state is missing. The width is the number of replicas, or as many times that
+        as a protocol's state has numbers: those of the first come first, and are the agents' values
     modes : (N,) index from 0 of the graph used in the step k -> k+1; -1 where not known
     agent_modes : (N + 1, m) graph that each agent says it used in the step that led to this state (from 0; -1 at
         step 0 and where missing), or None where nobody logged it
-    published : (N + 1, m, replicas) what the agents published of their states, NaN where missing; None without
-        broadcast noise: the states themselves
+    published : (N + 1, m, replicas) what the agents published of their states, NaN where missing; None where that is
+        the states themselves
     lost : (N, m, D) whether in the step k -> k+1 agent i did not get the message of its d-th neighbour, ascending,
         under the graph of that step (see ``StepModel.neighbours``); D is the largest number of neighbours. None
         where messages cannot be lost
@@ -65,6 +66,11 @@ class Trajectory:
     agent_modes: IntArray | None = None
     published: FloatArray | None = None
     lost: BoolArray | None = None
+
+    @property
+    def values(self) -> FloatArray:
+        """(N + 1, m, replicas): the agents' values, which are all of the state unless a protocol has more to it."""
+        return self.states[:, :, : self.record.experiment.run.replicas]
 
     @property
     def present(self) -> BoolArray:

@@ -309,13 +309,13 @@ def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
 
 
 def memory_needed(
-    agents: int, modes: int, steps: int, replicas: int, delay: int = 0, broadcast: float = 0.0
+    agents: int, modes: int, steps: int, replicas: int, delay: int = 0, truth: bool = False
 ) -> tuple[int, int]:
     """Bytes for the states of a run, and for the matrices of all graphs, which a delay makes larger.
 
-    With broadcast noise the states are there twice: as they are, and as they were published.
+    Where others hear something else than the states, these are there twice: as they are, and as they were published.
     """
-    states = (steps + 1) * agents * replicas * 8 * (2 if broadcast else 1)
+    states = (steps + 1) * agents * replicas * 8 * (2 if truth else 1)
     return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
 
 
@@ -330,12 +330,10 @@ def available_memory() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def memory_problems(
-    agents: int, modes: int, steps: int, replicas: int, delay: int, broadcast: float = 0.0
-) -> list[str]:
+def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int, truth: bool = False) -> list[str]:
     """States and matrices that cannot fit in memory."""
     available = available_memory()
-    states, matrices = memory_needed(agents, modes, steps, replicas, delay, broadcast)
+    states, matrices = memory_needed(agents, modes, steps, replicas, delay, truth)
     if states + matrices <= available:
         return []
     room = f"expected at most {amount(available)}, the memory available"

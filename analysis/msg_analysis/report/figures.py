@@ -77,9 +77,10 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> str:
     with _figure(2.7) as (figure, text):
         axes = figure.subplots()
         half = min(0.32, 0.28 + len(nodes) / 1000)
-        axes.hlines(predicted, agents - half, agents + half, color=BLACK, lw=1.4, label="predicted", zorder=3)
+        if not np.isnan(predicted).all():
+            axes.hlines(predicted, agents - half, agents + half, color=BLACK, lw=1.4, label="predicted", zorder=3)
         for chosen, colour, label in (
-            (~apart, BLUE, "measured, 95 % interval"),
+            (~apart, BLUE, "measured" if np.isnan(error).all() else "measured, 95 % interval"),
             (apart, VERMILLION, "measured, disagrees"),
         ):
             if chosen.any() and not np.isnan(measured[chosen]).all():
@@ -99,7 +100,8 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> str:
         axes.grid(visible=False, axis="x")
         axes.set_xlim(0.4, len(nodes) + 0.6)
         axes.margins(y=0.12)
-        figure.legend(loc="outside upper right", ncols=3)
+        if axes.get_legend_handles_labels()[0]:
+            figure.legend(loc="outside upper right", ncols=3)
     return text.getvalue()
 
 
@@ -132,18 +134,22 @@ def running_estimate(running: Mapping[str, FloatArray], predicted: float | None)
     return text.getvalue()
 
 
-def covariances(measured: FloatArray | None, predicted: FloatArray) -> str:
-    """Heat maps of one scale: measured, predicted, and their difference; the predicted one alone if need be.
+def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> str:
+    """Heat maps of one scale: measured, predicted, and their difference; what there is of these.
 
     Parameters
     ----------
-    measured, predicted : FloatArray
+    measured, predicted : FloatArray | None
         (m, m) each
     """
-    panels = [("predicted", predicted)]
-    if measured is not None:
-        panels = [("measured", measured), *panels, ("measured − predicted", measured - predicted)]
-    agents = len(predicted)
+    panels = [
+        (title, matrix) for title, matrix in (("measured", measured), ("predicted", predicted)) if matrix is not None
+    ]
+    if measured is not None and predicted is not None:
+        panels.append(("measured − predicted", measured - predicted))
+    if not panels:
+        return ""
+    agents = len(panels[0][1])
     limit = max(float(np.abs(matrix).max()) for _, matrix in panels) or 1.0
     with _figure(3.1 if len(panels) > 1 else 3.4, _WIDTH if len(panels) > 1 else 4.4) as (figure, text):
         axes = figure.subplots(1, len(panels), squeeze=False)[0]

@@ -23,6 +23,7 @@ _HEADLINES = {
     "agrees": "The run agrees with the prediction.",
     "disagrees": "The run disagrees with the prediction.",
     "incomplete": "No verdict: the data are incomplete.",
+    "unpredicted": "No verdict: there is no prediction.",
 }
 _OPEN_TABLE = 12  # agents up to which the table of the nodes is open from the start
 _SMALL_CHAIN = 8  # graphs up to which all transitions are listed
@@ -86,7 +87,7 @@ def render(comparison: Comparison, trajectory: Trajectory) -> str:
     pictures = {
         "graphs": figures.graphs(experiment),
         "nodes": figures.node_errors(document["node_errors"], document["level"]),
-        "covariance": figures.covariances(_matrix(covariance["measured"]), np.array(covariance["predicted"])),
+        "covariance": figures.covariances(_matrix(covariance["measured"]), _matrix(covariance["predicted"])),
     }
     if len(known):
         pictures["modes"] = figures.active_graph(known, names, chain.stationary, experiment.step_length)
@@ -125,6 +126,12 @@ def _explanation(document: dict[str, Any]) -> str:
             else "Too little came before the first gap for any number."
         )
         return f"Missing: {' and '.join(filter(None, lost))}. {numbers}"
+    if document["unpredicted"]:
+        rejected = [test["name"] for test in tests if test["rejected"]]
+        tested = " and ".join(test["name"] for test in tests) or "nothing"
+        outcome = f"{' and '.join(rejected)}: rejected." if rejected else f"Tested, and not rejected: {tested}."
+        cut = f" Errors are measured from step {document['transient']} on." if document["transient"] else ""
+        return f"Unpredicted: {document['unpredicted']}. {outcome}{cut}"
     chance = f"a run that follows the predicted law would be called a disagreement with a chance of {level:.2g}"
     rejected = [test for test in tests if test["rejected"]]
     if not rejected:

@@ -21,11 +21,12 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
 
     Returns
     -------
-    ``name``, ``problem``, ``time``, ``agents``, ``leaders``, ``noise``, ``run`` (with ``steps``),
+    ``name``, ``problem``, ``time``, ``agents``, ``leaders``, ``protocol`` (``name``, ``package``, ``version``,
+    ``linear``, ``states``, ``hidden``, ``parameters``, ``absent``), ``noise``, ``run`` (with ``steps``),
     ``switching`` (``matrix``, ``initial``), ``graphs`` (each ``name``, ``edges`` or ``arcs``,
     ``algebraic_connectivity``, ``stationary``, ``mean_holding_time``, ``stability_limit``),
     ``stability_limit``, ``predicted_system_error``, ``memory`` [bytes], ``unavailable``. None stands for what
-    is infinite or cannot be computed, or, for the stability limits, is not known (with a delay).
+    is infinite or cannot be computed, or, for the stability limits, is not known (with a delay or a protocol).
     """
     document = experiment.to_document()
     chain = experiment.chain
@@ -33,9 +34,9 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
         experiment.agents,
         chain.modes,
         experiment.steps,
-        experiment.run.replicas,
+        experiment.width,
         experiment.noise.delay,
-        experiment.noise.broadcast,
+        experiment.truth,
     )
     limits = [_stability_limit(experiment, graph) for graph in experiment.graph_list]
     return {
@@ -44,6 +45,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
         "time": experiment.time,
         "agents": experiment.agents,
         "leaders": document.get("leaders"),
+        "protocol": _protocol(experiment),
         "noise": document["noise"],
         "run": document["run"] | {"steps": experiment.steps},
         "switching": {"matrix": chain.matrix.tolist(), "initial": experiment.switching.initial},
@@ -78,7 +80,7 @@ def describe_bag(path: Path) -> dict[str, Any]:
     Returns
     -------
     ``bag``, ``run``, ``experiment``, ``seed``, ``agents``, ``replicas``, ``steps``, ``simulated_time``,
-    ``completeness``, ``files`` (each ``name``, ``size`` [bytes]), ``versions``
+    ``completeness``, ``files`` (each ``name``, ``size`` [bytes]), ``protocol`` (as of an experiment), ``versions``
 
     Raises
     ------
@@ -102,7 +104,20 @@ def describe_bag(path: Path) -> dict[str, Any]:
         "simulated_time": run.duration,
         "completeness": dataclasses.asdict(completeness) | {"complete": completeness.complete},
         "files": [{"name": file.name, "size": file.stat().st_size} for file in files],
+        "protocol": _protocol(record.experiment),
         "versions": record.versions,
+    }
+
+
+def _protocol(experiment: Experiment) -> dict[str, Any] | None:
+    """What the agents do instead of the built-in law; None for that."""
+    protocol = experiment.protocol
+    if protocol is None:
+        return None
+    parameters = experiment.to_document()["protocol"]
+    return protocol.info.to_json() | {
+        "parameters": {key: value for key, value in parameters.items() if key != "name"},
+        "absent": protocol.absent,
     }
 
 
@@ -114,7 +129,7 @@ def algebraic_connectivity(graph: Graph) -> float:
 
 
 def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
-    if experiment.time == "discrete" or experiment.noise.delay:
+    if experiment.time == "discrete" or experiment.noise.delay or experiment.protocol:
         return None
     limit = validation.stability_limit(graph, experiment.leader_gains)
     return limit if math.isfinite(limit) else None

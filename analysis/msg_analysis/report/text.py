@@ -23,6 +23,7 @@ _VERDICTS = {
     "agrees": ("The run agrees with the prediction.", "bold green"),
     "disagrees": ("The run disagrees with the prediction.", "bold red"),
     "incomplete": ("No verdict: the data are incomplete.", "bold yellow"),
+    "unpredicted": ("No verdict: there is no prediction. What was to be tested passed.", "bold"),
 }
 
 _METHODS = {
@@ -74,6 +75,10 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
         f"({number_text(document['simulated_time'])} units of time): {count['missing']} missing, "
         f"{count['duplicates']} twice, {count['out_of_order']} out of order"
     )
+    if document.get("unpredicted"):
+        console.print(Text(f"Unpredicted: {document['unpredicted']}."))
+    if document.get("transient"):
+        console.print(f"The first {document['transient']} steps, a transient, are left out of the errors.")
     _print_errors(document, console)
     _print_tests(document, console)
     loss = document.get("loss") or {}
@@ -139,6 +144,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
         leaders = document["leaders"]
         text = f"{_names(leaders['agents'])}, gain {leaders['gain']}, reference {leaders['reference']}"
         facts.add_row("leaders", text)
+    _add_protocol(facts, document.get("protocol"))
     facts.add_row("noise", ", ".join(f"{key} {_short(value)}" for key, value in document["noise"].items()))
     facts.add_row("steps", f"{run['steps']} of {number_text(run['dt'])}, {number_text(run['duration'])} units of time")
     facts.add_row("stability limit of a step", number_text(document["stability_limit"]))
@@ -188,6 +194,7 @@ def print_bag(document: dict[str, Any], console: Console) -> None:
     facts = fact_table(console, document["bag"])
     facts.add_row("run", document["run"])
     facts.add_row("experiment", f"{document['experiment']}, seed {document['seed']}")
+    _add_protocol(facts, document.get("protocol"))
     facts.add_row("agents, replicas", f"{document['agents']}, {document['replicas']}")
     facts.add_row("steps", f"{document['steps']}, {number_text(document['simulated_time'])} units of time")
     state = "complete" if count["complete"] else "incomplete"
@@ -201,6 +208,17 @@ def print_bag(document: dict[str, Any], console: Console) -> None:
     for name, version in document["versions"].items():
         facts.add_row(Text(name), Text(str(version)))
     console.print(facts)
+
+
+def _add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
+    if protocol is None:
+        return
+    kind = "linear" if protocol["linear"] else "not linear, no prediction"
+    facts.add_row("protocol", Text(f"{protocol['name']} of {protocol['package']} {protocol['version']}, {kind}"))
+    for name, value in protocol["parameters"].items():
+        facts.add_row("", Text(f"{name}: {_short(value)}"))
+    if protocol["absent"]:
+        facts.add_row("", Text(protocol["absent"], style="yellow"))
 
 
 def print_leaders(document: dict[str, Any], console: Console) -> None:

@@ -113,6 +113,8 @@ def _system(experiment: Experiment, law: Law) -> tuple[JumpSystem, float | None]
     if experiment.time == "discrete":
         raise InputError("--law continuous: expected an experiment in continuous time: leave --law out")
     noise = experiment.noise
+    if experiment.protocol:
+        raise InputError(f"--law continuous: {experiment.protocol.info} has steps only: leave --law out")
     if noise.broadcast or noise.link or noise.loss or noise.delay:
         raise InputError(
             "--law continuous: noise.broadcast, link, loss and delay belong to steps, expected 0: leave --law out"

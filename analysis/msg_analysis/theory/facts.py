@@ -18,6 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from msg_analysis.errors import InputError
+from msg_analysis.model.step import build_step_model
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
@@ -76,7 +77,8 @@ def check_facts(experiment: Experiment) -> list[Fact]:
 
     Continuous time: N_c, M_c and their projections (consensus), or N_k, M_k (tracking). Discrete time: H_c, A_c
     and their projections, or H_k, A_k. Graphs may be directed, weighted and disconnected, if their union connects
-    everybody. Leaders of infinite gain are deleted.
+    everybody. Leaders of infinite gain are deleted. Of a linear protocol, what holds of W = exp(-Z) in discrete time is
+    checked of its steps.
 
     Raises
     ------
@@ -85,8 +87,8 @@ def check_facts(experiment: Experiment) -> list[Fact]:
     gains = experiment.leader_gains
     follows = np.isfinite(gains)
     block = np.ix_(follows, follows)
-    laplacians = [(graph.laplacian + np.diag(np.where(follows, gains, 0.0)))[block] for graph in experiment.graph_list]
-    n, m = len(laplacians), len(laplacians[0])
+    drifts = [(graph.laplacian + np.diag(np.where(follows, gains, 0.0)))[block] for graph in experiment.graph_list]
+    n, m = len(drifts), len(drifts[0])
     if n * m * m > MAX_UNKNOWNS:
         raise InputError(
             f"facts: {n} graphs of {m} agents give matrices of n m^2 = {n * m * m} rows, expected at most "
@@ -94,8 +96,12 @@ def check_facts(experiment: Experiment) -> list[Fact]:
         )
     chain, law = experiment.chain.matrix, experiment.chain.stationary
     consensus = experiment.problem == "consensus"
-    check = _continuous if experiment.time == "continuous" else _discrete
-    return check(laplacians, chain, law, consensus)
+    if experiment.protocol:
+        step = build_step_model(experiment)
+        return _discrete([w[block] for w in step.nominal], step.transition, law, consensus)
+    if experiment.time == "continuous":
+        return _continuous(drifts, chain, law, consensus)
+    return _discrete([np.asarray(scipy.linalg.expm(-z)) for z in drifts], chain, law, consensus)
 
 
 def _continuous(drifts: list[FloatArray], generator: FloatArray, law: FloatArray, consensus: bool) -> list[Fact]:
@@ -123,9 +129,8 @@ def _continuous(drifts: list[FloatArray], generator: FloatArray, law: FloatArray
     ]
 
 
-def _discrete(drifts: list[FloatArray], transition: FloatArray, law: FloatArray, consensus: bool) -> list[Fact]:
-    m = len(drifts[0])
-    steps = [np.asarray(scipy.linalg.expm(-z)) for z in drifts]
+def _discrete(steps: list[FloatArray], transition: FloatArray, law: FloatArray, consensus: bool) -> list[Fact]:
+    m = len(steps[0])
 
     def matrices(weights: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
         first = _kron(transition.T, np.eye(m)) @ scipy.linalg.block_diag(*weights)

@@ -97,6 +97,8 @@ def error_bounds(prediction: Prediction) -> Bounds:
     With unequal or correlated noise, or directed graphs, E can lie outside on both sides.
     """
     experiment = prediction.experiment
+    if experiment.protocol:
+        return Bounds(None, None, _NO_BOUNDS + "they belong to the built-in law, not to a protocol")
     if experiment.time == "continuous":
         if prediction.continuous is None:
             return Bounds(None, None, _NO_BOUNDS + "they belong to the law without noise on the air, loss or delay")

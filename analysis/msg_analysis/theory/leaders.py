@@ -69,7 +69,11 @@ class LeaderProblem:
         step = self._system(frozenset({0}), 1.0)
         if step.noise.min() < -1e-12 * np.abs(step.noise).max():
             return "the noise of some agents is negatively correlated"
-        if self.law == "emulated":
+        if self.experiment.protocol:
+            everybody = self._system(frozenset(range(self.agents)), self.gain if math.isfinite(self.gain) else 0.0)
+            if everybody.matrices.min() < 0.0:
+                return "some weights of the protocol are negative"
+        elif self.law == "emulated":
             pull = self.gain if math.isfinite(self.gain) else 0.0
             degree = max(float(graph.adjacency.sum(axis=1).max()) for graph in self.experiment.graph_list)
             if self.experiment.step_length * (degree + pull) > 1.0:
@@ -180,7 +184,7 @@ def resolve_law(experiment: Experiment, law: Law | None = None) -> Law:
     """
     if experiment.time == "discrete":
         possible: list[Law] = ["discrete"]
-    elif experiment.noise.steps_only:
+    elif experiment.steps_only:
         possible = ["emulated"]
     else:
         possible = ["continuous", "emulated"]
@@ -189,7 +193,7 @@ def resolve_law(experiment: Experiment, law: Law | None = None) -> Law:
     if law not in possible:
         reason = "discrete time" if experiment.time == "discrete" else "continuous time"
         if law == "continuous" and experiment.time == "continuous":
-            reason += " with noise on the air, loss or delay, which belong to steps"
+            reason += " with a protocol, noise on the air, loss or delay, which belong to steps"
         raise InputError(f"--law {law}: {experiment.source} is in {reason}: use {' or '.join(possible)}")
     return law
 

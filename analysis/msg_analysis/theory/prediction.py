@@ -85,7 +85,8 @@ class Prediction:
     solver : of the equations of the run's steps; its ``system`` is the reduced system
     steady : (n, d, d) steady second moments of the reduced system of the run's steps
     emulated : what the run's steps do, exactly ("discrete" in the document of a discrete-time experiment)
-    continuous : the paper's continuous-time system; None in discrete time or with noise on the air, loss or delay
+    continuous : the paper's continuous-time system; None in discrete time, with a protocol, or with noise on the air,
+        loss or delay
     static : the pi-weighted mean over the graphs held for ever; None where one of them cannot keep the
         agents together
     """
@@ -129,7 +130,7 @@ def predict(experiment: Experiment) -> Prediction:
     step = build_step_model(experiment)
     continuous = static = None
     if not experiment.noise.steps_only:
-        if experiment.time == "continuous":
+        if experiment.time == "continuous" and not experiment.steps_only:
             paper = systems.continuous(experiment)
             exact = MomentSolver(paper)
             continuous = _moments(exact, exact.steady())
@@ -171,6 +172,8 @@ def _steady(step: StepModel, problem: str) -> tuple[MomentSolver, FloatArray]:
     except InputError as error:
         if step.dt < limit:
             raise
+        if not limit:
+            raise
         raise InputError(f"{error}; every dt below {limit:.4g} is stable, whatever the switching and delay") from error
     return solver, steady
 
@@ -195,6 +198,8 @@ def _require_stability(solver: MomentSolver) -> None:
 def _safe_step(step: StepModel) -> float:
     """Largest dt below which no agent overshoots what it hears: W is stochastic then, and stable with any delay."""
     own = np.diagonal(step.weights, axis1=1, axis2=2)
+    if (step.weights < 0.0).sum() > (own < 0.0).sum():
+        return 0.0  # a protocol that subtracts what it hears: nothing is safe
     heard = (step.weights.sum(axis=2) - own) / (1.0 - step.loss)  # without loss
     pull = (1.0 - step.weights.sum(axis=2)) + heard
     return float(step.dt / pull[:, ~step.grounded].max())

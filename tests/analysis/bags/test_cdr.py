@@ -217,6 +217,9 @@ def test_fast_codec_with_heard_is_the_general_one(typestore: Any, replicas: int,
     other = struct.pack(f"<{replicas}d", *range(1, replicas + 1))
     assert frame.unwrap(with_state(data, other)) == (7, 9, 1, other)
     assert AgentState.decode(with_state(data, other)).heard.tolist() == heard
+    for length in (1, 5):
+        decoded = AgentState.decode(with_state(data, bytes(8 * length), len(other)))
+        assert (decoded.state.tolist(), decoded.heard.tolist(), decoded.step) == ([0.0] * length, heard, 9)
     assert StateFrame(RUN, replicas).unwrap(data) is None  # of a run in which nothing can be lost
     if len(heard) > 1:
         assert StateFrame(RUN, replicas, len(heard) - 1).unwrap(data) is None

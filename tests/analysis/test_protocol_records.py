@@ -1,0 +1,126 @@
+"""What is kept of a protocol with a run, and what a bag is worth without it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from pydantic import Field
+
+from msg_agents.check import check
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.store import write_trajectory
+from msg_analysis.errors import InputError
+from msg_analysis.inference.compare import compare
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.record import RunRecord
+from msg_analysis.protocol import Heard, LinearProtocol, Parameters, Protocol
+from msg_analysis.report.info import describe_bag
+from msg_analysis.twin import new_record, simulate
+from msg_analysis.types import FloatArray
+
+
+def document(protocol: dict[str, Any] | None, **changes: Any) -> dict[str, Any]:
+    """Five agents on a line and a ring; ``run`` is merged, other keys are replaced."""
+    run = {"dt": 0.1, "duration": 60, "replicas": 3, "seed": 5, "start": [1, 2, 3, 4, 5]} | changes.pop("run", {})
+    return {
+        "name": "net",
+        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"edges": [[1, 2], [2, 3, 0.5], [3, 4], [4, 5], [5, 1]]}},
+        "switching": {"generator": [[-1, 1], [2, -2]]},
+        **({"protocol": protocol} if protocol else {}),
+        **changes,
+        "run": run,
+    }
+
+
+def experiment(protocol: dict[str, Any] | None, **changes: Any) -> Experiment:
+    return Experiment.parse(document(protocol, **changes))
+
+
+class Euler(LinearProtocol):
+    """The built-in law, declared."""
+
+    def weights(self, mode: int) -> FloatArray:
+        return np.eye(self.network.agents) - self.network.dt * self.network.graphs[mode].laplacian
+
+
+class EulerSteps(Protocol):
+    """The built-in law, step by step."""
+
+    tracking = True
+
+    def step(self, k: int, mode: int, state: FloatArray, heard: Heard, noise: FloatArray) -> FloatArray:
+        gain = self.network.leader_gains[self.agent]
+        pull = heard.weighted_sum(heard.values - state[0]) + gain * (self.network.reference - state[0])
+        return state + self.network.dt * pull + noise
+
+
+class OptionalParameters(Parameters):
+    limit: float | None = Field(2.0)
+
+
+class Optional(EulerSteps):
+    Parameters: ClassVar[type[Parameters]] = OptionalParameters
+
+
+@pytest.mark.parametrize("limit", [None, 3.0, ...])
+def test_parameters_survive(limit: Any, offer: Callable[..., None]) -> None:
+    """Also one that is None, and is not so by default."""
+    offer(("optional", Optional))
+    what = experiment({"name": "optional"} | ({} if limit is ... else {"limit": limit}))
+    again = RunRecord.from_json(new_record(what).to_json(), "here").experiment
+    assert again == what
+    assert again.protocol is not None
+    assert again.protocol.parameters == OptionalParameters(**({} if limit is ... else {"limit": limit}))
+    assert again.to_document()["protocol"] == {"name": "optional", "limit": 2.0 if limit is ... else limit}
+
+
+@pytest.mark.parametrize("name", ["metropolis", "integral_action"])
+def test_a_bag_of_what_is_not_installed(name: str, offer: Callable[..., None], tmp_path: Path) -> None:
+    """It can be read, counted and measured. What needs the protocol says so."""
+    bag = tmp_path / "bag"
+    trajectory = simulate(experiment({"name": name}, noise={"loss": 0.2}, run={"start": "zero"}))
+    write_trajectory(trajectory, bag)
+    assert json.loads(trajectory.record.to_json())["protocol"] == {
+        "name": name,
+        "package": "msg_agents_example_protocols",
+        "version": "0.1.0",
+        "linear": name == "metropolis",
+        "states": 1 if name == "metropolis" else 2,
+        "hidden": name != "metropolis",
+    }
+    offer(("another", Euler))
+    read = read_bag(bag)
+    assert read.completeness == trajectory.completeness
+    assert np.array_equal(read.states, trajectory.states)
+    assert read.lost is not None
+    assert trajectory.lost is not None
+    assert np.array_equal(read.lost, trajectory.lost)
+    word = f"protocol {name} (msg_agents_example_protocols 0.1.0) is not here"
+    assert word in describe_bag(bag)["protocol"]["absent"]
+    comparison = compare(read)
+    assert comparison.verdict == "unpredicted"
+    assert comparison.unpredicted is not None
+    assert word in comparison.unpredicted
+    with pytest.raises(InputError, match=r"is not here .*: install msg_agents_example_protocols 0"):
+        check(read)
+
+
+def test_a_bag_of_another_version(offer: Callable[..., None], tmp_path: Path) -> None:
+    """As good as the same where the states are of the same kind, else as good as none."""
+    offer(("mine", EulerSteps))
+    write_trajectory(simulate(experiment({"name": "mine"})), tmp_path / "bag")
+    offer(("mine", EulerSteps), version="1.3")
+    read = read_bag(tmp_path / "bag")
+    assert read.record.experiment.protocol is not None
+    assert str(read.record.experiment.protocol.info) == "protocol mine (pack 1.2)"
+    assert check(read).difference is None
+    offer(("mine", type("More", (EulerSteps,), {"states": 2})), version="2.0")
+    read = read_bag(tmp_path / "bag")
+    assert read.completeness.complete
+    with pytest.raises(InputError, match=r"mine \(pack 1.2\) is not here, but 2.0, whose states are of another kind"):
+        check(read)
