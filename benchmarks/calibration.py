@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import late_timers
 import numpy as np
 from scipy import stats
 from threadpoolctl import threadpool_limits
@@ -110,6 +111,43 @@ def print_evenness(runs: int) -> None:
         print(f"| {name} | {100 * (p < 0.05).mean():.1f} % | {100 * (p < 0.5).mean():.1f} % | {even:.2f} |", flush=True)
 
 
+def print_real_time(runs: int) -> None:
+    """Runs in real time, on time and late: p-values, false alarms, and what is found of agents that are wrong."""
+    late = {
+        "late": late_timers.busy(0.3, 1.5),
+        "slow": late_timers.busy(0.3, 0.7),
+        "switch": late_timers.busy(0.5, 1.0),
+    }
+    experiment = Experiment.parse(line_ring(pace="realtime", dt=0.1))
+    values: dict[str, dict[str, list[float]]] = {}
+    print("\n| real time | false alarms | deadlines missed | sequential law not supported |")
+    print("|---|---:|---:|---:|")
+    for name, timing in (("nobody late", dict[str, Any]()), ("late", late)):
+        alarms, missed, sequential = 0, 0.0, 0
+        values[name] = {}
+        for seed in range(runs):
+            trajectory = late_timers.run(experiment.with_run(seed=seed), timing_seed=seed, **timing)
+            comparison = compare(trajectory)
+            alarms += comparison.verdict == "disagrees"
+            assert comparison.timing is not None
+            assert comparison.laws is not None
+            missed += comparison.timing.missed_share / runs
+            sequential += comparison.laws.sequential.supported is False
+            for test in comparison.tests:
+                values[name].setdefault(test.name, []).append(test.p)
+        numbers = f"{100 * alarms / runs:.1f} % | {100 * missed:.1f} % | {100 * sequential / runs:.1f} %"
+        print(f"| {name} | {numbers} |", flush=True)
+    print("\n| real time | test | p below 5 % | p below 50 % | Kolmogorov-Smirnov p of the p-values |")
+    print("|---|---|---:|---:|---:|")
+    for name, tests in values.items():
+        for what, found in tests.items():
+            p = np.array(found)
+            even = stats.kstest(p, "uniform").pvalue
+            print(
+                f"| {name} | {what} | {100 * (p < 0.05).mean():.1f} % | {100 * (p < 0.5).mean():.1f} % | {even:.2f} |"
+            )
+
+
 def print_power(runs: int) -> None:
     """Runs that do not."""
     print("\n| what is wrong | found | by (share of the runs) |")
@@ -134,6 +172,7 @@ def main() -> None:
     with threadpool_limits(1):
         print_calibration(arguments.runs)
         print_evenness(max(1, arguments.runs // 2))
+        print_real_time(arguments.runs)
         print_power(max(1, arguments.runs // 8))
 
 

@@ -21,6 +21,7 @@ from msg_analysis.model.step import StepModel, Wiring, build_model, build_step_m
 from msg_analysis.model.streams import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.model.trajectory import Completeness, Trajectory
 from msg_analysis.theory.prediction import stationary_start_factor
+from msg_analysis.twin_realtime import IdealTimers
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
@@ -40,7 +41,7 @@ def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatA
     if start != "stationary":
         return np.repeat(np.array(start, dtype=float)[:, None], replicas, axis=1)
     assert isinstance(model, StepModel), "experiments without a prediction start from given values"
-    factor = stationary_start_factor(model, experiment.problem, first_mode)
+    factor = stationary_start_factor(experiment, first_mode)
     sources = [normals(experiment.run.seed, Stream.START, j, 0, (replicas,)) for j in range(experiment.agents)]
     deviations = np.array([weighted_sum([float(w) for w in row], sources) for row in factor])
     return deviations + model.reference
@@ -70,7 +71,8 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
 
     Returns
     -------
-    The same states, to the last bit, as those of a lockstep network run.
+    The same states, to the last bit, as those of a lockstep network run; in real time, as those of a run with ideal
+    timers and no delay.
     """
     experiment = record.experiment if record else experiment
     experiment.require_available()
@@ -81,8 +83,16 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
     modes = mode_path(experiment, model.initial)
     states = np.empty((experiment.steps + 1, *record.start.shape))
     states[0] = record.start
+    drives = _drives(experiment, model, modes)
+    if experiment.run.pace == "realtime":
+        timers = IdealTimers(experiment, model)
+        for k, state in enumerate(timers.states(modes, record.start, drives), start=1):
+            states[k] = state
+        agent_modes, used, made = timers.log(modes)
+        whole = Completeness(states.shape[0] * states.shape[1], states.shape[0] * states.shape[1], 0)
+        return Trajectory(record, states, modes, whole, agent_modes, used=used, made=made)
     reception = Reception(experiment, model) if experiment.noise.on_air else None
-    for k, state in enumerate(_states(experiment, model, modes, record.start, reception), start=1):
+    for k, state in enumerate(_states(model, modes, record.start, drives, reception), start=1):
         states[k] = state
     published, lost = reception.log(states, modes) if reception else (None, None)
     expected = states.shape[0] * states.shape[1] * (1 if published is None else 2)
@@ -119,14 +129,10 @@ def _simulate_agents(record: RunRecord, model: Wiring) -> Trajectory:
     )
 
 
-def _states(
-    experiment: Experiment, model: StepModel, modes: IntArray, start: FloatArray, reception: Reception | None
-) -> Iterator[FloatArray]:
-    """x(1), x(2), ... of a path of graphs."""
+def _drives(experiment: Experiment, model: StepModel, modes: IntArray) -> Iterator[FloatArray]:
+    """For every step of a path of graphs, (m, R): the noise of all agents, plus what the reference adds."""
     noise = ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas)
-    rows = [_padded_rows(model, mode) for mode in range(model.modes)]
     offsets = [offset[:, None] for offset in model.offsets]
-    state = start
     for k, mode in enumerate(modes):
         within = k % STEPS_PER_BLOCK
         if within == 0:
@@ -134,9 +140,19 @@ def _states(
             drives: dict[int, FloatArray] = {}
         if mode not in drives:
             drives[mode] = np.stack([of_agent[mode] for of_agent in noises], axis=1) + offsets[mode]
+        yield drives[mode][within]
+
+
+def _states(
+    model: StepModel, modes: IntArray, start: FloatArray, drives: Iterator[FloatArray], reception: Reception | None
+) -> Iterator[FloatArray]:
+    """x(1), x(2), ... of a path of graphs, everybody at once."""
+    rows = [_padded_rows(model, mode) for mode in range(model.modes)]
+    state = start
+    for k, (mode, drive) in enumerate(zip(modes, drives, strict=True)):
         weights, inputs = rows[mode]
         values = reception.values(k, mode, state) if reception else [state[j] for j in inputs]
-        state = step(weights, values, drives[mode][within])
+        state = step(weights, values, drive)
         yield state
 
 

@@ -108,8 +108,16 @@ def test_what_is_not_available_is_refused(tmp_path: Path) -> None:
     assert late.exit_code == 2
     assert "noise.delay: 2: not available" in late.stderr
     assert not (tmp_path / "out").exists()
+    file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nnoise: {loss: 0.1}\nrun: {pace: realtime}\n")
+    assert "noise.loss: 0.1: not available in real time yet" in call("predict", file).stderr
+
+
+def test_real_time_is_predicted_in_turn(tmp_path: Path) -> None:
+    file = tmp_path / "file.yaml"
     file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nrun: {pace: realtime}\n")
-    assert "run.pace: 'realtime': not available yet" in call("predict", file).stderr
+    assert "steps in turn" in call("predict", file).stdout
+    document = json.loads(call("predict", file, "--json").stdout)
+    assert document["emulated"]["law"] == "sequential"
 
 
 def test_simulate_writes_a_bag_and_never_overwrites(bag: Path) -> None:

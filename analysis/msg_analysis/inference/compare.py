@@ -7,16 +7,20 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
 
 from msg_analysis.inference.air import LossTest, broadcast_p, loss_test
 from msg_analysis.inference.batch import batch_interval
-from msg_analysis.inference.innovations import InnovationTests, innovation_tests, quadratic_form
+from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates
+from msg_analysis.inference.events import order_events
+from msg_analysis.inference.innovations import InnovationTests, innovation_tests
+from msg_analysis.inference.laws import Laws, measure_laws
 from msg_analysis.inference.martingale import TimeMeans, time_means
 from msg_analysis.inference.measurement import Measurement
 from msg_analysis.inference.multiplicity import holm
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.switching import SwitchingTest, switching_test
+from msg_analysis.inference.timing import Timing, measure_timing
+from msg_analysis.model.sequential import step_law
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.types import FloatArray, IntArray
@@ -27,51 +31,6 @@ EXIT_CODES: dict[Verdict, int] = {"agrees": 0, "disagrees": 1, "incomplete": 3, 
 MIN_STEPS = 100
 """Fewest steps for which numbers are given."""
 RUNNING_POINTS = 400
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """A measured error beside its prediction; None where it cannot be had.
-
-    Attributes
-    ----------
-    measured, predicted : time mean over the run, and its exact expectation
-    standard_error : of the measured one, the martingale one
-    z : (measured - predicted) / standard_error
-    p : two-sided, of z
-    p_holm : adjusted over the nodes; None for the system error
-    """
-
-    measured: float | None = None
-    predicted: float | None = None
-    standard_error: float | None = None
-    z: float | None = None
-    p: float | None = None
-    p_holm: float | None = None
-
-    @property
-    def interval(self) -> tuple[float | None, float | None]:
-        """95 % confidence interval around the measured error."""
-        if self.measured is None or self.standard_error is None:
-            return None, None
-        half = float(stats.norm.ppf(0.975)) * self.standard_error
-        return self.measured - half, self.measured + half
-
-    def to_json(self) -> dict[str, Any]:
-        """The document of one estimate."""
-        return {**asdict(self), "interval": list(self.interval)}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CovarianceTest:
-    """All second moments at once; arrays are (m, m), None where they were not estimated."""
-
-    measured: FloatArray | None = None
-    predicted: FloatArray | None = None
-    chi2: float | None = None
-    dof: int | None = None
-    p: float | None = None
-    note: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +61,8 @@ class Comparison:
     p_broadcast : of the noise in what was published; None without
     unpredicted : why there is no prediction; None where there is one
     transient : steps at the start that are left out of the measured errors; None with a prediction, which knows them
+    timing, laws : in real time: how time was kept, and which laws the log supports; None in lockstep. The errors and
+        the covariance are then held against the first of the laws that there is
     """
 
     trajectory: Trajectory
@@ -120,6 +81,8 @@ class Comparison:
     p_broadcast: float | None = None
     unpredicted: str | None = None
     transient: int | None = None
+    timing: Timing | None = None
+    laws: Laws | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -152,6 +115,7 @@ class Comparison:
             "completeness": asdict(self.trajectory.completeness),
             "steps": self.steps,
             "simulated_time": self.steps * record.experiment.step_length,
+            "law": self.laws.measured_against if self.laws else step_law(record.experiment),
             "system_error": self.system_error.to_json(),
             "node_errors": [estimate.to_json() for estimate in self.node_errors],
             "covariance": {
@@ -170,6 +134,8 @@ class Comparison:
             },
             "loss": asdict(self.loss) if self.loss else dict.fromkeys(("lost", "expected", "p")),
             "broadcast": {"p": self.p_broadcast},
+            "timing": self.timing.to_json() if self.timing else None,
+            "laws": self.laws.to_json() if self.laws else None,
             "continuous": {"system_error": self.continuous_error},
             "batch_means": {"interval": self.batch or (None, None)},
             "tests": [asdict(test) for test in self.tests],
@@ -181,7 +147,8 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     """Compare a run with what theory predicts for it.
 
     Every test assumes exactly the law that the record says was run; the family of all of them is wrong with
-    probability at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out.
+    probability at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In
+    real time, the family is what is exact whatever the timing was.
 
     Parameters
     ----------
@@ -194,7 +161,7 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
 
     Raises
     ------
-    InputError : no prediction (too large, unbounded)
+    InputError : no prediction (too large, unbounded), or a log that does not say what is needed
     """
     protocol = trajectory.record.experiment.protocol
     unpredicted = protocol.unpredictable() if protocol else None
@@ -205,16 +172,25 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     if trajectory.prefix < MIN_STEPS and not trajectory.completeness.complete:
         return _without_numbers(trajectory, level, prediction, continuous)
     observation = Observation.of(trajectory, prediction)
-    means = time_means(observation)
-    system_error, node_errors = _estimates(means)
-    covariance = _covariance(means, prediction)
-    innovations = innovation_tests(observation)
+    if observation.steps < MIN_STEPS and not trajectory.completeness.complete:
+        return _without_numbers(trajectory, level, prediction, continuous)
+    laws, timing, position = None, None, None
+    if observation.timers:
+        timing, order = measure_timing(observation), order_events(observation)
+        position = order.position
+        means, laws = measure_laws(observation, order, timing, level)
+    else:
+        means = time_means(observation)
+    system_error, node_errors = estimates(means, prediction.system)
+    covariance = covariance_test(means, prediction.system)
+    innovations = innovation_tests(observation, position)
     switching = switching_test(observation.modes, prediction.step.transition)
     loss, p_broadcast = loss_test(observation), broadcast_p(observation)
-    family = [("system error", system_error.p)]
-    family += [(f"error of agent {i}", node.p) for i, node in enumerate(node_errors, start=1)]
+    errors = [("system error", system_error.p)]
+    errors += [(f"error of agent {i}", node.p) for i, node in enumerate(node_errors, start=1)]
+    errors += [("covariance", covariance.p)]
+    family = errors if laws is None or laws.measured_against == "pattern" else []
     family += [
-        ("covariance", covariance.p),
         ("innovations: covariance", innovations.p_covariance),
         ("innovations: whiteness", innovations.p_whiteness),
         ("innovations: gains", innovations.p_gain),
@@ -237,6 +213,8 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
         running=_running(means, prediction.step.dt),
         loss=loss,
         p_broadcast=p_broadcast,
+        timing=timing,
+        laws=laws,
     )
 
 
@@ -294,46 +272,6 @@ def _without_numbers(
         tests=[],
         running={key: np.empty(0) for key in ("time", "system_error", "standard_error")},
     )
-
-
-def _estimates(means: TimeMeans) -> tuple[Estimate, list[Estimate]]:
-    combinations = np.vstack([means.nodes.sum(axis=0), means.nodes])
-    measured, predicted = combinations @ means.measured, combinations @ means.predicted
-    errors = np.sqrt(np.einsum("aq,qr,ar->a", combinations, means.covariance, combinations).clip(0.0))
-    estimates = [_estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
-    tested = [i for i, estimate in enumerate(estimates) if i > 0 and estimate.p is not None]
-    adjusted = dict(zip(tested, holm(np.array([estimates[i].p for i in tested], dtype=float)), strict=True))
-    nodes = [
-        Estimate(e.measured, e.predicted, e.standard_error, e.z, e.p, float(adjusted[i]) if i in adjusted else None)
-        for i, e in enumerate(estimates)
-        if i > 0
-    ]
-    return estimates[0], nodes
-
-
-def _estimate(measured: float, predicted: float, error: float, scale: float) -> Estimate:
-    if error <= 1e-12 * scale or error == 0.0:  # without noise: nothing but rounding
-        return Estimate(float(measured), float(predicted), float(error))
-    z = float((measured - predicted) / error)
-    return Estimate(float(measured), float(predicted), float(error), z, float(2 * stats.norm.sf(abs(z))))
-
-
-def _covariance(means: TimeMeans, prediction: Prediction) -> CovarianceTest:
-    measured = prediction.system.lifted(means.second_moments)
-    predicted = prediction.system.lifted(means.expected_moments)
-    if not means.joint:
-        note = "too many agents for a joint test; the node errors are tested one by one"
-        return CovarianceTest(measured, predicted, note=note)
-    chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
-    p: float | None = None
-    if dof and not means.squares:
-        p = float(stats.chi2.sf(chi2, dof))
-    elif dof and means.squares > dof:
-        # The covariance is itself estimated, from so many squares. Chi-square would reject too often, and Hotelling's
-        # law, which takes all of it for estimated, a little too seldom.
-        rest = means.squares - dof
-        p = float(stats.f.sf(chi2 * rest / (dof * (means.squares - 1)), dof, rest))
-    return CovarianceTest(measured, predicted, chi2, dof, p)
 
 
 def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:

@@ -1,8 +1,8 @@
 """What a step adds that its mean does not explain: e(k) = x(k+1) - W_g(k) x(k) - offset_g(k).
 
 Under the model the e(k) are independent N(0, N_g(k)), whatever the graphs do; so these tests are exact or
-nearly so, and find what the time means hardly see. With noise or loss on the air, what the agents heard takes
-the place of others' states (see ``reception``), and the same holds given that.
+nearly so, and find what the time means hardly see. With noise or loss on the air, and in real time, what the agents
+heard takes the place of others' states (see ``reception``), and the same holds given that, whoever was late.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from msg_analysis.inference.reception import (
     HeardRegression,
     Reception,
     full_reception_noise,
-    process_noise,
 )
 from msg_analysis.model.step import StepModel
 from msg_analysis.types import FloatArray, IntArray
@@ -79,16 +78,25 @@ class _Directions:
     quiet: FloatArray
 
 
-def innovation_tests(observation: Observation) -> InnovationTests:
-    """Test the innovations of a run."""
-    step, on_air = observation.step, observation.prediction.experiment.noise.on_air
-    noises = full_reception_noise(observation) if on_air else step.noise
+def innovation_tests(observation: Observation, position: IntArray | None = None) -> InnovationTests:
+    """Test the innovations of a run.
+
+    Parameters
+    ----------
+    position : (N, m) in real time, when the states were made (``events.Order.position``)
+    """
+    step, noise = observation.step, observation.prediction.experiment.noise
+    noises = full_reception_noise(observation) if noise.on_air else step.noise
     directions = [_directions(noise) for noise in noises]
     regression: _StateRegression | HeardRegression = (
-        HeardRegression(observation, MAX_REGRESSORS) if on_air else _StateRegression(observation)
+        HeardRegression(observation, MAX_REGRESSORS, position if _correlated(step) else None)
+        if noise.on_air or observation.timers
+        else _StateRegression(observation)
     )
-    varies = step.loss > 0.0 and observation.prediction.experiment.noise.link > 0.0
-    equalizer = Equalizer(process_noise(step), noises) if varies else None
+    varies = step.loss > 0.0 and noise.link > 0.0
+    if observation.timers:
+        varies = bool((step.noise_gain != step.noise_gain[0]).any())
+    equalizer = Equalizer(step, noises) if varies else None
     sums, p_whiteness = _pass(observation, directions, regression, equalizer)
     # What NO_NOISE hides may be there: ten standard deviations of it.
     hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in noises))
@@ -107,11 +115,18 @@ def innovations(observation: Observation, first: int, last: int, reception: Rece
     step, now = observation.step, observation.states[first:last]
     after = observation.states[first + 1 : last + 1].copy()
     if reception is not None:
-        return np.asarray(after - reception.mean() - step.offsets[reception.modes][:, :, None])
+        offsets = step.offsets[reception.graphs, np.arange(step.agents)]
+        return np.asarray(after - reception.mean() - offsets[:, :, None])
     for mode in range(step.modes):
         at = np.flatnonzero(observation.modes[first:last] == mode)
         after[at] -= step.weights[mode] @ now[at] + step.offsets[mode][:, None]
     return after
+
+
+def _correlated(step: StepModel) -> bool:
+    """Whether the process noise of an agent says something about that of another, whichever graphs they use."""
+    together = np.einsum("gik,hjk->ij", np.abs(step.noise_gain), np.abs(step.noise_gain))
+    return bool((together - np.diag(np.diag(together))).any())
 
 
 def _directions(noise: FloatArray) -> _Directions:
@@ -138,9 +153,9 @@ def _pass(
         if isinstance(regression, HeardRegression):
             reception = Reception.of(observation, first, last)
             e = innovations(observation, first, last, reception)
-            regression.add(reception, e)
+            regression.add(reception, e, first)
             if equalizer:
-                e = equalizer.equalize(e, modes, reception.link_variance)
+                e = equalizer.equalize(e, reception)
                 sums.quiet = max(sums.quiet, equalizer.quiet)
         else:
             e = innovations(observation, first, last)

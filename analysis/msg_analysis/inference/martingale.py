@@ -25,6 +25,7 @@ every step adds to it, so its squares do add up to its variance.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from msg_analysis.theory import symmetric
 from msg_analysis.theory.loss import lost_adjoint
 from msg_analysis.theory.moments import mode_potential, transient_mean
 from msg_analysis.theory.prediction import Prediction
+from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
 
 MAX_JOINT = 210
@@ -52,7 +54,8 @@ class TimeMeans:
     predicted : (q,) their exact expectation under the run's start and length
     covariance : (q, q) of measured under the model
     squares : number of steps whose squares make up ``covariance``; 0 where it is known from the model
-    nodes : (m, q) the node errors as combinations of them
+    nodes : (m, q) the node errors as combinations of them; (0, q) where they are too many
+    trace : (q,) the system error as a combination of them
     system_series : (N,) system error of every step, replicas averaged
     system_variances : (N,) of the system error: Var(D_k | y_k, g_k), or what stands for it with lost messages
     """
@@ -65,6 +68,7 @@ class TimeMeans:
     covariance: FloatArray
     squares: int
     nodes: FloatArray
+    trace: FloatArray
     system_series: FloatArray
     system_variances: FloatArray
 
@@ -191,11 +195,8 @@ def time_means(observation: Observation) -> TimeMeans:
     """
     system, steps = observation.prediction.system, observation.steps
     p = symmetric.size(system.dimension)
-    per_node = symmetric.pack(system.lift[:, :, None] * system.lift[:, None, :])
     joint = p <= MAX_JOINT
-    forms = np.eye(p) if joint else per_node
-    nodes = per_node if joint else np.eye(len(per_node))
-    trace = nodes.sum(axis=0)  # the system error is the sum of the node errors
+    forms, nodes, trace = forms_of(system, "joint" if joint else "nodes")
 
     values = _values(observation.prediction, forms)
     totals = np.zeros((system.modes, p + 1))
@@ -203,7 +204,7 @@ def time_means(observation: Observation) -> TimeMeans:
     series, variances = np.empty(steps), np.empty(steps)
     for first, last in observation.blocks(max(p, observation.states[0].size)):
         a = np.ones((last + 1 - first, p + 1))
-        a[:, :p] = _moments(observation, first, last + 1)
+        a[:, :p] = moments(observation, first, last + 1, observation.states)
         series[first:last] = a[:-1, :p] @ (trace @ forms)
         for mode, value in enumerate(values):
             at = np.flatnonzero(observation.modes[first:last] == mode)
@@ -219,17 +220,18 @@ def time_means(observation: Observation) -> TimeMeans:
     for value, total in zip(values, totals, strict=True):
         if isinstance(value, _Value):
             covariance += value.spread(total) / observation.replicas
-    moments = totals.sum(axis=0)[:p] / steps
+    seen = totals.sum(axis=0)[:p] / steps
     expected = expected_mean(observation)
     return TimeMeans(
-        second_moments=symmetric.unpack(moments, system.dimension),
+        second_moments=symmetric.unpack(seen, system.dimension),
         expected_moments=expected,
         joint=joint,
-        measured=forms @ moments,
+        measured=forms @ seen,
         predicted=forms @ symmetric.pack(expected),
         covariance=covariance / steps**2,
         squares=0 if system.loss_variance is None else steps,
         nodes=nodes,
+        trace=trace,
         system_series=series,
         system_variances=variances,
     )
@@ -259,9 +261,28 @@ def _values(prediction: Prediction, forms: FloatArray) -> list[_Value | _SharedV
     return values
 
 
-def _moments(observation: Observation, first: int, last: int) -> FloatArray:
-    """(last - first, p): packed y y^T of the states first..last-1, averaged over the replicas."""
+def forms_of(
+    system: JumpSystem, kind: Literal["joint", "nodes", "system"]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What is estimated: all second moments, the node errors, or the system error.
+
+    Returns
+    -------
+    forms : (q, p) on packed y y^T
+    nodes : (m, q) the node errors as combinations of them; (0, q) if only the system error is estimated
+    trace : (q,) the system error, which is the sum of the node errors
+    """
+    per_node = symmetric.pack(system.lift[:, :, None] * system.lift[:, None, :])
+    if kind == "joint":
+        return np.eye(per_node.shape[1]), per_node, per_node.sum(axis=0)
+    if kind == "nodes":
+        return per_node, np.eye(len(per_node)), np.ones(len(per_node))
+    return per_node.sum(axis=0)[None], np.empty((0, 1)), np.ones(1)
+
+
+def moments(observation: Observation, first: int, last: int, states: FloatArray) -> FloatArray:
+    """(last - first, p): packed y y^T of the states first..last-1 of (N + 1, m, R), averaged over the replicas."""
     system = observation.prediction.system
-    states = observation.states[first:last] - observation.step.reference
+    states = states[first:last] - observation.step.reference
     y = np.einsum("kmr,md->krd", states, system.lift, optimize=True)
     return symmetric.pack(y.transpose(0, 2, 1) @ y / observation.replicas)

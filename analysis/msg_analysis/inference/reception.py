@@ -1,13 +1,16 @@
-"""What the agents heard in the steps of a run, where something becomes of values on the air.
+"""What the agents heard in the steps of a run: where something becomes of values on the air, and in real time.
 
-From what was published and which messages were lost follows, for every step, what each agent used. Given that, the
-innovations are normal and independent, with a covariance that is known exactly: process noise plus the link noise of
-the messages that came. Broadcast noise and losses are in what was used; they are tested by themselves.
+From the log follows, for every step, what each agent used: which values of its neighbours, and in real time of which
+step they were and under which graph. Given that, the innovations are normal and independent, with a covariance that is
+known exactly: process noise, by the graph that each agent used, plus the link noise of the messages that came.
+Broadcast noise, losses and delays are in what was used; they are tested, or reported, by themselves.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy import stats
@@ -21,22 +24,64 @@ NO_NOISE = 1e-13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Neighbours:
+    """The neighbours of every agent in every graph, padded.
+
+    Attributes
+    ----------
+    senders : (n, m, D) the d-th neighbour, ascending; the agent itself beyond their number
+    count : (n, m) their number
+    """
+
+    senders: IntArray
+    count: IntArray
+
+
+@lru_cache(maxsize=4)
+def neighbour_tables(wiring: Wiring) -> Neighbours:
+    """The neighbours that the log of a run with this wiring speaks of."""
+    n, m = wiring.modes, wiring.agents
+    senders = np.tile(np.arange(m)[:, None], (n, 1, wiring.most_neighbours))
+    count = np.zeros((n, m), dtype=np.int64)
+    for mode in range(n):
+        for i in range(m):
+            neighbours = wiring.neighbours(mode, i)
+            count[mode, i] = len(neighbours)
+            senders[mode, i, : len(neighbours)] = neighbours
+    return Neighbours(senders, count)
+
+
+@lru_cache(maxsize=4)
+def neighbour_weights(step: StepModel) -> FloatArray:
+    """(n, m, D): nominal weights of the neighbours' values; 0 beyond their number."""
+    tables = neighbour_tables(step)
+    there = np.arange(step.most_neighbours) < tables.count[:, :, None]
+    return np.where(there, np.take_along_axis(step.nominal, tables.senders, axis=2), 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Reception:
     """What was heard in a block of b steps.
 
     Attributes
     ----------
-    modes : (b,) graphs
+    modes : (b,) graphs of the network
+    graphs : (b, m) graphs that the agents used; in lockstep those of the network
     states : (b, m, R) x
-    values : (b, m, R) what the agents published
-    weights : (b, m, m) nominal weights of the messages that came; 0 for others, and on the diagonal
-    own : (b, m) weight of an agent's own state, which stands for the messages that were lost too
+    published : (N + 1, m, R) what the agents published, of all steps
+    used : (b, m, D) step of the value of the d-th neighbour that was used; any where none came
+    senders : (b, m, D) who that neighbour is
+    weights : (b, m, D) nominal weights of what came; 0 for others
+    own : (b, m) weight of an agent's own state, which stands for what did not come too
     link_variance : (b, m) of the link noise in what each agent heard
     """
 
     modes: IntArray
+    graphs: IntArray
     states: FloatArray
-    values: FloatArray
+    published: FloatArray
+    used: IntArray
+    senders: IntArray
     weights: FloatArray
     own: FloatArray
     link_variance: FloatArray
@@ -44,56 +89,94 @@ class Reception:
     @classmethod
     def of(cls, observation: Observation, first: int, last: int) -> Reception:
         """Of the steps first..last-1."""
-        step, modes = observation.step, observation.modes[first:last]
-        coupling = step.nominal * ~np.eye(step.agents, dtype=bool)
-        weights = coupling[modes]
+        step, modes, timers = observation.step, observation.modes[first:last], observation.timers
+        tables, agents = neighbour_tables(step), np.arange(step.agents)
+        if timers is None:
+            graphs = np.repeat(modes[:, None], step.agents, axis=1)
+            used = np.broadcast_to(np.arange(first, last)[:, None, None], (*graphs.shape, step.most_neighbours))
+        else:
+            graphs, used = timers.graphs[first:last], timers.used[first:last]
+        weights = neighbour_weights(step)[graphs, agents]
         if observation.lost is not None:
-            lost = observation.lost[first:last]
-            for mode in range(step.modes):
-                at = np.flatnonzero(modes == mode)
-                receiver, sender, which = mode_links(step, mode)
-                weights[at[:, None], receiver, sender] *= ~lost[at[:, None], receiver, which]
+            weights = np.where(observation.lost[first:last], 0.0, weights)
+        weights = np.where(used >= 0, weights, 0.0)
         published = observation.states if observation.published is None else observation.published
         return cls(
             modes=modes,
+            graphs=graphs,
             states=observation.states[first:last],
-            values=published[first:last],
+            published=published,
+            used=used,
+            senders=tables.senders[graphs, agents],
             weights=weights,
-            own=step.nominal.sum(axis=2)[modes] - weights.sum(axis=2),
+            own=step.nominal.sum(axis=2)[graphs, agents] - weights.sum(axis=2),
             link_variance=observation.prediction.experiment.noise.link**2 * (weights**2).sum(axis=2),
         )
 
+    def heard(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
+        """(len(at), a, R): in some steps of the block, what these agents (a,) used for these neighbours (a,)."""
+        index = at[:, None], agents, which
+        return np.asarray(self.published[self.used[index], self.senders[index]])
+
     def mean(self) -> FloatArray:
         """(b, m, R): what these steps lead to without noise and without what the reference adds."""
-        return np.asarray(self.own[:, :, None] * self.states + self.weights @ self.values)
+        total = self.own[:, :, None] * self.states
+        every, agents = np.arange(len(self.modes)), np.arange(self.states.shape[1])
+        for d in range(self.weights.shape[2]):
+            total += self.weights[:, :, d, None] * self.heard(every, agents, np.full(len(agents), d))
+        return np.asarray(total)
+
+    def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
+        """Steps of the block that are alike: (graphs (m,) of the agents, their order (m,) if it counts, steps (a,)).
+
+        Parameters
+        ----------
+        order : (b, m) agents of each step, first to last
+        """
+        if order is None and (self.graphs == self.modes[:, None]).all():
+            for mode in np.unique(self.modes):
+                at = np.flatnonzero(self.modes == mode)
+                yield self.graphs[at[0]], None, at
+            return
+        keys = self.graphs if order is None else np.column_stack([self.graphs, order])
+        found, owner = np.unique(keys, axis=0, return_inverse=True)
+        owner = owner.reshape(-1)
+        steps = np.argsort(owner, kind="stable")
+        ends = np.searchsorted(owner[steps], np.arange(len(found) + 1))
+        m = self.graphs.shape[1]
+        for number, pattern in enumerate(found):
+            at = steps[ends[number] : ends[number + 1]]
+            yield pattern[:m], None if order is None else pattern[m:], at
 
 
 def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
     """Receiver, sender, and place of the sender among the receiver's neighbours, of every link of a graph."""
-    links = [(i, j, d) for i in range(step.agents) for d, j in enumerate(step.neighbours(mode, i).tolist())]
-    receiver, sender, which = np.array(links, dtype=np.int64).reshape(-1, 3).T
-    return receiver, sender, which
+    tables = neighbour_tables(step)
+    receiver, which = np.nonzero(np.arange(step.most_neighbours) < tables.count[mode][:, None])
+    return receiver, tables.senders[mode, receiver, which], which
 
 
 def full_reception_noise(observation: Observation) -> FloatArray:
     """(n, m, m): covariance of the innovations of a step in which nothing is lost."""
     step = observation.step
-    coupling = step.nominal * ~np.eye(step.agents, dtype=bool)
-    link = observation.prediction.experiment.noise.link**2 * (coupling**2).sum(axis=2)
-    return np.asarray(process_noise(step) + link[:, :, None] * np.eye(step.agents))
+    link = observation.prediction.experiment.noise.link**2 * (neighbour_weights(step) ** 2).sum(axis=2)
+    process = step.noise_gain @ step.noise_gain.transpose(0, 2, 1)
+    return np.asarray(process + link[:, :, None] * np.eye(step.agents))
 
 
-def process_noise(step: StepModel) -> FloatArray:
-    """(n, m, m): covariance of the process noise of a step."""
-    return np.asarray(step.noise_gain @ step.noise_gain.transpose(0, 2, 1))
+def process_noise(step: StepModel, graphs: IntArray) -> FloatArray:
+    """(m, m): covariance of the process noise of a step in which the agents use these graphs (m,)."""
+    gain = step.noise_gain[graphs, np.arange(step.agents)]
+    return np.asarray(gain @ gain.T)
 
 
 class Equalizer:
-    """Innovations of steps in which link noise is lost, brought to the covariance of those in which nothing is.
+    """Innovations of steps of unequal covariance, brought to that of steps in which all is as it should be.
 
-    With N the covariance of a step and M that of a step with the same graph in which all messages came, M^1/2 N^-1/2 e
-    has the covariance M. Where a step has less directions with noise than M (an agent without process noise has heard
-    nobody), it cannot be brought there: then only the total size of all innovations is left to test.
+    With N the covariance of a step and M that of a step of the network's graph in which all messages came and everybody
+    knew the graph, M^1/2 N^-1/2 e has the covariance M. Where a step has not as many directions with noise as M (an
+    agent without process noise has heard nobody), it cannot be brought there: then only the total size of all
+    innovations is left to test.
 
     Attributes
     ----------
@@ -102,24 +185,26 @@ class Equalizer:
     quiet : largest innovation in directions without noise
     """
 
-    def __init__(self, process: FloatArray, full: FloatArray) -> None:
-        self._process = process
+    def __init__(self, step: StepModel, full: FloatArray) -> None:
+        self._step = step
         self._roots = [_root(matrix, 0.5) for matrix in full]
         self._ranks = [rank for _, rank in self._roots]
         self.possible = True
         self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
 
-    def equalize(self, innovations: FloatArray, modes: IntArray, link_variance: FloatArray) -> FloatArray:
-        """(b, m, R) of (b, m, R), with graphs (b,) and variances (b, m) of the link noise."""
-        patterns, owner = np.unique(np.column_stack([modes, link_variance]), axis=0, return_inverse=True)
+    def equalize(self, innovations: FloatArray, reception: Reception) -> FloatArray:
+        """(b, m, R) of (b, m, R)."""
+        m = innovations.shape[1]
+        keys = np.column_stack([reception.modes, reception.graphs, reception.link_variance])
+        patterns, owner = np.unique(keys, axis=0, return_inverse=True)
         owner = owner.reshape(-1)
         equal = np.empty_like(innovations)
         order = np.argsort(owner, kind="stable")
         ends = np.searchsorted(owner[order], np.arange(len(patterns) + 1))
         for number, pattern in enumerate(patterns):
             at = order[ends[number] : ends[number + 1]]
-            mode, e = int(pattern[0]), innovations[at]
-            inverse, rank = _root(self._process[mode] + np.diag(pattern[1:]), -0.5)
+            mode, graphs, e = int(pattern[0]), pattern[1 : m + 1].astype(np.int64), innovations[at]
+            inverse, rank = _root(process_noise(self._step, graphs) + np.diag(pattern[m + 1 :]), -0.5)
             white = inverse @ e
             self.possible &= rank == self._ranks[mode]
             self.chi2 += float((white**2).sum())
@@ -152,74 +237,111 @@ def _root(matrix: FloatArray, power: float) -> tuple[FloatArray, int]:
 class HeardRegression:
     """Score test: innovations do not depend on what the agents heard, with the weights it was used with.
 
-    As without noise on the air, see ``innovations``; but the differences that row i uses are y_j - x_i of the messages
+    As without noise on the air, see ``innovations``; but the differences that row i uses are y_j - x_i of the values
     that came, with y_j as published, and the covariance of the innovations is that of each step.
+
+    In real time the agents make a step one after the other. Where their noise is correlated, a value that is used may
+    have a part of the noise of the very step in it; so each innovation is first freed of what those that were made
+    earlier in the step say about it.
+
+    Parameters
+    ----------
+    observation : of the run
+    most : largest number of regressors
+    position : (N, m) when the states were made; needed in real time, if the noise is correlated
     """
 
-    def __init__(self, observation: Observation, most: int) -> None:
-        step = observation.step
-        self._step, self._process = step, process_noise(step)
+    def __init__(self, observation: Observation, most: int, position: IntArray | None = None) -> None:
+        self._step = step = observation.step
         self._replicas = observation.replicas
+        self._position = position
         n, m = step.modes, step.agents
         # What is added to a state by itself: the leaders' own pull.
         self._pull = step.nominal.sum(axis=2) - 1.0
-        leaders = [np.flatnonzero(np.abs(pull) > 1e-12) for pull in self._pull]
-        links = [mode_links(step, mode)[:2] for mode in range(n)]
-        count = m + sum(len(receiver) for receiver, _ in links) + sum(map(len, leaders))
+        leads = np.abs(self._pull) > 1e-12
+        self._links = [mode_links(step, mode) for mode in range(n)]
+        count = m + sum(len(receiver) for receiver, _, _ in self._links) + int(leads.sum())
         self._each = count <= most
-        self._by_graph = n * m + m <= most
-        if self._each:
-            rows = [np.concatenate([links[g][0], leaders[g]]) for g in range(n)]
-            senders = [np.concatenate([links[g][1], leaders[g]]) for g in range(n)]
-        else:
-            rows = senders = [np.arange(m)] * (n if self._by_graph else 1)
-        starts = np.cumsum([m, *map(len, rows)])
-        groups = range(n) if self._each or self._by_graph else [0] * n
-        #: For each graph: places of its regressors, their rows, and (each) whose value they compare with
-        self._places = [np.concatenate([np.arange(m), np.arange(starts[g], starts[g + 1])]) for g in groups]
-        self._rows = [np.concatenate([np.arange(m), rows[g]]) for g in groups]
-        self._senders = [senders[g] for g in groups]
-        self._score, self._covariance = np.zeros(starts[-1]), np.zeros((starts[-1], starts[-1]))
+        if not self._each:
+            count = n * m + m if n * m + m <= most else 2 * m
+        #: Place of the regressor of a link, of a leader, or of all that pulls an agent; by the agent's graph
+        self._link_place = np.zeros((n, m, step.most_neighbours), dtype=np.int64)
+        self._lead_place = np.full((n, m), -1)
+        self._pull_place = np.zeros((n, m), dtype=np.int64)
+        place = m
+        for mode, (receiver, _, which) in enumerate(self._links):
+            self._pull_place[mode] = np.arange(m) + (m + mode * m if count == n * m + m else m)
+            self._link_place[mode, receiver, which] = np.arange(place, place + len(receiver))
+            place += len(receiver)
+            leaders = np.flatnonzero(leads[mode])
+            self._lead_place[mode, leaders] = np.arange(place, place + len(leaders))
+            place += len(leaders)
+        self._score, self._covariance = np.zeros(count), np.zeros((count, count))
 
     @property
     def numbers_per_step(self) -> int:
         """Size of the largest temporary array: regressors, or the weights of all messages."""
-        return max(max(map(len, self._rows)) * self._replicas, self._step.agents**2)
+        m, d = self._step.agents, self._step.most_neighbours
+        return max((2 + d) * m * self._replicas, m * d)
 
     def statistic(self) -> tuple[FloatArray, FloatArray]:
         """Scores (K,) and their covariance (K, K)."""
         return self._score, self._covariance
 
-    def add(self, reception: Reception, innovations: FloatArray) -> None:
-        """Take a block of steps with their innovations (b, m, R)."""
-        for mode in range(self._step.modes):
-            at = np.flatnonzero(reception.modes == mode)
-            if not at.size:
-                continue
-            places, rows, e = self._places[mode], self._rows[mode], innovations[at]
-            phi = self._regressors(reception, at, mode)
+    def add(self, reception: Reception, innovations: FloatArray, first: int = 0) -> None:
+        """Take a block of steps, from ``first`` on, with their innovations (b, m, R)."""
+        order = None
+        if self._position is not None:
+            order = np.argsort(self._position[first : first + len(innovations)], axis=1)
+        for graphs, agents, at in reception.patterns(order):
+            e, process = innovations[at], process_noise(self._step, graphs)
+            if agents is not None:
+                e, process = _freed(e, process, agents)
+            places, rows, phi = self._regressors(reception, at, graphs)
             self._score[places] += np.einsum("kar,kar->a", e[:, rows], phi)
             block = np.ix_(places, places)
             flat = phi.transpose(1, 0, 2).reshape(len(rows), -1)
-            self._covariance[block] += self._process[mode][np.ix_(rows, rows)] * (flat @ flat.T)
+            self._covariance[block] += process[np.ix_(rows, rows)] * (flat @ flat.T)
             if reception.link_variance.any():
                 phi = phi * np.sqrt(reception.link_variance[at])[:, rows, None]
                 flat = phi.transpose(1, 0, 2).reshape(len(rows), -1)
                 self._covariance[block] += (rows[:, None] == rows) * (flat @ flat.T)
 
-    def _regressors(self, reception: Reception, at: IntArray, mode: int) -> FloatArray:
-        """(len(at), a, R): constants of all agents, then what their rows use."""
-        m, rows, senders = self._step.agents, self._rows[mode], self._senders[mode]
-        x, y = reception.states[at], reception.values[at]
+    def _regressors(
+        self, reception: Reception, at: IntArray, graphs: IntArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """Places (a,), rows (a,) and values (len(at), a, R): constants of all agents, then what their rows use."""
+        m = self._step.agents
+        agents = np.arange(m)
+        x = reception.states[at]
         deviation = x - self._step.reference
-        phi = np.ones((len(at), len(rows), x.shape[2]))
+        ones = np.ones((len(at), m, x.shape[2]))
+        receivers, which = np.nonzero(np.arange(self._step.most_neighbours) < self._count(graphs)[:, None])
+        differences = reception.heard(at, receivers, which) - x[:, receivers]
+        weights = reception.weights[at[:, None], receivers, which][:, :, None]
         if self._each:
-            receivers = rows[m:]
-            came = reception.weights[at][:, receivers, senders] != 0.0
-            differences = (y[:, senders] - x[:, receivers]) * came[:, :, None]
-            phi[:, m:] = np.where((receivers == senders)[:, None], deviation[:, receivers], differences)
-        else:
-            weights = reception.weights[at]
-            pulled = weights @ y - weights.sum(axis=2)[:, :, None] * x
-            phi[:, m:] = pulled + self._pull[mode][:, None] * deviation
-        return phi
+            leaders = np.flatnonzero(self._lead_place[graphs, agents] >= 0)
+            places = [agents, self._link_place[graphs[receivers], receivers, which], self._lead_place[graphs, agents]]
+            places[2] = places[2][leaders]
+            rows = np.concatenate([agents, receivers, leaders])
+            parts = [ones, differences * (weights != 0.0), deviation[:, leaders]]
+            return np.concatenate(places), rows, np.concatenate(parts, axis=1)
+        pulled = self._pull[graphs, agents][:, None] * deviation
+        for i in range(m):
+            mine = receivers == i
+            pulled[:, i] += (weights[:, mine] * differences[:, mine]).sum(axis=1)
+        places = [agents, self._pull_place[graphs, agents]]
+        return np.concatenate(places), np.tile(agents, 2), np.concatenate([ones, pulled], axis=1)
+
+    def _count(self, graphs: IntArray) -> IntArray:
+        """(m,): neighbours of the agents."""
+        return np.asarray(neighbour_tables(self._step).count[graphs, np.arange(self._step.agents)])
+
+
+def _freed(e: FloatArray, process: FloatArray, agents: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Innovations of a step less what those of agents earlier in the order say about them; and their covariance."""
+    free = np.eye(len(agents))
+    for number, i in enumerate(agents.tolist()):
+        before = agents[:number]
+        free[i, before] = -process[i, before] @ np.linalg.pinv(process[np.ix_(before, before)], hermitian=True)
+    return free @ e, np.diag(np.diag(free @ process @ free.T).clip(0.0))

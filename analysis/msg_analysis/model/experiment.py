@@ -141,8 +141,20 @@ class Experiment:
         """
         lines = []
         if self.run.pace == "realtime":
-            lines.append(problem("run.pace", "'realtime'", "not available yet", "use lockstep"))
-        if purpose == "run" and self.noise.delay > 0:
+            for key, value in (
+                ("broadcast", self.noise.broadcast),
+                ("link", self.noise.link),
+                ("loss", self.noise.loss),
+                ("delay", self.noise.delay),
+            ):
+                if value:
+                    lines.append(problem(f"noise.{key}", value, "not available in real time yet", "use lockstep, or 0"))
+            if self.protocol and not self.protocol.linear:
+                protocol = show(self.protocol.info.name)
+                lines.append(
+                    problem("protocol.name", protocol, "expected a linear one in real time for now", "use lockstep")
+                )
+        elif purpose == "run" and self.noise.delay > 0:
             lines.append(problem("noise.delay", self.noise.delay, "not available in runs yet", "use 0"))
         if self.protocol:
             lines += self.protocol.unavailable(purpose)

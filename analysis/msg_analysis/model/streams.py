@@ -26,6 +26,7 @@ class Stream(IntEnum):
     BROADCAST = 4
     LINK = 5
     LOSS = 6
+    PHASE = 7
 
 
 def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.random.Generator:

@@ -57,6 +57,11 @@ class Trajectory:
         under the graph of that step (see ``StepModel.neighbours``); D is the largest number of neighbours. None
         where messages cannot be lost
     completeness : the account of what is there
+    used : (N, m, D) in real time: step of the value of the d-th neighbour, ascending, under the graph that the agent
+        used (``agent_modes``), that went into x_i(k+1); -1 where nothing had been heard of it yet, and where there is
+        no such neighbour. None in lockstep
+    made : (N + 1, m) in real time: when x_i(k) was made [ns of simulated time]; 0 for x(0), -1 where missing. None in
+        lockstep
     """
 
     record: RunRecord
@@ -66,6 +71,8 @@ class Trajectory:
     agent_modes: IntArray | None = None
     published: FloatArray | None = None
     lost: BoolArray | None = None
+    used: IntArray | None = None
+    made: IntArray | None = None
 
     @property
     def values(self) -> FloatArray:

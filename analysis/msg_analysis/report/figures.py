@@ -134,6 +134,31 @@ def running_estimate(running: Mapping[str, FloatArray], predicted: float | None)
     return text.getvalue()
 
 
+def lateness(timing: Mapping[str, Any]) -> str:
+    """Histogram of how late the steps of a run in real time were, with the deadline.
+
+    Parameters
+    ----------
+    timing : Mapping[str, Any]
+        ``timing`` of a comparison
+    """
+    edges = np.array(timing["histogram"]["lateness_ms"])
+    counts = np.array(timing["histogram"]["steps"])
+    deadline = timing["period_ms"]
+    with _figure(2.4) as (figure, text):
+        axes = figure.subplots()
+        axes.bar(edges[:-1], counts, np.diff(edges), align="edge", color=BLUE, lw=0)
+        missed = edges[:-1] >= deadline
+        axes.bar(edges[:-1][missed], counts[missed], np.diff(edges)[missed], align="edge", color=VERMILLION, lw=0)
+        if edges[-1] > deadline / 2:
+            axes.axvline(deadline, color=BLACK, lw=1.2, label="deadline")
+            figure.legend(loc="outside upper right")
+        axes.set_yscale("symlog", linthresh=1.0)
+        axes.set(xlabel="late by [ms]", ylabel="steps", ylim=(0, None))
+        axes.grid(visible=False, axis="x")
+    return text.getvalue()
+
+
 def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> str:
     """Heat maps of one scale: measured, predicted, and their difference; what there is of these.
 

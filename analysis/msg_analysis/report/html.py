@@ -18,6 +18,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.inference.compare import Comparison
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.report import figures
+from msg_analysis.report.text import LAWS, QUANTILES, SUPPORT, TIMES, timing_facts, verdict_line
 
 _HEADLINES = {
     "agrees": "The run agrees with the prediction.",
@@ -94,9 +95,17 @@ def render(comparison: Comparison, trajectory: Trajectory) -> str:
     if len(comparison.running["time"]) > 1:
         predicted = document["system_error"]["predicted"]
         pictures["running"] = figures.running_estimate(comparison.running, predicted)
+    timing = document["timing"]
+    if timing:
+        pictures["lateness"] = figures.lateness(timing)
     return environment.get_template("report.html.j2").render(
         document=document,
-        headline=_HEADLINES[document["verdict"]],
+        headline=verdict_line(_HEADLINES[document["verdict"]], document),
+        timing_facts=timing_facts(timing) if timing else [],
+        times=TIMES,
+        quantiles=QUANTILES,
+        laws=LAWS,
+        support=SUPPORT,
         explanation=_explanation(document),
         experiment=experiment,
         versions=trajectory.record.versions,

@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from msg_analysis.model.validation import amount
+from msg_analysis.model.words import percent
 
 _ROWS = 30
 _LAWS = {
@@ -25,6 +26,16 @@ _VERDICTS = {
     "incomplete": ("No verdict: the data are incomplete.", "bold yellow"),
     "unpredicted": ("No verdict: there is no prediction. What was to be tested passed.", "bold"),
 }
+
+TIMES = {
+    "lateness_ms": "late by [ms]",
+    "jitter_ms": "period off by [ms]",
+    "staleness_ms": "age of the values used [ms]",
+    "staleness_steps": "age of the values used [steps]",
+}
+QUANTILES = ("p50", "p95", "p99", "max")
+LAWS = {"pattern": "logged pattern", "sequential": "sequential", "continuous": "continuous time"}
+SUPPORT = {True: "supported", False: "not supported", None: "not decided"}
 
 _METHODS = {
     "exhaustive": "trying every set",
@@ -41,7 +52,11 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     document : of ``Prediction.to_json()``
     console : where to print
     """
-    laws = {title: document[key] for key, title in _LAWS.items() if document.get(key) is not None}
+    laws = {
+        "steps in turn" if document[key].get("law") == "sequential" else title: document[key]
+        for key, title in _LAWS.items()
+        if document.get(key) is not None
+    }
     errors = number_table(console, "Mean-square error in the steady state", "", *laws)
     errors.add_row("system", *(number_text(law["system_error"]) for law in laws.values()), end_section=True)
     for agent in range(min(document["agents"], _ROWS)):
@@ -68,7 +83,7 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
     console : where to print
     """
     verdict, style = _VERDICTS[document["verdict"]]
-    console.print(verdict, style=style)
+    console.print(verdict_line(verdict, document), style=style)
     count = document["completeness"]
     console.print(
         f"{count['received']} of {count['expected']} states in {document['steps']} steps "
@@ -84,10 +99,11 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
     loss = document.get("loss") or {}
     if loss.get("lost") is not None:
         console.print(f"{loss['lost']} messages lost, {loss['expected']:.6g} expected")
+    _print_timing(document, console)
     interval = document["batch_means"]["interval"]
     console.print(f"95 % interval of batch means, free of the model: {_interval(interval)}", style="dim")
     continuous = document["continuous"]["system_error"]
-    if continuous is not None:
+    if continuous is not None and not document.get("laws"):
         console.print(f"System error in continuous time, for reference: {number_text(continuous)}", style="dim")
 
 
@@ -113,6 +129,63 @@ def _print_errors(document: dict[str, Any], console: Console) -> None:
         row(f"agent {agent}", entry)
     _note_cut(table, len(nodes), "agents")
     console.print(table)
+
+
+def verdict_line(verdict: str, document: dict[str, Any]) -> str:
+    """The verdict; in real time with the deadlines that were missed, which are no disagreement.
+
+    Parameters
+    ----------
+    verdict : a sentence
+    document : of ``Comparison.to_json()``
+    """
+    deadlines = (document.get("timing") or {}).get("deadlines")
+    if not deadlines or not deadlines["missed"]:
+        return verdict
+    share = percent(deadlines["share"])
+    return f"{verdict.removesuffix('.')}; {share} of the deadlines were missed."
+
+
+def _print_timing(document: dict[str, Any], console: Console) -> None:
+    """How a run in real time kept its time, and which laws that supports."""
+    timing, laws = document.get("timing"), document.get("laws")
+    if not timing or not laws:
+        return
+    table = number_table(console, "Timing", "", "half below", "95 % below", "99 % below", "largest")
+    for key, title in TIMES.items():
+        values = timing[key]
+        table.add_row(Text(title), *(f"{values[q]:.3g}" if values[q] is not None else "-" for q in QUANTILES))
+    console.print(table)
+    facts = fact_table(console, "Real time")
+    for title, text in timing_facts(timing):
+        facts.add_row(title, text)
+    console.print(facts)
+    table = number_table(console, "Laws", "system error", "predicted", "z", "")
+    for key, title in LAWS.items():
+        law = laws[key]
+        error = law["system_error"]
+        table.add_row(title, number_text(error["predicted"]), _z(error["z"]), Text(SUPPORT[law["supported"]]))
+    console.print(table)
+    console.print(Text(laws["why"]))
+
+
+def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:
+    """Counts of a run in real time: what was counted, and the numbers.
+
+    Parameters
+    ----------
+    timing : of ``Comparison.to_json()``
+    """
+    deadlines, uses, graphs = timing["deadlines"], timing["ideal_uses"], timing["outdated_graph"]
+    facts = [
+        ("period", f"{number_text(timing['period_ms'])} ms"),
+        ("deadlines missed", f"{deadlines['missed']} of {deadlines['steps']} ({percent(deadlines['share'])})"),
+        ("values used as with ideal timers", f"{uses['ideal']} of {uses['uses']} ({percent(uses['share'])})"),
+        ("steps with an outdated graph", f"{graphs['steps']} of {deadlines['steps']} ({percent(graphs['share'])})"),
+    ]
+    if timing["never_heard"]:
+        facts.append(("uses of neighbours not heard of yet", str(timing["never_heard"])))
+    return facts
 
 
 def _print_tests(document: dict[str, Any], console: Console) -> None:

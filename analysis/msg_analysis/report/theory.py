@@ -11,7 +11,7 @@ import numpy as np
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.step import build_step_model
+from msg_analysis.model.sequential import build_run_model
 from msg_analysis.theory import system as systems
 from msg_analysis.theory.facts import check_facts
 from msg_analysis.theory.indices import error_bounds, graph_indices
@@ -82,7 +82,7 @@ def describe_transient(
         if unit is None:
             whole = unreduced_consensus(experiment)
         else:
-            whole = systems.emulated(build_step_model(experiment), "tracking")
+            whole = systems.emulated(build_run_model(experiment), "tracking")
         start = start_of(experiment, whole, system.lift @ steady @ system.lift.T)
         found = transient(whole, start, _steps(times, unit))
     else:
@@ -109,7 +109,7 @@ def describe_transient(
 def _system(experiment: Experiment, law: Law) -> tuple[JumpSystem, float | None]:
     """The reduced system of a law, and the time of a step (None in continuous time)."""
     if law == "emulated":
-        return systems.emulated(build_step_model(experiment), experiment.problem), experiment.step_length
+        return systems.emulated(build_run_model(experiment), experiment.problem), experiment.step_length
     if experiment.time == "discrete":
         raise InputError("--law continuous: expected an experiment in continuous time: leave --law out")
     noise = experiment.noise

@@ -13,8 +13,8 @@ import scipy.sparse.csgraph
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.sequential import build_run_model
 from msg_analysis.model.spec import LeadersSpec
-from msg_analysis.model.step import build_step_model
 from msg_analysis.theory import system as systems
 from msg_analysis.theory.leader_search import Leaders, LeaderSearch, Watch, ignore
 from msg_analysis.theory.moments import MomentSolver
@@ -121,7 +121,7 @@ class LeaderProblem:
         led = dataclasses.replace(self.experiment, spec=self.experiment.spec.model_copy(update=changes))
         if self.law == "continuous":
             return systems.continuous(led)
-        return systems.emulated(build_step_model(led), "tracking")
+        return systems.emulated(build_run_model(led), "tracking")
 
 
 @dataclass(frozen=True, slots=True)

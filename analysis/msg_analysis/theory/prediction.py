@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from msg_analysis.errors import InputError
+from msg_analysis.model.sequential import StepLaw, build_run_model, step_law
 from msg_analysis.model.step import StepModel, build_step_model
 from msg_analysis.theory import system as systems
 from msg_analysis.theory.moments import MomentSolver
@@ -41,11 +43,13 @@ class Moments:
     covariance : (m, m) of the disagreement (consensus) or of the deviation from the reference (tracking)
     by_mode : (n, m, m) E[.; mode i], which sum to ``covariance``; None for the static baseline
     solver : how they were computed; None for the static baseline
+    law : of the run's steps: "synchronous", or "sequential" in real time; None for other laws
     """
 
     covariance: FloatArray
     by_mode: FloatArray | None = None
     solver: SolverReport | None = None
+    law: StepLaw | None = None
 
     @property
     def node_errors(self) -> FloatArray:
@@ -67,6 +71,8 @@ class Moments:
             "node_certainty": [_inverse(e) for e in self.node_errors],
             "covariance": self.covariance.tolist(),
         }
+        if self.law is not None:
+            document = {"law": self.law, **document}
         if self.by_mode is not None:
             document["mode_second_moments"] = self.by_mode.tolist()
         if self.solver is not None:
@@ -81,10 +87,12 @@ class Prediction:
     Attributes
     ----------
     experiment : what is predicted
-    step : the experiment compiled to one step
-    solver : of the equations of the run's steps; its ``system`` is the reduced system
+    step : the experiment compiled to one step of an agent
+    solver : of the equations of the run's steps, in real time those of its sequential law; its ``system`` is the
+        reduced system
     steady : (n, d, d) steady second moments of the reduced system of the run's steps
-    emulated : what the run's steps do, exactly ("discrete" in the document of a discrete-time experiment)
+    emulated : what the run's steps do, exactly ("discrete" in the document of a discrete-time experiment); in real
+        time if nobody is late
     continuous : the paper's continuous-time system; None in discrete time, with a protocol, or with noise on the air,
         loss or delay
     static : the pi-weighted mean over the graphs held for ever; None where one of them cannot keep the
@@ -138,12 +146,12 @@ def predict(experiment: Experiment) -> Prediction:
             paper = systems.emulated(step, experiment.problem)
         if all(_holds_together(experiment, mode) for mode in range(step.modes)):
             static = _static(paper)
-    solver, steady = _steady(step, experiment.problem)
-    emulated = _moments(solver, steady)
+    solver, steady = _steady(step, build_run_model(experiment), experiment.problem)
+    emulated = dataclasses.replace(_moments(solver, steady), law=step_law(experiment))
     return Prediction(experiment, step, solver, steady, emulated, continuous, static)
 
 
-def stationary_start_factor(step: StepModel, problem: str, mode: int) -> FloatArray:
+def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
     """(m, m) square root S of the law of x(0) given g(0) = mode in the steady state: S S^T = C_g0 / pi_g0.
 
     S is the symmetric positive semidefinite root, which is unique. One thread of linear algebra, so that the
@@ -151,21 +159,22 @@ def stationary_start_factor(step: StepModel, problem: str, mode: int) -> FloatAr
 
     Parameters
     ----------
-    step : the compiled experiment
-    problem : "consensus" or "tracking"
+    experiment : whose steps, in real time those of its sequential law, the start is stationary for
     mode : g(0), from 0
     """
+    step = build_step_model(experiment)
     with threadpool_limits(1):
-        solver, steady = _steady(step, problem)
+        solver, steady = _steady(step, build_run_model(experiment), experiment.problem)
         values, vectors = np.linalg.eigh(steady[mode] / step.stationary[mode])
         root = (vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T
         return solver.system.lifted(root)
 
 
-def _steady(step: StepModel, problem: str) -> tuple[MomentSolver, FloatArray]:
+def _steady(step: StepModel, run: StepModel, problem: str) -> tuple[MomentSolver, FloatArray]:
+    """Of the run's steps. What is stochastic for one agent is so for all of them, one after the other or at once."""
     limit = _safe_step(step)
     try:
-        solver = MomentSolver(systems.emulated(step, problem))
+        solver = MomentSolver(systems.emulated(run, problem))
         steady = solver.steady()
         if step.dt >= limit:
             _require_stability(solver)

@@ -217,11 +217,12 @@ def test_what_is_not_available_yet_is_listed() -> None:
     assert small().unavailable() == []
     small().require_available()
     noisy = small(noise={"broadcast": 0.1, "link": 0.2, "loss": 0.3, "delay": 2}, run={"pace": "realtime"})
-    assert [line.split(":")[0] for line in noisy.unavailable()] == ["run.pace", "noise.delay"]
-    assert noisy.unavailable()[0] == "run.pace: 'realtime': not available yet: use lockstep"
+    keys = [f"noise.{key}" for key in ("broadcast", "link", "loss", "delay")]
+    assert [line.split(":")[0] for line in noisy.unavailable("predict")] == keys
+    assert noisy.unavailable()[0] == "noise.broadcast: 0.1: not available in real time yet: use lockstep, or 0"
     with pytest.raises(NotAvailableError, match=r"noise\.delay: 2"):
         noisy.require_available()
-    assert len(noisy.unavailable("predict")) == 1
+    small(run={"pace": "realtime"}).require_available()
     small(noise={"broadcast": 0.1, "link": 0.2, "loss": 0.3}).require_available()
     small(noise={"loss": 0.3, "delay": 2}).require_available("predict")
 

@@ -15,14 +15,16 @@ import numpy as np
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.inference.compare import Comparison, CovarianceTest, Estimate, compare
+from msg_analysis.inference.compare import Comparison, compare
 from msg_analysis.inference.compare import Test as FamilyTest
+from msg_analysis.inference.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.innovations import InnovationTests
 from msg_analysis.inference.switching import SwitchingTest
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.trajectory import Completeness, Trajectory
 from msg_analysis.report.html import write_report
+from msg_analysis.twin import simulate
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
 MakeComparison = Callable[..., Comparison]
@@ -171,3 +173,40 @@ def test_replaces_and_leaves_nothing_half_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be written"):
         write_report(comparison, comparison.trajectory, tmp_path / "nowhere" / "report.html")
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
+
+
+def in_real_time(late: int) -> Comparison:
+    """Every step of every agent is late by so many ns of simulated time."""
+    document = {
+        "name": "timers",
+        "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
+        "switching": {"generator": [[-1, 1], [1, -1]]},
+        "run": {"dt": 0.1, "duration": 20, "replicas": 2, "pace": "realtime", "speed": 10},
+    }
+    trajectory = simulate(Experiment.parse(document))
+    assert trajectory.made is not None
+    made = trajectory.made.copy()
+    made[1:] += late
+    return compare(dataclasses.replace(trajectory, made=made))
+
+
+def test_real_time_has_its_sections(tmp_path: Path) -> None:
+    comparison = in_real_time(150_000_000)
+    write_report(comparison, comparison.trajectory, tmp_path / "report.html")
+    page = Page((tmp_path / "report.html").read_text())
+    assert "The run agrees with the prediction; 100 % of the deadlines were missed." in page.text
+    for text in ("Real time", "late by [ms]", "600 of 600 (100 %)", "Laws", "logged pattern", "for what the log says"):
+        assert text in page.text
+    assert page.tags.count("img") == 6
+    on_time = in_real_time(0)
+    write_report(on_time, on_time.trajectory, tmp_path / "report.html")
+    text = Page((tmp_path / "report.html").read_text()).text
+    assert "The run agrees with the prediction." in text
+    assert "600 of 600 (0 %)" not in text
+    assert "0 of 600 (0 %)" in text
+
+
+def test_lockstep_has_no_timing(tmp_path: Path) -> None:
+    page = _page(_comparison(_trajectory(3, 200)), tmp_path / "report.html")
+    assert "Real time" not in page.text
+    assert "for the steps of this run" in page.text

@@ -191,3 +191,29 @@ def test_bag() -> None:
     output = shown(text.print_bag, document)
     for part in ("[bold]bag", "d3ba43f6", "incomplete: 3 of 4, 1 missing", "5: other run", "1.23 MB", "2.0"):
         assert part in output
+
+
+def test_real_time() -> None:
+    """Timing and laws are shown; missed deadlines stand in the line of the verdict."""
+    quantiles = {"p50": 0.1, "p95": 2.0, "p99": 30.0, "max": None}
+    error = estimate(2.0)
+    law = {"system_error": error, "supported": None, "why": "because"}
+    timing = {
+        "period_ms": 10.0,
+        **dict.fromkeys(("lateness_ms", "jitter_ms", "staleness_ms", "staleness_steps"), quantiles),
+        "deadlines": {"steps": 1000, "missed": 73, "share": 0.073},
+        "ideal_uses": {"uses": 400, "ideal": 300, "share": 0.75},
+        "outdated_graph": {"steps": 1, "share": 0.00001},
+        "never_heard": 4,
+    }
+    laws = {"pattern": law | {"supported": True}, "sequential": law, "continuous": law | {"supported": False}}
+    document = comparison("agrees", 3, 2.0) | {"timing": timing, "laws": laws | {"why": "the reasons"}}
+    output = shown(text.print_comparison, document)
+    assert output.startswith("The run agrees with the prediction; 7.3 % of the deadlines were missed.")
+    for part in ("late by [ms]", "73 of 1000 (7.3 %)", "300 of 400 (75 %)", "1 of 1000 (less than 0.01 %)"):
+        assert part in output
+    assert "neighbours not heard of yet" in output
+    assert output.count("supported") == 2
+    assert "not decided" in output
+    assert "the reasons" in output
+    assert "Timing" not in shown(text.print_comparison, comparison("agrees", 3, 2.0))

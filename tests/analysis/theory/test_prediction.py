@@ -9,7 +9,6 @@ import pytest
 import scipy.linalg
 
 from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.step import build_step_model
 from msg_analysis.theory.prediction import predict, stationary_start_factor
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
@@ -172,16 +171,15 @@ def test_without_noise_certainty_is_undefined():
 
 def test_start_factor_is_the_symmetric_root_of_the_conditional_covariance():
     e = Experiment.load(GOLDEN / "tracking.yaml")
-    step = build_step_model(e)
     golden = json.loads((GOLDEN / "tracking.predict.json").read_text())
     for mode in range(3):
-        factor = stationary_start_factor(step, e.problem, mode)
+        factor = stationary_start_factor(e, mode)
         target = np.array(golden["emulated"]["mode_second_moments"][mode]) / golden["stationary"][mode]
         np.testing.assert_allclose(factor, scipy.linalg.sqrtm(target).real, rtol=1e-7, atol=1e-9)
 
 
 def test_start_factor_of_consensus_has_no_mean():
     e = experiment()
-    factor = stationary_start_factor(build_step_model(e), e.problem, 1)
+    factor = stationary_start_factor(e, 1)
     np.testing.assert_allclose(factor.sum(axis=0), 0.0, atol=1e-12)
     np.testing.assert_allclose(factor @ factor.T, predict(e).emulated.by_mode[1] / 0.5, atol=1e-12)

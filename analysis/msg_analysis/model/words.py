@@ -1,0 +1,16 @@
+"""Numbers as words of a sentence."""
+
+from __future__ import annotations
+
+
+def percent(share: float) -> str:
+    """With three digits, and never 0 or 100 for what is not.
+
+    Parameters
+    ----------
+    share : from 0 to 1
+    """
+    value = 100.0 * share
+    if 0.0 < value < 0.01:
+        return "less than 0.01 %"
+    return "more than 99.9 %" if 99.9 < value < 100.0 else f"{value:.3g} %"

@@ -1,0 +1,359 @@
+"""Comparisons of runs in real time, whose agents are late, hear late, and learn late of the graph."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from msg_analysis.errors import InputError
+from msg_analysis.inference.compare import compare
+from msg_analysis.inference.events import order_events
+from msg_analysis.inference.innovations import innovation_tests, innovations
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.reception import HeardRegression, Reception, process_noise
+from msg_analysis.inference.timing import measure_timing
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.realtime import phases
+from msg_analysis.model.streams import STEPS_PER_BLOCK, Stream, normals
+from msg_analysis.model.trajectory import Completeness
+from msg_analysis.model.words import percent
+from msg_analysis.theory.prediction import predict
+from msg_analysis.twin import simulate
+
+CORRELATED = [[1.0, 0.3, 0.0], [0.0, 0.5, 0.2], [0.0, 0.0, 2.0]]
+
+
+def experiment(run=None, **changes):
+    document = {
+        "name": "timers",
+        "graphs": {"a": {"path": [1, 2, 3]}, "b": {"arcs": [[1, 2], [2, 3, 2.0], [3, 1], [1, 3]]}},
+        "switching": {"generator": [[-1.0, 1.0], [2.0, -2.0]]},
+        "run": {"dt": 0.1, "duration": 40, "replicas": 2, "seed": 3, "pace": "realtime"} | (run or {}),
+    }
+    return Experiment.parse(document | changes)
+
+
+TRACKING = {"problem": "tracking", "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0}}
+CASES = {
+    "consensus": experiment(),
+    "correlated": experiment(noise={"process": CORRELATED}, **TRACKING),
+    "noise by graph": experiment(noise={"process": {"a": [1.0, 0.5, 2.0], "b": CORRELATED}}),
+}
+
+
+def lateness(late_timers):
+    busy = late_timers.busy
+    return {"late": busy(0.3, 1.5), "slow": busy(0.5, 1.5), "switch": busy(0.8, 2.0)}
+
+
+def observe(trajectory):
+    return Observation.of(trajectory, predict(trajectory.record.experiment))
+
+
+def drawn_noise(what, graphs):
+    """(N, m, R): row i of B_g v(k), g being the graph that agent i used."""
+    steps = len(graphs)
+    shape = (STEPS_PER_BLOCK, what.run.replicas)
+    blocks = range(-(-steps // STEPS_PER_BLOCK))
+    v = np.stack(
+        [
+            np.concatenate([normals(what.run.seed, Stream.PROCESS, j, b, shape) for b in blocks])[:steps]
+            for j in range(3)
+        ],
+        axis=1,
+    )
+    gain = np.sqrt(what.run.dt) * what.noise_gain
+    return np.einsum("kij,kjr->kir", gain[graphs, np.arange(3)], v)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_loop_is_the_twin_when_nobody_is_late(late_timers, case):
+    loop, twin = late_timers.run(CASES[case]), simulate(CASES[case])
+    np.testing.assert_allclose(loop.states, twin.states, atol=1e-12)
+    for name in ("agent_modes", "used"):
+        np.testing.assert_array_equal(getattr(loop, name), getattr(twin, name))
+    np.testing.assert_allclose(loop.made, twin.made, atol=1)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_innovations_are_the_noise_that_was_added(late_timers, case):
+    """Exactly, whoever was late, whatever was heard, whichever graph each agent used."""
+    what = CASES[case]
+    trajectory = late_timers.run(what, **lateness(late_timers))
+    graphs = trajectory.agent_modes[1:]
+    assert (graphs != trajectory.modes[:, None]).mean() > 0.05
+    assert (trajectory.used == -1).any()
+    observation = observe(trajectory)
+    found = innovations(observation, 0, 400, Reception.of(observation, 0, 400))
+    np.testing.assert_allclose(found, drawn_noise(what, graphs), atol=1e-12)
+    part = innovations(observation, 120, 130, Reception.of(observation, 120, 130))
+    np.testing.assert_array_equal(part, found[120:130])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_timing_does_not_change_what_is_tested_of_the_noise(late_timers, case):
+    """The same noise on time and late: the same p-values, where it is the same in every graph."""
+    what = CASES[case]
+    results = []
+    for trajectory in (simulate(what), late_timers.run(what, **lateness(late_timers))):
+        observation = observe(trajectory)
+        results.append(innovation_tests(observation, order_events(observation).position))
+    if case == "noise by graph":
+        assert min(results[1].p_covariance, results[1].p_whiteness) > 1e-3
+    else:
+        assert results[1].p_covariance == pytest.approx(results[0].p_covariance)
+        assert results[1].p_whiteness == pytest.approx(results[0].p_whiteness)
+
+
+def test_lockstep_is_the_same_with_or_without_a_log_of_it(late_timers):
+    """A log that says that all of step k was used gives what is tested in lockstep."""
+    what = experiment(run={"pace": "lockstep"}, noise={"process": CORRELATED})
+    trajectory = simulate(what)
+    plain = innovation_tests(Observation.of(trajectory, predict(what)))
+    model = predict(what).step
+    used = np.full((400, 3, model.most_neighbours), -1)
+    for k, g in enumerate(trajectory.modes):
+        for i in range(3):
+            used[k, i, : len(model.neighbours(g, i))] = k
+    graphs = np.repeat(np.concatenate([[-1], trajectory.modes])[:, None], 3, axis=1)
+    made = np.tile((np.arange(401) * 100_000_000)[:, None], (1, 3))
+    logged = dataclasses.replace(
+        trajectory, record=dataclasses.replace(trajectory.record, experiment=what.with_run(pace="realtime")),
+        agent_modes=graphs, used=used, made=made,
+    )  # fmt: skip
+    found = innovation_tests(observe(logged))
+    assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(plain), rel=1e-6)
+
+
+def test_regression_frees_innovations_of_those_made_before(late_timers):
+    """Against a loop: within a step, each less its regression on those that were made earlier."""
+    what = CASES["noise by graph"]
+    observation = observe(late_timers.run(what, **lateness(late_timers)))
+    position, timers, step = order_events(observation).position, observation.timers, observation.step
+    regression = HeardRegression(observation, 400, position)
+    for first, last in ((0, 150), (150, 400)):
+        reception = Reception.of(observation, first, last)
+        regression.add(reception, innovations(observation, first, last, reception), first)
+    e = innovations(observation, 0, 400, Reception.of(observation, 0, 400))
+    places = {}
+    for g in range(2):
+        for i in range(3):
+            for j in step.neighbours(g, i).tolist():
+                places[g, i, j] = 3 + len(places)
+    size = 3 + len(places)
+    score, covariance = np.zeros(size), np.zeros((size, size))
+    for k in range(400):
+        noise = process_noise(step, timers.graphs[k])
+        before = []
+        for i in np.argsort(position[k]):
+            known = np.linalg.lstsq(noise[np.ix_(before, before)], noise[before, i], rcond=None)[0] if before else []
+            free = e[k, i] - sum((c * e[k, j] for c, j in zip(known, before, strict=True)), np.zeros(2))
+            variance = noise[i, i] - sum(c * noise[i, j] for c, j in zip(known, before, strict=True))
+            before.append(i)
+            phi = np.zeros((size, 2))
+            phi[i] = 1.0
+            g = timers.graphs[k, i]
+            for d, j in enumerate(step.neighbours(g, i).tolist()):
+                s = timers.used[k, i, d]
+                phi[places[g, i, j]] = 0.0 if s < 0 else observation.states[s, j] - observation.states[k, i]
+            score += phi @ free
+            covariance += variance * phi @ phi.T
+    np.testing.assert_allclose(regression.statistic()[0], score, atol=1e-9)
+    np.testing.assert_allclose(regression.statistic()[1], covariance, atol=1e-9)
+
+
+@pytest.mark.parametrize("case", ["consensus", "noise by graph"])
+def test_calibration(late_timers, case):
+    """p-values of 30 late runs of 400 steps are even, intervals cover, verdicts agree.
+
+    Kolmogorov-Smirnov at 2e-4 for each of 9 tests, coverage and verdicts at 1e-4 by the binomial law: a right program
+    fails a case with probability below 0.3 %.
+    """
+    late = lateness(late_timers)
+    runs = [late_timers.run(CASES[case].with_run(seed=seed), timing_seed=seed, **late) for seed in range(30)]
+    results = [compare(run) for run in runs]
+    collected = [{test.name: test.p for test in result.tests} for result in results]
+    names = ["system error", *(f"error of agent {i}" for i in (1, 2, 3)), "covariance"]
+    names += [f"innovations: {what}" for what in ("covariance", "whiteness", "gains")]
+    assert list(collected[0]) == [*names, "switching"]
+    for name in collected[0]:
+        assert stats.kstest([p[name] for p in collected], "uniform").pvalue > 2e-4, name
+    covered = sum(r.system_error.interval[0] <= r.system_error.predicted <= r.system_error.interval[1] for r in results)
+    assert covered >= stats.binom.ppf(1e-4, len(results), 0.95)
+    alarms = sum(result.verdict == "disagrees" for result in results)
+    assert alarms <= stats.binom.isf(1e-4, len(results), 0.01)
+
+
+LONG = experiment(run={"duration": 400, "replicas": 16})
+
+
+def test_a_late_machine_is_not_a_wrong_theory(late_timers):
+    """Agents that lose half their time: deadlines are missed, the sequential law fails, the verdict does not."""
+    result = compare(late_timers.run(LONG, late=late_timers.busy(0.5, 6.0), slow=late_timers.busy(0.5, 3.0)))
+    assert result.verdict == "agrees"
+    assert result.timing.missed_share > 0.3
+    assert result.laws.pattern.supported
+    assert result.laws.sequential.supported is False
+    assert result.laws.continuous.supported is False
+    assert "of the deadlines were missed" in result.laws.sequential.why
+    document = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    assert document["law"] == "pattern"
+    assert document["system_error"] == document["laws"]["pattern"]["system_error"]
+    assert document["timing"]["deadlines"]["share"] == result.timing.missed_share
+    assert set(document["laws"]) == {"pattern", "sequential", "continuous", "why"}
+
+
+def test_ideal_timers_go_with_the_sequential_law():
+    result = compare(simulate(LONG))
+    assert result.verdict == "agrees"
+    assert result.laws.pattern.supported
+    assert result.laws.sequential.supported
+    assert result.laws.continuous.supported is False  # steps of 0.1 are seen in a run of this length
+    assert "and so it was" in result.laws.sequential.why
+    assert result.laws.sequential.system_error.predicted == pytest.approx(predict(LONG).emulated.system_error)
+    assert result.laws.continuous.system_error.predicted == predict(LONG).continuous.system_error
+
+
+def other_gain(factor):
+    """Agent 2 gives its neighbours this weight, in every graph."""
+
+    def change(model):
+        nominal = model.nominal.copy()
+        extra = (factor - 1.0) * nominal[:, 1] * [1.0, 0.0, 1.0]
+        nominal[:, 1] += extra
+        nominal[:, 1, 1] -= extra.sum(axis=1)
+        return dataclasses.replace(model, nominal=nominal)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("truth", "found_by"),
+    [
+        (other_gain(0.8), "innovations: gains"),
+        (lambda model: dataclasses.replace(model, noise_gain=1.1 * model.noise_gain), "innovations: covariance"),
+    ],
+)
+def test_power_on_a_late_machine(late_timers, truth, found_by):
+    """Runs of a wrong law, 4,000 steps: rejected, and by the test that should."""
+    result = compare(late_timers.run(LONG, truth=truth, **lateness(late_timers)))
+    assert result.verdict == "disagrees"
+    assert min(result.tests, key=lambda test: test.p).name == found_by
+
+
+def test_the_pattern_law_finds_a_wrong_gain_by_itself(late_timers):
+    result = compare(late_timers.run(LONG, truth=other_gain(0.6), **lateness(late_timers)))
+    assert result.laws.pattern.supported is False
+    assert "agents did something else" in result.laws.pattern.why
+
+
+def test_what_is_said_to_be_used_but_was_not(late_timers):
+    """Agents that hear late, but say that they heard at once."""
+    trajectory = late_timers.run(LONG, slow=late_timers.busy(0.8, 15.0))
+    used = np.where(trajectory.used >= 0, np.arange(4000)[:, None, None], -1)
+    result = compare(dataclasses.replace(trajectory, used=used))
+    assert result.verdict == "disagrees"
+    assert any(test.rejected and test.name.startswith("innovations") for test in result.tests)
+
+
+def test_clocks_that_disagree_leave_the_innovations(late_timers):
+    trajectory = late_timers.run(CASES["consensus"])
+    made = trajectory.made.copy()
+    made[1:, 1] += 250_000_000
+    result = compare(dataclasses.replace(trajectory, made=made))
+    assert result.verdict == "agrees"
+    tests = [test.name for test in result.tests]
+    assert tests == ["innovations: covariance", "innovations: whiteness", "innovations: gains", "switching"]
+    document = result.to_json()
+    assert document["law"] == "sequential"
+    assert document["laws"]["pattern"]["supported"] is None
+    assert "their clocks disagree" in document["laws"]["why"]
+    assert document["system_error"] == document["laws"]["sequential"]["system_error"]
+
+
+def test_timing_by_hand(late_timers):
+    what = experiment(run={"duration": 0.5, "speed": 4.0, "seed": 5, "dt": 0.1})
+    trajectory = simulate(what)
+    step = predict(what).step
+    ideal = measure_timing(observe(trajectory))
+    assert (ideal.period_ms, ideal.missed, ideal.ideal_share, ideal.outdated_share) == (25.0, 0, 1.0, 0.0)
+    assert ideal.lateness_ms.max == ideal.jitter_ms.max == 0.0
+
+    first = int(np.argmin(phases(what)))  # nobody else is heard first
+    made, used, graphs = trajectory.made.copy(), trajectory.used.copy(), trajectory.agent_modes.copy()
+    made[3, first] += 130_000_000  # due at 0.2 + phase: 1.3 periods late, and so
+    made[4, first] = made[3, first]  # the next one is late by 0.3
+    used[2, first, 0] -= 1
+    used[0, first, 0] = -1
+    graphs[5, first] = 1 - graphs[5, first]
+    used[4, first] = -1
+    neighbours = len(step.neighbours(graphs[5, first], first))
+    used[4, first, :neighbours] = 4
+    late = measure_timing(observe(dataclasses.replace(trajectory, made=made, used=used, agent_modes=graphs)))
+    assert late.steps == 15
+    assert late.missed == 1
+    assert late.lateness_ms.max == pytest.approx(1.3 * 25)
+    assert late.jitter_ms.max == pytest.approx(1.3 * 25)
+    assert late.never_heard == 1
+    assert late.uses - late.ideal_uses == 2
+    assert late.outdated_graphs == 1
+    assert late.staleness_steps.max == 2
+    edges, counts = late.histogram
+    assert counts.sum() == 15
+    assert edges[-1] == pytest.approx(1.3 * 25)
+    json.dumps(late.to_json(), allow_nan=False)
+
+
+def test_runs_cut_short(late_timers):
+    """Numbers of the complete beginning in which nobody uses a value from after it; no verdict."""
+    trajectory = late_timers.run(CASES["consensus"], **lateness(late_timers))
+    states = trajectory.states.copy()
+    states[300, 1] = np.nan
+    gap = dataclasses.replace(trajectory, states=states, completeness=Completeness(1203, 1202, 1))
+    result = compare(gap)
+    assert result.verdict == "incomplete"
+    assert 250 < result.steps < 300
+    assert result.timing.steps == 3 * result.steps
+    states[20, 1] = np.nan
+    result = compare(dataclasses.replace(gap, states=states))
+    assert (result.timing, result.laws, result.tests) == (None, None, [])
+    json.dumps(result.to_json(), allow_nan=False)
+
+
+def test_logs_that_do_not_say_enough(late_timers):
+    trajectory = late_timers.run(CASES["consensus"])
+    with pytest.raises(InputError, match="expected that every state says the graph"):
+        compare(dataclasses.replace(trajectory, used=None))
+    graphs = trajectory.agent_modes.copy()
+    graphs[8, 1] = -1
+    with pytest.raises(InputError, match="agent 2: does not say which graph it used in step 7"):
+        compare(dataclasses.replace(trajectory, agent_modes=graphs))
+
+
+@pytest.mark.parametrize("start", ["zero", [1.0, 2.0, -4.0]])
+def test_other_starts(late_timers, start):
+    result = compare(late_timers.run(experiment(run={"start": start}), **lateness(late_timers)))
+    assert result.verdict == "agrees"
+    assert result.laws.continuous.supported is None
+    assert "steady state" in result.laws.continuous.why
+
+
+def test_without_noise(late_timers):
+    what = experiment(noise={"process": 0.0}, run={"start": [1.0, 2.0, -4.0]})
+    result = compare(late_timers.run(what, **lateness(late_timers)))
+    assert result.verdict == "agrees"
+    assert result.laws.pattern.supported is None
+    json.dumps(result.to_json(), allow_nan=False)
+
+
+def test_lockstep_has_no_timing():
+    document = compare(simulate(experiment(run={"pace": "lockstep"}))).to_json()
+    assert (document["law"], document["timing"], document["laws"]) == ("synchronous", None, None)
+
+
+def test_shares_in_words():
+    assert [percent(share) for share in (0.0, 1e-6, 0.0731, 0.5, 0.9995, 1.0)] == [
+        "0 %", "less than 0.01 %", "7.31 %", "50 %", "more than 99.9 %", "100 %"
+    ]  # fmt: skip
