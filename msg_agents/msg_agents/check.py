@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.model.step import build_model
+from msg_analysis.model.path import mode_path
+from msg_analysis.model.step import build_model, build_step_model
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.twin import simulate
-from msg_analysis.types import BoolArray, FloatArray
+from msg_analysis.twin_log import replay
+from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +32,10 @@ class Check:
 
 
 def check(trajectory: Trajectory) -> Check:
-    """Compute a lockstep run again with the offline twin and compare every state and every graph.
+    """Compute a run again with the offline twin and compare every state and every graph.
+
+    Of a run in lockstep the twin needs the seed only. In real time it also takes from the log what every agent used in
+    every step, and the stamps must allow for that: nothing is used before it was made.
 
     Parameters
     ----------
@@ -40,26 +45,72 @@ def check(trajectory: Trajectory) -> Check:
     ------
     NotAvailableError : the run was not of a kind that the twin repeats
     """
+    if trajectory.record.experiment.run.pace == "realtime":
+        return _check_realtime(trajectory)
     twin = simulate(trajectory.record.experiment, record=trajectory.record)
-    known = trajectory.modes >= 0
-    graphs = [graph.name for graph in trajectory.record.experiment.graph_list]
     # What is there at step k comes out of the graph and the losses of the steps before. First come, first named.
     found = [
         _first_state(trajectory, trajectory.states, twin.states, "logged"),
         _first_state(trajectory, trajectory.published, twin.published, "published"),
         _first_loss(trajectory, twin),
-        _first(
-            known & (trajectory.modes != twin.modes),
-            lambda step: (
-                f"graph of step {step}: logged {graphs[trajectory.modes[step]]}, "
-                f"the seed gives {graphs[twin.modes[step]]}"
-            ),
-        ),
+        _first_graph(trajectory, twin.modes),
     ]
+    return Check(trajectory.completeness.received, trajectory.completeness.missing, _earliest(found))
+
+
+def _check_realtime(trajectory: Trajectory) -> Check:
+    experiment = trajectory.record.experiment
+    law = replay(trajectory)
+    path = mode_path(experiment, build_step_model(experiment).initial)
+    found = [
+        _first_state(trajectory, trajectory.states, law, "logged"),
+        _first_early_use(trajectory),
+        _first_graph(trajectory, path),
+    ]
+    compared = int((trajectory.present & ~np.isnan(law).any(axis=2)).sum())
+    return Check(compared, trajectory.completeness.expected - compared, _earliest(found))
+
+
+def _earliest(found: Sequence[tuple[float, str] | None]) -> str | None:
+    """Of differences with their steps, the first one in words."""
     differences = [difference for difference in found if difference is not None]
-    first = min(differences, key=lambda difference: difference[0])[1] if differences else None
-    compared = trajectory.completeness.received
-    return Check(compared, trajectory.completeness.missing, first)
+    return min(differences, key=lambda difference: difference[0])[1] if differences else None
+
+
+def _first_graph(trajectory: Trajectory, modes: IntArray) -> tuple[float, str] | None:
+    graphs = [graph.name for graph in trajectory.record.experiment.graph_list]
+    return _first(
+        (trajectory.modes >= 0) & (trajectory.modes != modes),
+        lambda step: (
+            f"graph of step {step}: logged {graphs[trajectory.modes[step]]}, the seed gives {graphs[modes[step]]}"
+        ),
+    )
+
+
+def _first_early_use(trajectory: Trajectory) -> tuple[float, str] | None:
+    """A value that went into a state which was made before it, or at the same time."""
+    used, made, modes = trajectory.used, trajectory.made, trajectory.agent_modes
+    assert used is not None
+    assert made is not None
+    assert modes is not None
+    model = build_step_model(trajectory.record.experiment)
+    senders = np.zeros((model.modes + 1, *used.shape[1:]), dtype=np.int64)  # the last one where there is no graph
+    for mode in range(model.modes):
+        for i in range(model.agents):
+            neighbours = model.neighbours(mode, i)
+            senders[mode, i, : len(neighbours)] = neighbours
+    sender = senders[modes[1:], np.arange(model.agents)]
+    early = (used >= 0) & (made[1:] >= 0)[:, :, None] & (made[used, sender] >= made[1:, :, None])
+
+    def describe(step: int, agent: int, which: int) -> str:
+        return (
+            f"agent {agent + 1} at step {step + 1}: stamped {made[step + 1, agent] / 1e9} s of simulated time, and "
+            f"used step {used[step, agent, which]} of agent {sender[step, agent, which] + 1}, stamped "
+            f"{made[used[step, agent, which], sender[step, agent, which]] / 1e9} s"
+        )
+
+    found = _first(early, describe)
+    return found and (found[0] + 1, found[1])
 
 
 def _first(wrong: BoolArray, describe: Callable[..., str]) -> tuple[float, str] | None:
@@ -75,7 +126,7 @@ def _first_state(
 ) -> tuple[float, str] | None:
     if logged is None or law is None:
         return None
-    there = ~np.isnan(logged).any(axis=2)
+    there = ~(np.isnan(logged) | np.isnan(law)).any(axis=2)
 
     def describe(step: int, agent: int) -> str:
         here, expected = logged[step, agent], law[step, agent]

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from msg_analysis.model.record import RunRecord
 
 DISAGREES, INCOMPLETE = 1, 3
+USE_SIM_TIME_HELP = "Take the time from /clock, which somebody else publishes in the same domain (realtime)."
 
 
 @click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -51,7 +52,8 @@ def main() -> None:
 @click.option("--no-record", is_flag=True, help="Only run: no bag, no verdict.")
 @click.option("--seed", type=int, help="Instead of run.seed.")
 @click.option("--duration", type=float, help="Instead of run.duration, in units of simulated time.")
-@click.option("--pace", help="Instead of run.pace: lockstep.")
+@click.option("--pace", help="Instead of run.pace: lockstep or realtime.")
+@click.option("--speed", type=float, help="Instead of run.speed: units of simulated time per second (realtime).")
 @click.option("--processes", help="Instead of run.processes: auto, one_per_agent or a number.")
 @click.option(
     "--restarts",
@@ -61,6 +63,7 @@ def main() -> None:
     help="How often agents or the switcher may be killed and are started again.",
 )
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own.")
+@click.option("--use-sim-time", is_flag=True, help=USE_SIM_TIME_HELP)
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
 def run(
@@ -71,9 +74,11 @@ def run(
     seed: int | None,
     duration: float | None,
     pace: str | None,
+    speed: float | None,
     processes: str | None,
     restarts: int,
     domain: int | None,
+    use_sim_time: bool,
     executor: str | None,
     as_json: bool,
 ) -> None:
@@ -82,7 +87,7 @@ def run(
 
     from msg_agents.runner import conclude, run_network
 
-    changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace}
+    changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
     if processes is not None:
         changes["processes"] = int(processes) if processes.isdigit() else processes
     what = _load(experiment).with_run(**{key: value for key, value in changes.items() if value is not None})
@@ -93,6 +98,7 @@ def run(
             None if no_record else out,
             domain=domain,
             restarts=restarts,
+            use_sim_time=use_sim_time,
             on_progress=on_progress,
             environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
         )
@@ -210,6 +216,17 @@ def prepare(experiment: Path) -> None:
     click.echo(new_record(what).to_json())
 
 
+class _RosCommand(click.Command):
+    """Takes arguments for ROS 2 as any ROS node does: ``--ros-args ... [--]``. rclpy finds them by itself."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        while "--ros-args" in args:
+            start = args.index("--ros-args")
+            end = args.index("--", start) + 1 if "--" in args[start:] else len(args)
+            args = args[:start] + args[end:]
+        return super().parse_args(ctx, args)
+
+
 def _node_options(command: Callable[..., None]) -> Callable[..., None]:
     """What the commands of single nodes have in common."""
     for option in (
@@ -221,6 +238,7 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
             show_default=True,
             help="Seconds to wait for the other nodes.",
         ),
+        click.option("--use-sim-time", is_flag=True, help=USE_SIM_TIME_HELP),
         click.option("--lifeline", type=int, hidden=True),
     ):
         command = option(command)
@@ -242,7 +260,7 @@ _checkpoint = click.option(
 )
 
 
-@main.command(epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
+@main.command(cls=_RosCommand, epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
 @_node_options
 @click.option(
     "--agent",
@@ -278,10 +296,10 @@ def agent(
         group = AgentGroup(record=record, model=model, agents=indices, readers=readers, checkpoints=directory)
         return list(group.nodes)
 
-    _run_nodes(nodes, **options)
+    _run_nodes(nodes, record, **options)
 
 
-@main.command(epilog=examples("msg-agents switcher run.json --await recorder"))
+@main.command(cls=_RosCommand, epilog=examples("msg-agents switcher run.json --await recorder"))
 @_node_options
 @_await
 @_checkpoint
@@ -299,16 +317,17 @@ def switcher(
             os.write(status, json.dumps(list(steps)).encode() + b"\n")
 
     def nodes() -> list[NetworkNode]:
-        from msg_agents.switcher import Switcher
+        from msg_agents.switcher import SWITCHERS
 
         model = build_model(record.experiment)
         directory = _make(checkpoint)
-        return [Switcher(record=record, model=model, readers=list(readers), on_progress=report, checkpoints=directory)]
+        kind = SWITCHERS[record.experiment.run.pace]
+        return [kind(record=record, model=model, readers=list(readers), on_progress=report, checkpoints=directory)]
 
-    _run_nodes(nodes, **options)
+    _run_nodes(nodes, record, **options)
 
 
-@main.command(epilog=examples("msg-agents recorder run.json --out runs/mine"))
+@main.command(cls=_RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
 @_node_options
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Directory of the bag; must not exist.")
 def recorder(run_record: Path, *, out: Path, **options: Any) -> None:
@@ -320,16 +339,30 @@ def recorder(run_record: Path, *, out: Path, **options: Any) -> None:
 
         return [Recorder(record=record, directory=out)]
 
-    _run_nodes(nodes, **options)
+    _run_nodes(nodes, record, **options)
 
 
-def _run_nodes(nodes: Callable[[], list[NetworkNode]], *, lifeline: int | None, discovery_timeout: float) -> None:
+def _run_nodes(
+    nodes: Callable[[], list[NetworkNode]],
+    record: RunRecord,
+    *,
+    lifeline: int | None,
+    discovery_timeout: float,
+    use_sim_time: bool,
+) -> None:
     from msg_agents.process import hold_lifeline, run_nodes
 
     if lifeline is not None:
         hold_lifeline(lifeline)
     executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
-    if not run_nodes(nodes, executor=executor, discovery_timeout=discovery_timeout):
+    throughput = record.experiment.run.pace == "lockstep"
+    if not run_nodes(
+        nodes,
+        executor=executor,
+        discovery_timeout=discovery_timeout,
+        throughput=throughput,
+        use_sim_time=use_sim_time,
+    ):
         sys.exit(INCOMPLETE)
 
 

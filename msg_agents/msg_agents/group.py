@@ -12,13 +12,16 @@ from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.publisher import Publisher
 
 from msg_agents.agent import Agent
+from msg_agents.lockstep import LockstepAgent
 from msg_agents.node import GRAPH_TOPIC, OTHER_RUN, PROGRESS_TOPIC, RESEND_TOPIC
 from msg_agents.qos import LATCHED
+from msg_agents.realtime import RealtimeAgent
 from msg_agents.turns import Turns
 from msg_analysis.bags.cdr import ActiveGraph, CdrError
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import Wiring
 
+AGENTS: dict[str, type[Agent]] = {"lockstep": LockstepAgent, "realtime": RealtimeAgent}  # by pace
 PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages of an agent, in a small network
 MOST_REPORTS = 250.0  # of them a second from a whole network: the switcher reads them all
 
@@ -60,8 +63,9 @@ class AgentGroup:
         listens = model.listens()
         exchanges = listens | listens.T
         self._agents: dict[int, Agent] = {}
+        kind = AGENTS[record.experiment.run.pace]
         for i in agents:
-            self._agents[i] = Agent(
+            self._agents[i] = kind(
                 record=record,
                 model=model,
                 agent=i,
@@ -75,6 +79,7 @@ class AgentGroup:
         for agent in self.nodes:
             agent.meet(self._agents)
         self._host = self.nodes[0]
+        self._host.host(self.nodes)
         self._progress = self._host.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
         self._resend: Publisher | None = None
         self._host.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._receive_graph, LATCHED, raw=True)

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from msg_agents.timers import every
+
 DIAGNOSTICS_TOPIC = "/diagnostics"
 PERIOD = 1.0  # s
 PATIENCE = 5.0  # s
@@ -21,7 +23,7 @@ class Health:
     Attributes
     ----------
     message : one line
-    waiting : whether it cannot go on for the time being
+    waiting : whether it cannot go on, or not keep up, for the time being
     values : facts, by name
     """
 
@@ -55,7 +57,7 @@ class Reporter:
     def __init__(self, nodes: Sequence[Node]) -> None:
         self._nodes = nodes
         self._publisher = nodes[0].create_publisher(DiagnosticArray, DIAGNOSTICS_TOPIC, 10)
-        nodes[0].create_timer(PERIOD, self._report)
+        every(nodes[0], PERIOD, self._report)
 
     def _report(self) -> None:
         array = DiagnosticArray(

@@ -67,7 +67,12 @@ def discovery_timeout(agents: int, processes: int) -> float:
 
 
 def plan_network(
-    experiment: Experiment, run_file: Path, bag: Path | None, checkpoints: Path | None = None
+    experiment: Experiment,
+    run_file: Path,
+    bag: Path | None,
+    checkpoints: Path | None = None,
+    *,
+    use_sim_time: bool = False,
 ) -> list[ProcessPlan]:
     """The processes of a run, in the order in which they should be started.
 
@@ -77,23 +82,24 @@ def plan_network(
     run_file : the run record that every node is given
     bag : directory to record to; None: no recorder
     checkpoints : directory for what agents and switcher need to go on after being killed; None: they cannot
+    use_sim_time : whether the nodes take the time from ``/clock``
 
     Raises
     ------
     InputError : more processes than discovery can handle
     """
     count = count_processes(experiment)
-    patience: tuple[str, ...] = ()
+    common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
     timeout = discovery_timeout(experiment.agents, count)
     if timeout > DISCOVERY_TIMEOUT:
-        patience = ("--discovery-timeout", f"{timeout:g}")
-    options = patience + (("--await", RECORDER) if bag is not None else ())
+        common += ("--discovery-timeout", f"{timeout:g}")
+    options = common + (("--await", RECORDER) if bag is not None else ())
     if checkpoints is not None:
         options += ("--checkpoint", str(checkpoints))
     resumes = checkpoints is not None
     plans = []
     if bag is not None:
-        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *patience)))
+        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *common)))
     for index in range(count):
         # Neighbouring numbers share a process: in most graphs they are neighbours, and their messages stay inside.
         agents = tuple(range(index * experiment.agents // count, (index + 1) * experiment.agents // count))

@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
+from rclpy.time_source import CLOCK_TOPIC
 
 from msg_agents.errors import RCLError
 from msg_agents.health import Health
@@ -23,6 +24,7 @@ EXPERIMENT_TOPIC = "experiment"
 GRAPH_TOPIC = "graph"
 PROGRESS_TOPIC = "progress"
 END_TOPIC = "end"
+EPOCH_TOPIC = "epoch"
 RESEND_TOPIC = "resend"
 NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
 OTHER_RUN = "of another run, agent or layout"
@@ -47,7 +49,8 @@ def truth_topic(agent: int) -> str:
 
 def longest_heard(record: RunRecord) -> int:
     """Most steps that ``heard`` of a state message can list in a run."""
-    return record.experiment.agents - 1 if record.experiment.noise.loss else 0
+    experiment = record.experiment
+    return experiment.agents - 1 if experiment.noise.loss or experiment.run.pace == "realtime" else 0
 
 
 class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
@@ -113,6 +116,12 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
     def awaited(self) -> list[str]:
         """Names of those who have not been found yet."""
         return []
+
+    def awaited_clock(self) -> list[str]:
+        """Who should tell the time and has not been found."""
+        if not self.get_parameter("use_sim_time").value or self.count_publishers(CLOCK_TOPIC):
+            return []
+        return [f"a publisher of {CLOCK_TOPIC}"]
 
     def begin(self) -> None:
         """Everyone has been found: start."""

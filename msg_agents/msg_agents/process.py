@@ -7,6 +7,7 @@ import faulthandler
 import gc
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -24,6 +25,7 @@ SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wak
 GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collections find nothing
 LEAVE_GRACE = 5  # s
 LIFELINE_GRACE = 5.0  # s
+USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
 
 
 class NotFoundError(InputError):
@@ -71,7 +73,12 @@ def hold_lifeline(descriptor: int) -> None:
 
 
 def run_nodes(
-    make_nodes: Callable[[], Sequence[NetworkNode]], *, executor: str = "events", discovery_timeout: float
+    make_nodes: Callable[[], Sequence[NetworkNode]],
+    *,
+    executor: str = "events",
+    discovery_timeout: float,
+    throughput: bool = True,
+    use_sim_time: bool = False,
 ) -> bool:
     """Run nodes in this process until each has done its part.
 
@@ -80,6 +87,8 @@ def run_nodes(
     make_nodes : called once ROS is up
     executor : "events" or "single"
     discovery_timeout : s to wait for the other nodes of the run
+    throughput : whether much work in little time counts for more than being woken at once
+    use_sim_time : whether the nodes take the time from ``/clock``; as the ROS parameter of that name
 
     Returns
     -------
@@ -93,8 +102,9 @@ def run_nodes(
     # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
     # installed on top, ends the spin between two callbacks.
     signal.signal(signal.SIGINT, lambda *_: None)
-    prefer_throughput()
-    rclpy.init()
+    if throughput:
+        prefer_throughput()
+    rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
     nodes: Sequence[NetworkNode] = []
     complete = False
     try:
@@ -149,11 +159,11 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
     deadline = time.monotonic() + timeout
     waiting = list(nodes)
     while True:
-        waiting = [node for node in waiting if not node.found()]
+        waiting = [node for node in waiting if not node.found() or node.awaited_clock()]
         if not waiting:
             return
         if time.monotonic() > deadline:
-            missing = sorted({name for node in waiting for name in node.awaited()})
+            missing = sorted({name for node in waiting for name in node.awaited() + node.awaited_clock()})
             raise NotFoundError(
                 f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} had not found: "
                 f"{', '.join(missing)}. Are they running, in the same ROS_DOMAIN_ID "

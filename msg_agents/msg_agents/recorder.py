@@ -26,6 +26,7 @@ from msg_agents.node import (
     truth_topic,
 )
 from msg_agents.qos import LATCHED, STREAM
+from msg_agents.timers import every
 from msg_analysis.bags.cdr import ActiveGraph, AgentState, CdrError, StateFrame, decode_string, stamp_ns
 from msg_analysis.bags.schemas import network_topics
 from msg_analysis.bags.writer import BagWriter
@@ -77,8 +78,8 @@ class Recorder(NetworkNode):
             self.create_subscription(AgentStateMsg, topic, self._collector(source), STREAM, raw=True)
         self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
         self.leave_at_end()
-        self.create_timer(WRITE_PERIOD, self._guarded(self._write_states))
-        self.create_timer(FLUSH_PERIOD, self._guarded(self.bag.flush))
+        every(self, WRITE_PERIOD, self._guarded(self._write_states))
+        every(self, FLUSH_PERIOD, self._guarded(self.bag.flush))
 
     def health(self) -> Health:
         """See NetworkNode."""

@@ -76,6 +76,7 @@ def run_network(
     *,
     domain: int | None = None,
     restarts: int = 0,
+    use_sim_time: bool = False,
     on_progress: Callable[[int], None] = lambda _: None,
     environment: Mapping[str, str] | None = None,
 ) -> RunResult:
@@ -87,6 +88,7 @@ def run_network(
     out : directory in which a new bag is made; None: do not record
     domain : ROS_DOMAIN_ID; a free one is chosen if not given
     restarts : how often an agent or the switcher may be killed and is started again; once more ends the run
+    use_sim_time : whether the nodes take the time from ``/clock``, which somebody else publishes in the same domain
     on_progress : called a few times a second with the step that every agent has reached
     environment : changes to the environment of the processes
 
@@ -113,7 +115,10 @@ def run_network(
                 _interruptible() as interrupted,
                 Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
             ):
-                supervisor.start(plan_network(experiment, run_file, bag, folder / CHECKPOINTS if restarts else None))
+                checkpoints = folder / CHECKPOINTS if restarts else None
+                supervisor.start(
+                    plan_network(experiment, run_file, bag, checkpoints=checkpoints, use_sim_time=use_sim_time)
+                )
                 _watch(supervisor, experiment.steps, result, restarts, interrupted, on_progress)
                 # Before the others are ended: what ends because we end it has not failed.
                 _collect_failures(supervisor, result, interrupted)

@@ -1,10 +1,14 @@
-"""The switcher node: publishes the experiment and the path of the active graph."""
+"""The switcher node: publishes the experiment and the path of the active graph.
+
+In lockstep it keeps ahead of the agents; in real time it publishes the epoch and every sojourn at its time.
+"""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
 from msg_agents_interfaces.msg import Progress as ProgressMsg
@@ -15,6 +19,7 @@ from msg_agents.health import Health
 from msg_agents.network import RECORDER
 from msg_agents.node import (
     END_TOPIC,
+    EPOCH_TOPIC,
     EXPERIMENT_TOPIC,
     GRAPH_TOPIC,
     NOT_AN_AGENT,
@@ -23,7 +28,9 @@ from msg_agents.node import (
     agent_name,
 )
 from msg_agents.qos import LATCHED
-from msg_analysis.bags.cdr import ActiveGraph, encode_string
+from msg_agents.schedule import SECOND, Schedule
+from msg_agents.timers import DueTimer, every
+from msg_analysis.bags.cdr import ActiveGraph, Progress, encode_string
 from msg_analysis.model.path import Sojourn, sojourns
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import Wiring
@@ -41,11 +48,14 @@ BEHIND = 5000
 
 REPORT_PERIOD = 0.1  # s
 
+HEAD_START = SECOND // 2
+"""ns of the clock from the publication of the epoch to the epoch: by then everybody should know it."""
+
 FAREWELL = 4.0  # s; more than the 3 s between two heartbeats of Fast DDS
 
 
 class Switcher(NetworkNode):
-    """Draws the exact path of the chain and keeps a bounded number of sojourns ahead of the agents.
+    """Draws the exact path of the chain; when it publishes what of it, is a matter of its pace.
 
     Parameters
     ----------
@@ -74,17 +84,13 @@ class Switcher(NetworkNode):
         self._heard = False  # from an agent since the last call of on_progress
         self._recorded = RECORDER not in readers
         self._on_progress = on_progress
-        # Part of the path has been published if there is a mark, and nobody says how much.
         self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
-        self._behind = bool(self._mark and self._mark.exists())
-        self._ahead: deque[int] = deque()  # first steps of the published sojourns that the slowest has not reached
-        self._most_ahead = AHEAD
         self._expected = [agent_name(i) for i in range(model.agents)] + readers
         self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LATCHED)
         self._graph = self.create_publisher(ActiveGraphMsg, GRAPH_TOPIC, LATCHED)
         self._end = self.create_publisher(ProgressMsg, END_TOPIC, LATCHED)
         self.create_subscription(ProgressMsg, PROGRESS_TOPIC, self._receive, LATCHED, raw=True)
-        self.create_timer(REPORT_PERIOD, self._report)
+        every(self, REPORT_PERIOD, self._report)
 
     def found(self) -> bool:
         """See NetworkNode."""
@@ -97,19 +103,22 @@ class Switcher(NetworkNode):
 
     def health(self) -> Health:
         """See NetworkNode."""
-        slowest = self._slowest
-        values = {"step of the slowest agent": str(slowest), "sojourns ahead of it": str(len(self._ahead))}
-        if slowest < 0:
+        values = {"step of the slowest agent": str(self._slowest)}
+        if self._slowest < 0:
             silent = [agent_name(i) for i, step in enumerate(self._reached) if step < 0]
             return Health(f"waiting for {', '.join(silent)}", waiting=True, values=values)
-        return Health(f"{len(self._ahead)} sojourns ahead of step {slowest}", values=values)
+        return self._how(values)
+
+    def _how(self, values: dict[str, str]) -> Health:
+        """How it is once all agents have started; ``values`` are what there is to say anyway."""
+        raise NotImplementedError
 
     def begin(self) -> None:
-        """Publish the experiment and the beginning of the path."""
-        if self._mark:
-            self._mark.touch()
+        """Publish the experiment, to begin with."""
         self.publish(self._experiment, encode_string(self.record.to_json()))
-        self._keep_ahead()
+
+    def _moved(self) -> None:
+        """The slowest agent has got further."""
 
     def finish(self, *, complete: bool) -> None:
         """See NetworkNode. Nobody needs anything but the end any more, and who has left has had it."""
@@ -128,7 +137,7 @@ class Switcher(NetworkNode):
         slowest = min(self._reached)
         if slowest > self._slowest:
             self._slowest = slowest
-            self._keep_ahead()
+            self._moved()
         if self._recorded and slowest >= self._steps and not self.done.done():
             self._report()
             self.publish(self._end, self.progress(NOT_AN_AGENT, self._steps))
@@ -139,36 +148,11 @@ class Switcher(NetworkNode):
             self._heard = False
             self._on_progress(self._reached)
 
-    def _keep_ahead(self) -> None:
-        slowest = self._slowest
-        if self._behind:
-            if slowest < 0:  # not everybody has said yet where he is
-                return
-            self._catch_up(slowest)
-        while self._ahead and self._ahead[0] <= slowest:
-            self._ahead.popleft()
-        while len(self._ahead) < self._most_ahead:
-            sojourn = next(self._path, None)
-            if sojourn is None:
-                return
-            self._publish_sojourn(sojourn)
-
-    def _catch_up(self, slowest: int) -> None:
-        """Publish again what may still have been under way when the process before this one went."""
-        recent: deque[Sojourn] = deque(maxlen=BEHIND)
-        for sojourn in self._path:
-            recent.append(sojourn)
-            if sojourn.last_step >= slowest:
-                break
-        for sojourn in recent:
-            self._publish_sojourn(sojourn)
-        self._behind = False
-
-    def _publish_sojourn(self, sojourn: Sojourn) -> None:
+    def _publish_sojourn(self, sojourn: Sojourn) -> int:
+        """Publish a sojourn; the bytes of its message."""
         message = self._message(sojourn).encode()
-        self._most_ahead = min(self._most_ahead, max(AHEAD_LEAST, AHEAD_BYTES // len(message)))
         self.publish(self._graph, message)
-        self._ahead.append(sojourn.first_step)
+        return len(message)
 
     def _message(self, sojourn: Sojourn) -> ActiveGraph:
         graph = self._graphs[sojourn.mode]
@@ -182,3 +166,117 @@ class Switcher(NetworkNode):
             last_step=sojourn.last_step,
             arcs=graph.arcs,
         )
+
+
+class LockstepSwitcher(Switcher):
+    """Keeps a bounded number of sojourns ahead of the agents. Parameters: see Switcher."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # Part of the path has been published if there is a mark, and nobody says how much.
+        self._behind = bool(self._mark and self._mark.exists())
+        self._ahead: deque[int] = deque()  # first steps of the published sojourns that the slowest has not reached
+        self._most_ahead = AHEAD
+
+    def _how(self, values: dict[str, str]) -> Health:
+        """See Switcher."""
+        values["sojourns ahead of it"] = str(len(self._ahead))
+        return Health(f"{len(self._ahead)} sojourns ahead of step {self._slowest}", values=values)
+
+    def begin(self) -> None:
+        """Publish the experiment and the beginning of the path."""
+        if self._mark:
+            self._mark.touch()
+        super().begin()
+        self._moved()
+
+    def _moved(self) -> None:
+        """See Switcher: keep ahead."""
+        slowest = self._slowest
+        if self._behind:
+            if slowest < 0:  # not everybody has said yet where he is
+                return
+            self._catch_up(slowest)
+        while self._ahead and self._ahead[0] <= slowest:
+            self._ahead.popleft()
+        while len(self._ahead) < self._most_ahead:
+            sojourn = next(self._path, None)
+            if sojourn is None:
+                return
+            self._go_ahead(sojourn)
+
+    def _catch_up(self, slowest: int) -> None:
+        """Publish again what may still have been under way when the process before this one went."""
+        recent: deque[Sojourn] = deque(maxlen=BEHIND)
+        for sojourn in self._path:
+            recent.append(sojourn)
+            if sojourn.last_step >= slowest:
+                break
+        for sojourn in recent:
+            self._go_ahead(sojourn)
+        self._behind = False
+
+    def _go_ahead(self, sojourn: Sojourn) -> None:
+        size = self._publish_sojourn(sojourn)
+        self._most_ahead = min(self._most_ahead, max(AHEAD_LEAST, AHEAD_BYTES // size))
+        self._ahead.append(sojourn.first_step)
+
+
+class RealtimeSwitcher(Switcher):
+    """Says when simulated time begins, and publishes each sojourn when it begins. Parameters: see Switcher."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._timer = DueTimer(self, self._keep_up)
+        self._schedule: Schedule | None = None
+        self._next = next(self._path, None)
+
+    def _how(self, values: dict[str, str]) -> Health:
+        """See Switcher."""
+        if self._schedule is None:
+            return Health("waiting for the time on /clock", waiting=True, values=values)
+        late = self._next is not None and self._timer.now() - self._schedule.clock_time(self._next.first_step)
+        values["lateness of the graph [ms]"] = f"{max(0, late) / 1e6:.3f}"
+        return Health(f"step of the slowest agent: {self._slowest}", values=values)
+
+    def begin(self) -> None:
+        """Publish the experiment; and after another process, what that one has published of epoch and path."""
+        super().begin()
+        text = self._mark.read_text(encoding="ascii") if self._mark and self._mark.exists() else ""
+        if text:
+            self._start(int(text))
+
+    def _report(self) -> None:
+        super()._report()
+        now = self._timer.now()
+        if self._schedule is None and self._slowest >= 0 and now:
+            epoch = now + HEAD_START
+            if self._mark:  # whole or not at all: whoever takes over must go on with this epoch
+                draft = self._mark.with_suffix(".draft")
+                draft.write_text(str(epoch), encoding="ascii")
+                draft.replace(self._mark)
+            self._start(epoch)
+
+    def _start(self, epoch: int) -> None:
+        """Publish the epoch, and the path as far as it has come."""
+        experiment = self.record.experiment
+        self._schedule = Schedule(epoch=epoch, speed=experiment.run.speed, step_length=experiment.step_length)
+        publisher = self.create_publisher(ProgressMsg, EPOCH_TOPIC, LATCHED)
+        self.publish(publisher, Progress(epoch, self.run, NOT_AN_AGENT, 0).encode())
+        self._keep_up()
+
+    def _keep_up(self) -> None:
+        """Publish every sojourn whose time has come, the first one before."""
+        assert self._schedule is not None
+        simulated = self._schedule.simulated(self._timer.now())
+        come: deque[Sojourn] = deque(maxlen=BEHIND)
+        while self._next and (self._next.first_step == 0 or self._schedule.due(self._next.first_step) <= simulated):
+            come.append(self._next)
+            self._next = next(self._path, None)
+        for sojourn in come:
+            self._publish_sojourn(sojourn)
+        if self._next:
+            self._timer.set(self._schedule.clock_time(self._next.first_step))
+
+
+SWITCHERS: dict[str, type[Switcher]] = {"lockstep": LockstepSwitcher, "realtime": RealtimeSwitcher}  # by pace

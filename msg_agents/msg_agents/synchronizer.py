@@ -27,6 +27,7 @@ class Refusal:
     FAR = "a step that a peer cannot have reached"
     SEQUENCE = "a sojourn out of sequence"
     KNOWN = "a sojourn known already"
+    EARLY = "a sojourn before its time"
 
 
 @dataclass(frozen=True, slots=True)

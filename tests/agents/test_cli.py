@@ -70,7 +70,7 @@ def run_file(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("changes", "options", "words"),
     [
-        ({"run": {"pace": "realtime"}}, [], ["run.pace", "realtime", "lockstep"]),
+        ({"run": {"pace": "realtime"}, "noise": {"link": 0.1}}, [], ["noise.link: 0.1", "real time", "lockstep"]),
         ({"noise": {"delay": 2}}, [], ["noise.delay", "2"]),
         ({"run": {"dt": 0.3, "duration": 5}}, [], ["run.duration"]),
         ({"unknown": 1}, [], ["unknown"]),
@@ -79,7 +79,9 @@ def run_file(tmp_path: Path) -> Path:
             [],
             ["run.processes", "at most 90"],
         ),
-        ({}, ["--pace", "realtime"], ["run.pace"]),
+        ({"noise": {"loss": 0.1}}, ["--pace", "realtime"], ["noise.loss: 0.1", "real time"]),
+        ({"noise": {"delay": 1}}, ["--pace", "realtime"], ["noise.delay: 1"]),
+        ({}, ["--pace", "realtime", "--speed", "0"], ["run.speed: 0", "> 0"]),
         ({}, ["--pace", "fast"], ["run.pace", "fast"]),
         ({}, ["--processes", "many"], ["run.processes", "many"]),
         ({}, ["--processes", "0"], ["run.processes"]),

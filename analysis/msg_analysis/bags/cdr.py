@@ -26,7 +26,7 @@ from msg_analysis.types import AnyArray, FloatArray
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 HEADER_SIZE = 4
 RUN_SIZE = 16
-_SECOND = 1_000_000_000  # ns
+SECOND = 1_000_000_000  # ns
 # Bytes that may follow a message: Fast DDS aligns the end as if elements followed an empty sequence of 8-byte
 # numbers, and fills up to a multiple of four.
 _MAX_PADDING = 7
@@ -56,7 +56,7 @@ class StepClock:
     """
 
     def __init__(self, dt: float) -> None:
-        step = Fraction(repr(float(dt))) * _SECOND
+        step = Fraction(repr(float(dt))) * SECOND
         self._numerator, self._denominator = step.numerator, step.denominator
 
     def nanoseconds(self, step: int) -> int:
@@ -77,7 +77,7 @@ def stamp_ns(data: bytes) -> int:
         seconds, nanoseconds = _STAMP[data[:2]].unpack_from(data)
     except (KeyError, struct.error) as error:
         raise CdrError(f"stamp: no CDR header and stamp in {bytes(data[:12]).hex(' ') or 'no bytes'}") from error
-    return int(seconds) * _SECOND + int(nanoseconds)
+    return int(seconds) * SECOND + int(nanoseconds)
 
 
 class StateCodec:
@@ -114,9 +114,9 @@ class StateCodec:
             raise ValueError(f"state: {state.dtype} of shape {state.shape}, expected float64 of shape {self._shape}")
         return self.wrap(step, mode, to_payload(state))
 
-    def wrap(self, step: int, mode: int, payload: bytes, heard: Sequence[int] = ()) -> bytes:
-        """One AgentState of a state that is bytes already, of the right length."""
-        seconds, nanoseconds = divmod(self._nanoseconds(step), _SECOND)
+    def wrap(self, step: int, mode: int, payload: bytes, heard: Sequence[int] = (), stamp: int | None = None) -> bytes:
+        """One AgentState of a state that is bytes already, of the right length; by default stamped k dt [ns]."""
+        seconds, nanoseconds = divmod(self._nanoseconds(step) if stamp is None else stamp, SECOND)
         fixed = (1, 0, self._run, self._agent, step, mode, len(heard), self._replicas)
         data = _STATE.pack(LITTLE_ENDIAN, seconds, nanoseconds, *fixed)
         if heard:
@@ -228,7 +228,7 @@ class _Reader:
         return np.frombuffer(self._data, self._order + code, count, start).astype(code)
 
     def stamp(self) -> int:
-        return self.number("i", "header") * _SECOND + self.number("I", "header")
+        return self.number("i", "header") * SECOND + self.number("I", "header")
 
     def end(self) -> None:
         left = len(self._data) - self._at
@@ -267,8 +267,8 @@ class _Writer:
     def header(self, stamp: int, frame_id: str, run: bytes) -> None:
         if len(run) != RUN_SIZE:
             raise ValueError(f"run: {len(run)} bytes, expected the {RUN_SIZE} bytes of a UUID")
-        self.number("i", stamp // _SECOND)
-        self.number("I", stamp % _SECOND)
+        self.number("i", stamp // SECOND)
+        self.number("I", stamp % SECOND)
         self.string(frame_id)
         self.raw(run)
 

@@ -209,6 +209,8 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
         truth.modes,
         published=published.states if published else None,
         lost=truth.lost,
+        used=truth.used,
+        made=truth.made,
     )
 
 
@@ -219,7 +221,7 @@ class _Collected:
     ----------
     states : (N + 1, m, width); NaN where a state is missing
     modes : (N + 1, m) from 0; -1 where missing
-    lost : see ``Trajectory.lost``
+    lost, used, made : see ``Trajectory``
     received, duplicates, out_of_order : see ``Completeness``
     """
 
@@ -230,7 +232,8 @@ class _Collected:
         refused["undecodable"] += columns.undecodable
         counts = columns.runs()
         refused["other run"] += sum(counts.values()) - counts.get(run, 0)
-        links = _Links(build_model(experiment)) if experiment.noise.loss else None
+        realtime = experiment.run.pace == "realtime"
+        links = _Links(build_model(experiment), steps) if experiment.noise.loss or realtime else None
         taken = columns.take(run, width, links.most if links else 0)
         refused["wrong length"] += counts.get(run, 0) - len(taken.step)
 
@@ -240,12 +243,13 @@ class _Collected:
             ("step out of range", taken.step > steps),
             ("unknown mode", taken.mode > len(experiment.graph_list)),
             ("not finite", ~np.isfinite(taken.state).all(axis=1)),
+            ("stamped before the start", realtime & (taken.stamp < 0)),
         ):
             refused[reason] += int((good & bad).sum())
             good &= ~bad
         index = np.flatnonzero(good)
         if links:
-            fits = links.fit(taken, index)
+            fits = links.fit(taken, index, realtime=realtime)
             refused["heard what it cannot have"] += int((~fits).sum())
             index = index[fits]
         cell = taken.step[index] * agents + taken.agent[index] - 1
@@ -255,6 +259,8 @@ class _Collected:
         copy, original = index[again], kept[owner[again]]
         differs = (taken.state[copy] != taken.state[original]).any(axis=1)
         differs |= (taken.heard[copy] != taken.heard[original]).any(axis=1)
+        if realtime:
+            differs |= taken.stamp[copy] != taken.stamp[original]
         refused["contradicts an earlier copy"] += int(differs.sum())
 
         states = np.full(((steps + 1) * agents, width), np.nan)
@@ -263,7 +269,16 @@ class _Collected:
         modes[cells] = taken.mode[kept] - 1
         self.states, self.modes = states.reshape(steps + 1, agents, width), modes.reshape(steps + 1, agents)
         self.lost: BoolArray | None = None
-        if links:
+        self.used: IntArray | None = None
+        self.made: IntArray | None = None
+        if links and realtime:
+            listed = np.arange(links.most) < taken.heard_count[kept, None]
+            used = np.full(((steps + 1) * agents, links.most), -1, dtype=np.int64)
+            used[cells] = np.where(listed & (taken.heard[kept] != LOST), taken.heard[kept].astype(np.int64), -1)
+            made = np.full((steps + 1) * agents, -1, dtype=np.int64)
+            made[cells] = taken.stamp[kept]
+            self.used, self.made = used.reshape(steps + 1, agents, links.most)[1:], made.reshape(steps + 1, agents)
+        elif links:
             lost = np.zeros(((steps + 1) * agents, links.most), dtype=np.bool_)
             lost[cells] = taken.heard[kept] == LOST
             self.lost = lost.reshape(steps + 1, agents, links.most)[1:]
@@ -272,26 +287,34 @@ class _Collected:
 
 
 class _Links:
-    """What ``heard`` can be in a lockstep run in which messages are lost.
+    """What ``heard`` can be where it says something.
 
     Attributes
     ----------
     most : largest number of neighbours
     """
 
-    def __init__(self, model: Wiring) -> None:
+    def __init__(self, model: Wiring, steps: int) -> None:
+        self._last = np.uint64(steps)
         self.most = model.most_neighbours
         self._neighbours = np.zeros((model.modes + 1, model.agents), dtype=np.int64)  # no graph led to step 0
         for mode in range(model.modes):
             self._neighbours[mode + 1] = [len(model.neighbours(mode, i)) for i in range(model.agents)]
 
-    def fit(self, states: States, index: IntArray) -> BoolArray:
-        """Whether what they heard is empty, or for each neighbour under their graph the step before, or ``LOST``."""
+    def fit(self, states: States, index: IntArray, *, realtime: bool) -> BoolArray:
+        """Whether what they heard is, for each neighbour under their graph, a step that can be, or ``LOST``.
+
+        In lockstep that is the step before, and nothing at all says the same of all neighbours.
+        """
         heard, count = states.heard[index], states.heard_count[index]
         neighbours = self._neighbours[states.mode[index], states.agent[index] - 1]
-        known = (heard == LOST) | (heard == (states.step[index].astype(np.uint64) - np.uint64(1))[:, None])
-        known |= np.arange(self.most) >= count[:, None]
-        return np.asarray((count == 0) | ((count == neighbours) & known.all(axis=1)))
+        if realtime:
+            possible = heard <= self._last
+        else:
+            possible = heard == (states.step[index].astype(np.uint64) - np.uint64(1))[:, None]
+        known = (heard == LOST) | possible | (np.arange(self.most) >= count[:, None])
+        fits = (count == neighbours) & known.all(axis=1)
+        return np.asarray(fits if realtime else fits | (count == 0))
 
 
 def _out_of_order(states: States, index: IntArray) -> int:

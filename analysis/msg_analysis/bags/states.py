@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from msg_analysis.bags.cdr import LITTLE_ENDIAN, RUN_SIZE, AgentState, CdrError
+from msg_analysis.bags.cdr import LITTLE_ENDIAN, RUN_SIZE, SECOND, AgentState, CdrError
 from msg_analysis.bags.mcapfile import Batch
 from msg_analysis.types import AnyArray, FloatArray, IntArray
 
@@ -19,6 +19,8 @@ def _layout(replicas: int, heard: int) -> np.dtype[np.void]:
     longer = 8 * heard
     fields = {
         "header": ("V4", 0),
+        "seconds": ("<i4", 4),
+        "nanoseconds": ("<u4", 8),
         "frame_id": ("V5", 12),
         "run": (f"V{RUN_SIZE}", 17),
         "agent": ("<u4", 36),
@@ -50,6 +52,7 @@ class States:
     state : (messages, replicas)
     heard_count : (messages,) length of ``heard``
     heard : (messages, D) its first D entries; 0 beyond its end
+    stamp : (messages,) [ns]
     """
 
     position: IntArray
@@ -59,6 +62,7 @@ class States:
     state: FloatArray
     heard_count: IntArray
     heard: AnyArray
+    stamp: IntArray
 
 
 @dataclass(slots=True)
@@ -126,7 +130,8 @@ class StateColumns:
         agent, mode = table["agent"].astype(np.int64), table["mode"].astype(np.int64)
         step = np.minimum(table["step"], np.uint64(2**63 - 1)).astype(np.int64)
         count, heard = table["heard_count"].astype(np.int64), table["heard"].astype(np.uint64)
-        states = States(position, agent, step, mode, table["state"].astype(np.float64), count, heard)
+        stamp = table["seconds"].astype(np.int64) * SECOND + table["nanoseconds"]
+        states = States(position, agent, step, mode, table["state"].astype(np.float64), count, heard, stamp)
         self._columns.setdefault((run, states.state.shape[1]), []).append(states)
 
     def _add_any(self, data: bytes, position: int) -> None:
@@ -137,6 +142,7 @@ class StateColumns:
             return
         table = np.zeros(1, _layout(len(message.state), len(message.heard)))
         table["agent"], table["step"], table["mode"] = message.agent, message.step, message.mode
+        table["seconds"], table["nanoseconds"] = divmod(message.stamp, SECOND)
         table["state"], table["heard"], table["heard_count"] = message.state, message.heard, len(message.heard)
         self._append(message.run, np.array([position]), table)
 
@@ -161,13 +167,13 @@ class StateColumns:
             how many entries of ``heard`` are wanted
         """
         none = np.empty(0, np.int64)
-        empty = States(none, none, none, none, np.empty((0, replicas)), none, np.empty((0, 0), np.uint64))
+        empty = States(none, none, none, none, np.empty((0, replicas)), none, np.empty((0, 0), np.uint64), none)
         parts = self._columns.pop((run, replicas), []) or [empty]
         position = np.concatenate([part.position for part in parts])
         order = np.argsort(position, kind="stable")
-        names = ("agent", "step", "mode", "heard_count")
+        names = ("agent", "step", "mode", "heard_count", "stamp")
         columns = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
-        agent, step, mode, heard_count = (column[order] for column in columns)
+        agent, step, mode, heard_count, stamp = (column[order] for column in columns)
         state = np.concatenate([part.state for part in parts])
         heard = np.zeros((len(order), most_heard), np.uint64)
         ends = np.cumsum([len(part.step) for part in parts]).tolist()
@@ -176,4 +182,4 @@ class StateColumns:
             heard[end - len(part.step) : end, :width] = part.heard[:, :width]
         if not np.array_equal(order, np.arange(len(order))):
             state, heard = state[order], heard[order]
-        return States(position[order], agent, step, mode, state, heard_count, heard)
+        return States(position[order], agent, step, mode, state, heard_count, heard, stamp)

@@ -71,15 +71,23 @@ def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
     heard = _heard(trajectory, used)
     sojourns = _sojourns(trajectory)
     sojourn = next(sojourns, None)
-    for k in range(len(trajectory.states)):
-        now = time(k)
-        if sojourn is not None and sojourn.first_step == k:
-            yield "/graph", sojourn.encode(), now
+    made = trajectory.made
+    if made is None:
+        steps = range(len(trajectory.states))
+        made = np.repeat(np.array([time(k) for k in steps])[:, None], experiment.agents, axis=1)
+    for cell in np.argsort(made, axis=None, kind="stable").tolist():
+        k, i = divmod(cell, experiment.agents)
+        now = int(made[k, i])
+        while sojourn is not None and sojourn.stamp <= now:
+            yield "/graph", sojourn.encode(), sojourn.stamp
             sojourn = next(sojourns, None)
         for (topics, states), there, codec in zip(streams, present, codecs, strict=True):
-            for i in np.flatnonzero(there[k]).tolist():
+            if there[k, i]:
                 payload = to_payload(states[k, i])
-                yield topics[i], codec[i].wrap(k, int(used[k, i]) + 1, payload, heard(k, i)), now
+                yield topics[i], codec[i].wrap(k, int(used[k, i]) + 1, payload, heard(k, i), now), now
+    while sojourn is not None:
+        yield "/graph", sojourn.encode(), sojourn.stamp
+        sojourn = next(sojourns, None)
 
 
 def _names(topic: Callable[[str, int], str], agents: int) -> list[str]:
@@ -87,20 +95,28 @@ def _names(topic: Callable[[str, int], str], agents: int) -> list[str]:
 
 
 def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[int]]:
-    """What an agent says at step k that it heard in the step that led there: nothing, where nothing was lost."""
-    lost = trajectory.lost
-    if lost is None:
+    """What an agent says at step k that it heard in the step that led there.
+
+    Nothing in lockstep where nothing was lost, everything in real time.
+    """
+    lost, values = trajectory.lost, trajectory.used
+    if lost is None and values is None:
         return lambda _k, _i: []
     model = build_model(trajectory.record.experiment)
     modes, agents = range(model.modes), range(model.agents)
     counts = [[len(model.neighbours(mode, i)) for i in agents] for mode in modes]
 
-    def heard(k: int, i: int) -> list[int]:
-        if k == 0 or not lost[k - 1, i].any():
+    def listed(k: int, i: int) -> list[int]:
+        if k == 0:
             return []
-        return [LOST if gone else k - 1 for gone in lost[k - 1, i, : counts[used[k, i]][i]].tolist()]
+        neighbours = counts[used[k, i]][i]
+        if values is not None:
+            return [LOST if step < 0 else step for step in values[k - 1, i, :neighbours].tolist()]
+        if lost is None or not lost[k - 1, i].any():
+            return []
+        return [LOST if gone else k - 1 for gone in lost[k - 1, i, :neighbours].tolist()]
 
-    return heard
+    return listed
 
 
 def _sojourns(trajectory: Trajectory) -> Iterator[ActiveGraph]:

@@ -141,23 +141,23 @@ class Experiment:
         """
         lines = []
         if self.run.pace == "realtime":
-            for key, value in (
-                ("broadcast", self.noise.broadcast),
-                ("link", self.noise.link),
-                ("loss", self.noise.loss),
-                ("delay", self.noise.delay),
-            ):
-                if value:
-                    lines.append(problem(f"noise.{key}", value, "not available in real time yet", "use lockstep, or 0"))
-            if self.protocol and not self.protocol.linear:
-                protocol = show(self.protocol.info.name)
-                lines.append(
-                    problem("protocol.name", protocol, "expected a linear one in real time for now", "use lockstep")
-                )
+            lines += self._unavailable_in_real_time()
         elif purpose == "run" and self.noise.delay > 0:
             lines.append(problem("noise.delay", self.noise.delay, "not available in runs yet", "use 0"))
         if self.protocol:
             lines += self.protocol.unavailable(purpose)
+        return lines
+
+    def _unavailable_in_real_time(self) -> list[str]:
+        noise = self.noise
+        lines = [
+            problem(f"noise.{key}", value, "not available in real time yet", "use 0, or run.pace: lockstep")
+            for key in ("broadcast", "link", "loss", "delay")
+            if (value := getattr(noise, key))
+        ]
+        if self.protocol and not self.protocol.linear:
+            name = show(self.protocol.info.name)
+            lines.append(problem("protocol.name", name, "in real time expected a linear one", "use run.pace: lockstep"))
         return lines
 
     def require_available(self, purpose: Purpose = "run") -> None:

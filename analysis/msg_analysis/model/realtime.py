@@ -1,4 +1,9 @@
-"""Real time: when each agent is due, on a timer of its own."""
+"""Real time: when which agent makes which step.
+
+Simulated time runs with the clock of the nodes, ``run.speed`` units a second, from the epoch of the run on. Agent i
+makes its step from x(k) to x(k+1) at (k + phi_i) dt, with the newest values that it has by then. The phases phi_i are
+those of timers of equal period which nobody has synchronised: spread over the period, in an order that the seed draws.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +20,9 @@ if TYPE_CHECKING:
 
 
 def phases(experiment: Experiment) -> FloatArray:
-    """(m,) phi in (0, 1): agent i makes its step k -> k+1 when it is due, at simulated time (k + phi_i) dt.
+    """(m,) phi_i in (0, 1): the part of a step after which agent i makes it.
 
-    Timers of equal period that are not synchronised, spread over it in an order drawn from the seed.
+    They are (rank + 1/2) / m, the ranks a random permutation drawn from the seed of the experiment.
     """
     ranks = generator(experiment.run.seed, Stream.PHASE).permutation(experiment.agents)
     return np.asarray((ranks + 0.5) / experiment.agents)

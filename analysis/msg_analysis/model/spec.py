@@ -267,7 +267,7 @@ class RunSpec(_Section):
         description="lockstep: as fast as it goes, deterministic; realtime: every agent on its own timer",
         examples=["lockstep"],
     )
-    speed: Positive = Field(1.0, description="realtime: simulated time units per second", examples=[1.0])
+    speed: Positive = Field(1.0, description="realtime: simulated time units per second of the clock", examples=[1.0])
     processes: Annotated[
         str | int,
         PlainValidator(_processes, json_schema_input_type=Literal["auto", "one_per_agent"] | Count),

@@ -56,12 +56,12 @@ class Trajectory:
     lost : (N, m, D) whether in the step k -> k+1 agent i did not get the message of its d-th neighbour, ascending,
         under the graph of that step (see ``StepModel.neighbours``); D is the largest number of neighbours. None
         where messages cannot be lost
+    used : (N, m, D) in real time: step of the value of the d-th neighbour, ascending under the graph
+        ``agent_modes[k + 1, i]``, that went into x_i(k+1); -1 where nothing had been heard and the agent's own value
+        took its place, where the state is missing, and beyond the last neighbour. None in lockstep
+    made : (N + 1, m) in real time: simulated time [ns] at which the state was made; 0 for x(0), -1 where missing.
+        Later than that of all values that went into it. None in lockstep
     completeness : the account of what is there
-    used : (N, m, D) in real time: step of the value of the d-th neighbour, ascending, under the graph that the agent
-        used (``agent_modes``), that went into x_i(k+1); -1 where nothing had been heard of it yet, and where there is
-        no such neighbour. None in lockstep
-    made : (N + 1, m) in real time: when x_i(k) was made [ns of simulated time]; 0 for x(0), -1 where missing. None in
-        lockstep
     """
 
     record: RunRecord

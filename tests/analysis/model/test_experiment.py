@@ -219,7 +219,9 @@ def test_what_is_not_available_yet_is_listed() -> None:
     noisy = small(noise={"broadcast": 0.1, "link": 0.2, "loss": 0.3, "delay": 2}, run={"pace": "realtime"})
     keys = [f"noise.{key}" for key in ("broadcast", "link", "loss", "delay")]
     assert [line.split(":")[0] for line in noisy.unavailable("predict")] == keys
-    assert noisy.unavailable()[0] == "noise.broadcast: 0.1: not available in real time yet: use lockstep, or 0"
+    assert [line.split(":")[0] for line in noisy.unavailable()] == keys
+    assert noisy.unavailable()[2] == "noise.loss: 0.3: not available in real time yet: use 0, or run.pace: lockstep"
+    small(run={"pace": "realtime", "speed": 5}).require_available()
     with pytest.raises(NotAvailableError, match=r"noise\.delay: 2"):
         noisy.require_available()
     small(run={"pace": "realtime"}).require_available()

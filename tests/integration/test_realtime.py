@@ -1,0 +1,160 @@
+"""Networks in real time: every agent on its own timer, with the newest values that it has.
+
+What depends on timing is not asserted; what the log says of it must be possible, and the states must be what the law
+makes of it, to the last bit.
+"""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msg_agents.check import check
+from msg_agents.domain import free_domain
+from msg_agents.environment import node_environment
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.model.realtime import phases
+from msg_analysis.model.trajectory import Trajectory
+
+# 100 steps a second for 4 s.
+REALTIME = {"pace": "realtime", "speed": 5, "dt": 0.05, "duration": 20}
+TICK = 20_000_000  # ns by which the clock below moves on, every 10 ms of the wall
+# Publishes a clock of its own: twice as fast as the wall, with a pause of a second after every one and a half.
+CLOCK = f"""
+import time
+import rclpy
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+
+rclpy.init()
+node = rclpy.create_node("clock", enable_rosout=False)
+publisher = node.create_publisher(Clock, "/clock", 10)
+for tick in range(100_000):
+    publisher.publish(Clock(clock=Time(nanoseconds=1000_000_000_000 + tick * {TICK}).to_msg()))
+    time.sleep(1.0 if tick % 150 == 149 else 0.01)
+"""
+
+
+def assert_possible(trajectory: Trajectory) -> None:
+    """Complete, equal to its replay, and stamped as it can be."""
+    assert trajectory.completeness.complete
+    assert trajectory.completeness.duplicates == 0
+    assert trajectory.completeness.out_of_order == 0
+    assert trajectory.completeness.refused == {}
+    outcome = check(trajectory)
+    assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, trajectory.states[..., 0].size)
+    experiment, used, made = trajectory.record.experiment, trajectory.used, trajectory.made
+    assert used is not None
+    assert made is not None
+    assert (made[0] == 0).all()
+    assert (np.diff(made, axis=0) > 0).all()
+    due = (np.arange(experiment.steps)[:, None] + phases(experiment)) * experiment.step_length * 1e9
+    assert (made[1:] >= due - 1).all()
+    assert (used <= experiment.steps).all()
+    assert (used >= 0).any()
+    assert not np.isnan(trajectory.states).any()
+
+
+@contextmanager
+def clock(domain: int) -> Iterator[None]:
+    process = subprocess.Popen([sys.executable, "-c", CLOCK], env=node_environment(domain))
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.parametrize("processes", ["one_per_agent", 2])
+def test_five_agents(network: Any, processes: Any) -> None:
+    result = network.run(network.experiment(run={**REALTIME, "processes": processes}))
+    assert result.failures == []
+    assert_possible(result.trajectory)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"problem": "tracking", "leaders": {"agents": [1, 4], "gain": "inf", "reference": 2.0}},
+        {
+            "time": "discrete",
+            "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
+            "noise": {"process": [[1.0 if i == j else 0.3 / (1 + i + 2 * j) for j in range(5)] for i in range(5)]},
+            "run": {"dt": 1, "duration": 200, "speed": 100},
+        },
+    ],
+    ids=["grounded", "discrete, correlated"],
+)
+def test_other_laws(network: Any, changes: dict[str, Any]) -> None:
+    run = {**REALTIME, "duration": 10, "processes": 1, **changes.get("run", {})}
+    result = network.run(network.experiment(**{**changes, "run": run}))
+    assert result.failures == []
+    assert_possible(result.trajectory)
+
+
+def test_under_a_clock_of_somebody_else(network: Any) -> None:
+    """All stamps are ticks of that clock, but for the nanoseconds by which what comes out of something is later."""
+    speed = 2.5
+    what = network.experiment(run={**REALTIME, "speed": speed, "duration": 20, "processes": 2})
+    with free_domain() as domain, clock(domain):
+        result = network.run(what, domain=domain, use_sim_time=True)
+    assert result.failures == []
+    assert_possible(result.trajectory)
+    assert (result.trajectory.made % round(TICK * speed) < 10_000).all()
+
+
+@pytest.mark.parametrize("option", [["--use-sim-time"], ["--ros-args", "-p", "use_sim_time:=true"]], ids=" ".join)
+def test_without_a_clock(network: Any, option: list[str]) -> None:
+    prepare = network.start("prepare", network.file(run=REALTIME))
+    file = network.directory / "run.json"
+    file.write_text(prepare.communicate(timeout=60)[0])
+    with free_domain() as domain:
+        agents = [part for number in "12345" for part in ("--agent", number)]
+        node = network.start("agent", file, *agents, "--discovery-timeout", "2", *option, ROS_DOMAIN_ID=str(domain))
+        stdout, stderr = node.communicate(timeout=60)
+    assert (node.returncode, stdout) == (2, ""), stderr
+    assert "had not found: a publisher of /clock." in stderr
+
+
+def test_killed_and_back(network: Any, repetition: int) -> None:
+    """An agent and the switcher are killed; whoever takes over keeps to the epoch and catches up."""
+    rng = random.Random(f"realtime {repetition}")
+    what = network.experiment(run={**REALTIME, "duration": 50, "replicas": 16, "processes": 3})
+
+    def kill() -> None:
+        network.wait_until_moving()
+        for kind in ("agent", "switcher"):
+            time.sleep(rng.uniform(0.0, 1.0))
+            victims = network.wait_for(lambda kind=kind: network.processes(kind), 30, f"a living {kind}")
+            rng.choice(victims).kill()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    result = network.run(what, restarts=3)
+    killer.join()
+    assert result.failures == []
+    assert len(result.restarts) == 2
+    assert_possible(result.trajectory)
+
+
+def test_two_runs_at_the_same_time(network: Any) -> None:
+    """They neither hear nor overwrite each other, whatever their verdicts."""
+    file, out = network.file(run={**REALTIME, "processes": 1}), network.directory / "runs"
+    runs = [network.start("run", file, "--out", out, "--seed", seed) for seed in ("1", "2")]
+    errors = [run.communicate(timeout=100)[1] for run in runs]
+    assert not any("Traceback" in text or "failed" in text for text in errors), errors
+    bags = sorted(Path(directory) for directory in out.iterdir())
+    trajectories = [read_bag(bag) for bag in bags]
+    assert {trajectory.record.experiment.run.seed for trajectory in trajectories} == {1, 2}
+    for trajectory in trajectories:
+        assert_possible(trajectory)
