@@ -42,8 +42,10 @@ test: setup ## Run all tests
 test-fast: setup ## Run the tests that start no network
 	$(BIN)/python -m pytest -m "not integration"
 
-stress: setup ## Repeat every random fault 20 times: about an hour and a half
-	STRESS=20 $(BIN)/python -m pytest tests/integration/test_kill.py tests/integration/test_restart.py tests/integration/test_faults.py
+STRESS ?= 20
+
+stress: setup ## Repeat every random fault 20 times (STRESS=N: N times): about an hour
+	STRESS=$(STRESS) $(BIN)/python -m pytest --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py)
 
 lint: setup ## Check style and types
 	$(BIN)/ruff check

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from msg_agents_interfaces.msg import AgentState as AgentStateMsg
 from rclpy.publisher import Publisher
 
-from msg_agents.checkpoint import Checkpoint
-from msg_agents.health import Pace
+from msg_agents.checkpoint import Checkpoint, longest_heard
 from msg_agents.network import RECORDER
-from msg_agents.node import NetworkNode, agent_name, longest_heard, state_topic, truth_topic
+from msg_agents.node import NetworkNode, agent_name, state_topic, truth_topic
+from msg_agents.pace import Pace
 from msg_agents.qos import STREAM
 from msg_analysis.bags.cdr import ActiveGraph, StateCodec, StateFrame, with_state
 from msg_analysis.errors import InputError
@@ -24,7 +24,7 @@ from msg_analysis.model.step import Wiring
 if TYPE_CHECKING:
     from msg_agents.group import AgentGroup
 
-NOT_FINITE = "a state that is not finite"
+NOT_FINITE = "not finite"
 
 
 class Agent(NetworkNode):
@@ -105,10 +105,10 @@ class Agent(NetworkNode):
 
     def begin(self) -> None:
         """Publish x(0), or, after another process, all that may have been under way when that one went."""
-        if self._law.step:
+        if self._published.found:
             self._repeat(0)
             self._ask_again()
-        else:
+        if not self._law.step:
             self._publish_state(0)
         self._report()
 

@@ -11,14 +11,28 @@ import os
 import struct
 from pathlib import Path
 
+from msg_agents.synchronizer import AGAIN
 from msg_analysis.errors import InputError
+from msg_analysis.model.record import RunRecord
 
-MOST, LEAST, ROOM = 6000, 256, 1 << 24
+MOST, LEAST, ROOM = AGAIN, 256, 1 << 24
 """States kept of each agent: as many as find room [bytes], between these. More than the 5,000 that a reader may be
 behind (what the middleware keeps of a writer), where that is possible; and always more than agents may be apart."""
 
 # Length of the message, and step + 1, written after it: 0 or an older step's mark until it is whole.
 _MARK = struct.Struct("<QQ")
+
+
+def longest_heard(record: RunRecord) -> int:
+    """Most steps that ``heard`` of a state message can list in a run."""
+    experiment = record.experiment
+    return experiment.agents - 1 if experiment.noise.loss or experiment.run.pace == "realtime" else 0
+
+
+def room_for(size: int) -> int:
+    """Bytes of the file of an agent whose longest message has so many."""
+    slot = size + _MARK.size
+    return slot * max(LEAST, min(MOST, ROOM // slot))
 
 
 class Checkpoint:
@@ -29,16 +43,21 @@ class Checkpoint:
     path : of the file; made if there is none. None: in memory, for this process only
     size : bytes of the longest message
 
+    Attributes
+    ----------
+    found : whether the file was there: some process has been here before
+
     Raises
     ------
-    InputError : the file is there and of another size
+    InputError : the file is there and of another size, or there is no room for it
     """
 
     def __init__(self, path: Path | None, size: int) -> None:
+        self.found = False
         self._size = size
         self._slot = size + _MARK.size
-        self._capacity = max(LEAST, min(MOST, ROOM // self._slot))
-        total = self._slot * self._capacity
+        total = room_for(size)
+        self._capacity = total // self._slot
         if path is None:
             self._map = mmap.mmap(-1, total)
             return
@@ -49,8 +68,15 @@ class Checkpoint:
                 raise InputError(
                     f"{path}: {found} bytes, expected {total}: it is of another run: remove it, or name another place"
                 )
-            os.truncate(descriptor, total)
+            self.found = bool(found)
+            # All of it now: a disk that is full later would kill whoever writes to the map.
+            os.posix_fallocate(descriptor, 0, total)
             self._map = mmap.mmap(descriptor, total)
+        except OSError as error:
+            raise InputError(
+                f"{path}: no room for {total} bytes ({error.strerror}): name another place, or let nobody be started "
+                "again (--restarts 0)"
+            ) from error
         finally:
             os.close(descriptor)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import msg_agents
-from msg_agents.environment import DISCOVERY_TIMEOUT
+from msg_agents.environment import DISCOVERY_TIMEOUT, RESTARTS
 from msg_analysis.console import CommandGroup, examples, result_console
 
 if TYPE_CHECKING:
@@ -58,9 +58,9 @@ def main() -> None:
 @click.option(
     "--restarts",
     type=click.IntRange(0),
-    default=0,
+    default=RESTARTS,
     show_default=True,
-    help="How often agents or the switcher may be killed and are started again.",
+    help="How often, in all, agents or the switcher are started again when they were killed.",
 )
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own.")
 @click.option("--use-sim-time", is_flag=True, help=USE_SIM_TIME_HELP)
@@ -84,6 +84,7 @@ def run(
 ) -> None:
     """Run EXPERIMENT as a network of processes, record it, and compare the record with the theory."""
     from rich.console import Console
+    from rich.text import Text
 
     from msg_agents.runner import conclude, run_network
 
@@ -100,10 +101,9 @@ def run(
             restarts=restarts,
             use_sim_time=use_sim_time,
             on_progress=on_progress,
+            on_note=lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True),
             environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
         )
-    for line in result.restarts:
-        click.echo(f"{click.style('note:', fg='yellow', bold=True)} {line}", err=True)
     for line in result.failures:
         click.echo(f"{click.style('failed:', fg='red', bold=True)} {line}", err=True)
     conclude(result)
@@ -127,6 +127,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         "rate": result.rate,
         "wall_time": result.wall_time,
         "restarts": result.restarts,
+        "strangers": result.strangers,
         "failures": result.failures,
     }
     if result.bag is not None and result.comparison is not None:
@@ -240,6 +241,7 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
         ),
         click.option("--use-sim-time", is_flag=True, help=USE_SIM_TIME_HELP),
         click.option("--lifeline", type=int, hidden=True),
+        click.option("--account", type=click.Path(path_type=Path), hidden=True),
     ):
         command = option(command)
     return command
@@ -290,10 +292,14 @@ def agent(
 
     def nodes() -> list[NetworkNode]:
         from msg_agents.group import AgentGroup
+        from msg_agents.node import agent_name
+        from msg_agents.succession import enter, succeed
 
         indices = [number - 1 for number in agents]
         model, directory = build_model(record.experiment), _make(checkpoint)
+        successions = succeed(directory, map(agent_name, indices))
         group = AgentGroup(record=record, model=model, agents=indices, readers=readers, checkpoints=directory)
+        enter(successions, group.nodes[0])
         return list(group.nodes)
 
     _run_nodes(nodes, record, **options)
@@ -317,12 +323,15 @@ def switcher(
             os.write(status, json.dumps(list(steps)).encode() + b"\n")
 
     def nodes() -> list[NetworkNode]:
+        from msg_agents.succession import enter, succeed
         from msg_agents.switcher import SWITCHERS
 
-        model = build_model(record.experiment)
-        directory = _make(checkpoint)
+        model, directory = build_model(record.experiment), _make(checkpoint)
+        successions = succeed(directory, ["switcher"])
         kind = SWITCHERS[record.experiment.run.pace]
-        return [kind(record=record, model=model, readers=list(readers), on_progress=report, checkpoints=directory)]
+        node = kind(record=record, model=model, readers=list(readers), on_progress=report, checkpoints=directory)
+        enter(successions, node)
+        return [node]
 
     _run_nodes(nodes, record, **options)
 
@@ -349,6 +358,7 @@ def _run_nodes(
     lifeline: int | None,
     discovery_timeout: float,
     use_sim_time: bool,
+    account: Path | None,
 ) -> None:
     from msg_agents.process import hold_lifeline, run_nodes
 
@@ -362,6 +372,7 @@ def _run_nodes(
         discovery_timeout=discovery_timeout,
         throughput=throughput,
         use_sim_time=use_sim_time,
+        account=account,
     ):
         sys.exit(INCOMPLETE)
 

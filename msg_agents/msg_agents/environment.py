@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 
 LOOPBACK_PROFILE = Path(__file__).with_name("loopback.xml")
+MOST_PARTICIPANTS = 100  # of a domain that find each other on one machine: maxInitialPeersRange of loopback.xml
+RESTARTS = 3  # of killed processes in a run, if nothing else is said
 DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other, in small networks
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
 

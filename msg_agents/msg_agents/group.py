@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,9 +11,10 @@ from rclpy.publisher import Publisher
 
 from msg_agents.agent import Agent
 from msg_agents.lockstep import LockstepAgent
-from msg_agents.node import GRAPH_TOPIC, OTHER_RUN, PROGRESS_TOPIC, RESEND_TOPIC
+from msg_agents.node import GRAPH_TOPIC, OTHER_RUN, PROGRESS_TOPIC, RESEND_TOPIC, UNDECODABLE
 from msg_agents.qos import LATCHED
 from msg_agents.realtime import RealtimeAgent
+from msg_agents.synchronizer import AGAIN, Refusal
 from msg_agents.turns import Turns
 from msg_analysis.bags.cdr import ActiveGraph, CdrError
 from msg_analysis.model.record import RunRecord
@@ -82,6 +81,7 @@ class AgentGroup:
         self._host.host(self.nodes)
         self._progress = self._host.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
         self._resend: Publisher | None = None
+        self._sojourns: dict[int, tuple[int, int, int]] = {}  # taken: what they said, by sequence number
         self._host.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._receive_graph, LATCHED, raw=True)
         self._host.create_subscription(ProgressMsg, RESEND_TOPIC, self._receive_resend, LATCHED, raw=True)
         self._host.leave_at_end(self.nodes)
@@ -90,9 +90,7 @@ class AgentGroup:
         self._host.executor.create_task(callback)
 
     def fail(self, error: Exception) -> None:
-        """End the process because an agent cannot go on. Why is in full in what the process prints, its log."""
-        if not self._host.done.done():
-            traceback.print_exception(error, file=sys.stderr)
+        """End the process because an agent cannot go on."""
         for agent in self.nodes:
             agent.fail(error)
 
@@ -115,14 +113,20 @@ class AgentGroup:
     def _receive_graph(self, data: bytes) -> None:
         try:
             graph = ActiveGraph.decode(data)
-        except CdrError as error:
-            self._host.refuse(str(error), GRAPH_TOPIC)
+        except CdrError:
+            self._host.refuse(UNDECODABLE, GRAPH_TOPIC)
             return
         if graph.run != self._host.run:
             self._host.refuse(OTHER_RUN, GRAPH_TOPIC)
             return
         # Agents that take over are at different steps: what is new to one may be known to another.
         reasons = {agent.learn(graph) for agent in self.nodes}
+        claim = (graph.mode, graph.first_step, graph.last_step)
+        if None in reasons:
+            self._sojourns[graph.sequence] = claim
+            self._sojourns.pop(graph.sequence - AGAIN, None)
+        elif self._sojourns.get(graph.sequence, claim) != claim:
+            reasons = {Refusal.CONTRADICTION}
         for reason in reasons:
             if reason:
                 self._host.refuse(reason, GRAPH_TOPIC)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from msg_agents.account import write_account
 from msg_agents.timers import every
 
 DIAGNOSTICS_TOPIC = "/diagnostics"
 PERIOD = 1.0  # s
-PATIENCE = 5.0  # s
 
 
 @dataclass(slots=True)
@@ -31,10 +31,11 @@ class Health:
     waiting: bool = False
     values: dict[str, str] = field(default_factory=dict)
 
-    def to_status(self, node: Node, refused: Mapping[str, int], repeated: int) -> DiagnosticStatus:
+    def to_status(self, node: Node, refused: Mapping[tuple[str, str], int], repeated: int) -> DiagnosticStatus:
         """The message. Refused messages are a warning: somebody else is on our topics."""
         warn = self.waiting or bool(refused)
-        values = self.values | {f"refused: {reason}": str(count) for reason, count in refused.items()}
+        counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in refused.items()}
+        values = self.values | counts
         if repeated:
             values["received again"] = str(repeated)
         return DiagnosticStatus(
@@ -52,46 +53,28 @@ class Reporter:
     Parameters
     ----------
     nodes : at least one; with a method ``health() -> Health`` and counters ``refused`` and ``repeated``
+    account : file for whoever started the process: what its nodes have refused, and what they wait for
     """
 
-    def __init__(self, nodes: Sequence[Node]) -> None:
+    def __init__(self, nodes: Sequence[Node], account: Path | None = None) -> None:
         self._nodes = nodes
+        self._account = account
+        self._waiting: dict[str, str] = {}
         self._publisher = nodes[0].create_publisher(DiagnosticArray, DIAGNOSTICS_TOPIC, 10)
         every(nodes[0], PERIOD, self._report)
 
     def _report(self) -> None:
+        healths = [(node, node.health()) for node in self._nodes]
         array = DiagnosticArray(
-            status=[node.health().to_status(node, node.refused, node.repeated) for node in self._nodes]
+            status=[health.to_status(node, node.refused, node.repeated) for node, health in healths]
         )
         array.header.stamp = self._nodes[0].get_clock().now().to_msg()
         self._publisher.publish(array)
+        self._waiting = {node.get_name(): health.message if health.waiting else "" for node, health in healths}
+        self.keep_account()
 
-
-class Pace:
-    """Looks at a step counter now and then.
-
-    Attributes
-    ----------
-    rate : steps per second between the last two looks
-    stalled : s for which there has been no step; 0.0 if there was one since the last look
-    """
-
-    def __init__(self) -> None:
-        self._step, self._time = 0, time.monotonic()
-        self._patience = PATIENCE
-        self.rate = self.stalled = 0.0
-
-    def look(self, step: int) -> bool:
-        """Whether it is time to complain: after ``PATIENCE`` s without a step, and then ever more rarely."""
-        now = time.monotonic()
-        elapsed, made = now - self._time, step - self._step
-        self._step, self._time = step, now
-        self.rate = made / elapsed if elapsed > 0.0 else 0.0
-        if made:
-            self.stalled, self._patience = 0.0, PATIENCE
-            return False
-        self.stalled += elapsed
-        if self.stalled < self._patience:
-            return False
-        self._patience = 2.0 * self.stalled
-        return True
+    def keep_account(self) -> None:
+        """Write the account, whole or not at all."""
+        if self._account is not None:
+            refused = [(node.get_name(), *what, count) for node in self._nodes for what, count in node.refused.items()]
+            write_account(self._account, refused, self._waiting)

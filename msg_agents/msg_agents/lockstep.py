@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
 from msg_agents.agent import NOT_FINITE, Agent
 from msg_agents.health import Health
-from msg_agents.node import OTHER_RUN, state_topic
+from msg_agents.node import state_topic, why_not
 from msg_agents.synchronizer import WINDOW, Synchronizer
 from msg_analysis.bags.cdr import ActiveGraph
 from msg_analysis.model.payload import all_finite
@@ -50,7 +52,9 @@ class LockstepAgent(Agent):
         if not pace.stalled:
             return Health(f"at step {step}", values=values)
         waiting = self._synchronizer.waiting_for()
-        if overdue:
+        if overdue and step == 0 and self.get_name() in self.namesakes():
+            self._group.fail(self.clash([self.get_name()], pace.stalled))  # the others have begun without this one
+        elif overdue:
             self.get_logger().warning(f"no step for {pace.stalled:.0f} s at step {step}: waiting for {waiting}")
             self._ask_again()
         return Health(f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting})
@@ -61,12 +65,12 @@ class LockstepAgent(Agent):
         offer = self._synchronizer.offer
         ready = self._synchronizer.ready
         ask = self._turns.ask
-        topic = state_topic(peer)
+        topic, replicas = state_topic(peer), self.record.experiment.run.replicas
 
         def receive(data: bytes) -> None:
             frame = unwrap(data)
             if frame is None or frame[0] != peer + 1:
-                self.refuse(OTHER_RUN, topic)
+                self.refuse(why_not(data, self.record, peer, replicas), topic)
                 return
             state = frame[3]
             reason = offer(peer, frame[1], state) if all_finite(state) else NOT_FINITE
@@ -94,6 +98,8 @@ class LockstepAgent(Agent):
         try:
             self._advance()
         except ProtocolError as error:
+            if not self.done.done():
+                traceback.print_exception(error, file=sys.stderr)  # in full in what the process prints, its log
             self._group.fail(error)
 
     def _advance(self) -> None:

@@ -11,7 +11,7 @@ from msg_agents.environment import DISCOVERY_TIMEOUT
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import Experiment
 
-RECORDER = "recorder"
+RECORDER, SWITCHER = "recorder", "switcher"
 SMALL = 8
 """Agents up to which each one gets a process of its own, and which a process has at least in larger networks."""
 MOST_PROCESSES = 90
@@ -107,5 +107,5 @@ def plan_network(
         first, last = agents[0] + 1, agents[-1] + 1
         name = f"agent_{first}" if first == last else f"agents_{first}_to_{last}"
         plans.append(ProcessPlan(name, ("agent", str(run_file), *numbers, *options), agents, resumes))
-    plans.append(ProcessPlan("switcher", ("switcher", str(run_file), *options), resumes=resumes))
+    plans.append(ProcessPlan(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
     return plans

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
@@ -15,9 +16,11 @@ from rclpy.time_source import CLOCK_TOPIC
 
 from msg_agents.errors import RCLError
 from msg_agents.health import Health
+from msg_agents.network import RECORDER, SWITCHER
 from msg_agents.qos import LATCHED
 from msg_agents.synchronizer import Refusal
-from msg_analysis.bags.cdr import CdrError, Progress, StepClock
+from msg_analysis.bags.cdr import AgentState, CdrError, Progress, StepClock
+from msg_analysis.errors import InputError
 from msg_analysis.model.record import RunRecord
 
 EXPERIMENT_TOPIC = "experiment"
@@ -27,7 +30,10 @@ END_TOPIC = "end"
 EPOCH_TOPIC = "epoch"
 RESEND_TOPIC = "resend"
 NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
-OTHER_RUN = "of another run, agent or layout"
+OTHER_RUN, UNDECODABLE = "other run", "undecodable"
+UNKNOWN_AGENT, OTHER_AGENT = "unknown agent", "of another agent than its topic"
+WRONG_LENGTH, OTHER_LAYOUT = "wrong length", "not in the layout of the agents"
+OUT_OF_RANGE = "step out of range"
 RECORDED = "recorded already"
 REPEATS = {Refusal.OLD, Refusal.KNOWN, RECORDED}
 
@@ -47,10 +53,25 @@ def truth_topic(agent: int) -> str:
     return f"{agent_name(agent)}/truth"
 
 
-def longest_heard(record: RunRecord) -> int:
-    """Most steps that ``heard`` of a state message can list in a run."""
-    experiment = record.experiment
-    return experiment.agents - 1 if experiment.noise.loss or experiment.run.pace == "realtime" else 0
+def why_not(data: bytes, record: RunRecord, agent: int, length: int) -> str:
+    """What is wrong with a message that the readers of a topic could not take.
+
+    Parameters
+    ----------
+    agent : whose topic it is (index from 0)
+    length : of the states there
+    """
+    try:
+        message = AgentState.decode(data)
+    except CdrError:
+        return UNDECODABLE
+    if message.run != record.run.bytes:
+        return OTHER_RUN
+    if not 1 <= message.agent <= record.experiment.agents:
+        return UNKNOWN_AGENT
+    if message.agent != agent + 1:
+        return OTHER_AGENT
+    return WRONG_LENGTH if len(message.state) != length else OTHER_LAYOUT
 
 
 class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
@@ -74,20 +95,20 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         self.run = record.run.bytes
         self._step_clock = StepClock(record.experiment.step_length)
         self.done: Future = Future()
-        self.refused: Counter[str] = Counter()
+        self.refused: Counter[tuple[str, str]] = Counter()  # by topic and reason
         self.repeated = 0
         self._leaving: list[NetworkNode] = [self]
 
     def refuse(self, reason: str, topic: str) -> None:
-        """Count a message that is no part of this run; say so the first time.
+        """Count a message that is no part of this run; say so the first time on this topic for this reason.
 
         What is here already is only counted: agents send again what one of them may have missed.
         """
         if reason in REPEATS:
             self.repeated += 1
             return
-        self.refused[reason] += 1
-        if self.refused[reason] == 1:
+        self.refused[topic, reason] += 1
+        if self.refused[topic, reason] == 1:
             self.get_logger().warning(f"refused a message on {topic}: {reason} (further ones are only counted)")
 
     def publish(self, publisher: Publisher, data: bytes) -> None:
@@ -123,6 +144,21 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
             return []
         return [f"a publisher of {CLOCK_TOPIC}"]
 
+    def namesakes(self) -> list[str]:
+        """Names of nodes of this run that more than one node bears."""
+        here = self.get_namespace()
+        count = Counter(name for name, namespace in self.get_node_names_and_namespaces() if namespace == here)
+        names = [*map(agent_name, range(self.record.experiment.agents)), SWITCHER, RECORDER]
+        return [name for name in names if count[name] > 1]
+
+    def clash(self, names: Iterable[str], seconds: float) -> InputError:
+        """The error of a node that has not been alone with these names for some time."""
+        return InputError(
+            f"after {seconds:.0f} s there was still more than one {', '.join(names)} in the same ROS_DOMAIN_ID "
+            f"({os.environ.get('ROS_DOMAIN_ID', '0')}): is this run, or another one, under way there? End it, or "
+            "choose another domain"
+        )
+
     def begin(self) -> None:
         """Everyone has been found: start."""
 
@@ -153,11 +189,14 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         """A Progress message of this run; None (and counted) if it is no such thing."""
         try:
             progress = Progress.decode(data)
-        except CdrError as error:
-            self.refuse(str(error), topic)
+        except CdrError:
+            self.refuse(UNDECODABLE, topic)
             return None
-        if progress.run != self.run or progress.agent > self.record.experiment.agents:
+        if progress.run != self.run:
             self.refuse(OTHER_RUN, topic)
+            return None
+        if progress.agent > self.record.experiment.agents:
+            self.refuse(UNKNOWN_AGENT, topic)
             return None
         return progress
 

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -79,6 +80,7 @@ def run_nodes(
     discovery_timeout: float,
     throughput: bool = True,
     use_sim_time: bool = False,
+    account: Path | None = None,
 ) -> bool:
     """Run nodes in this process until each has done its part.
 
@@ -89,6 +91,7 @@ def run_nodes(
     discovery_timeout : s to wait for the other nodes of the run
     throughput : whether much work in little time counts for more than being woken at once
     use_sim_time : whether the nodes take the time from ``/clock``; as the ROS parameter of that name
+    account : file that says once a second, and at the end, what the nodes have refused and what they wait for
 
     Returns
     -------
@@ -97,7 +100,7 @@ def run_nodes(
     Raises
     ------
     NotFoundError : with the names of who is missing
-    InputError : what a node failed with
+    InputError : what a node failed with, or the names of who is there twice
     """
     # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
     # installed on top, ends the spin between two callbacks.
@@ -106,10 +109,11 @@ def run_nodes(
         prefer_throughput()
     rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
     nodes: Sequence[NetworkNode] = []
+    reporter: Reporter | None = None
     complete = False
     try:
         nodes = make_nodes()
-        Reporter(nodes)
+        reporter = Reporter(nodes, account)
         spinner = make_executor(executor)
         for node in nodes:
             spinner.add_node(node)
@@ -133,6 +137,8 @@ def run_nodes(
     finally:
         for node in nodes:
             node.finish(complete=complete)
+        if reporter:
+            reporter.keep_account()
         _leave(nodes, complete=complete)
     return complete
 
@@ -155,14 +161,26 @@ def _leave(nodes: Sequence[NetworkNode], *, complete: bool) -> None:
 
 
 def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
-    """Wait until the publishers of all nodes have found their readers."""
+    """Wait until the publishers of all nodes have found their readers, and every name belongs to one node only.
+
+    Readers are told by their names. Where two bear the same one, a run might start without the one that belongs to it.
+    """
     deadline = time.monotonic() + timeout
     waiting = list(nodes)
+    warned = False
     while True:
         waiting = [node for node in waiting if not node.found() or node.awaited_clock()]
-        if not waiting:
+        late = time.monotonic() > deadline
+        twice = nodes[0].namesakes() if late or not waiting else []
+        if not waiting and not twice:
             return
-        if time.monotonic() > deadline:
+        if twice and not warned:
+            warned = True
+            names = ", ".join(twice)
+            nodes[0].get_logger().warning(f"there is more than one {names}: waiting until only one is left")
+        if late and twice:
+            raise nodes[0].clash(twice, timeout)
+        if late:
             missing = sorted({name for node in waiting for name in node.awaited() + node.awaited_clock()})
             raise NotFoundError(
                 f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} had not found: "

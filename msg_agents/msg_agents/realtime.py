@@ -11,7 +11,7 @@ from msg_agents_interfaces.msg import Progress as ProgressMsg
 from msg_agents.agent import NOT_FINITE, Agent
 from msg_agents.health import Health
 from msg_agents.newest import NOTHING, Newest
-from msg_agents.node import EPOCH_TOPIC, NOT_AN_AGENT, OTHER_RUN, state_topic
+from msg_agents.node import EPOCH_TOPIC, NOT_AN_AGENT, OTHER_RUN, state_topic, why_not
 from msg_agents.qos import LATCHED
 from msg_agents.schedule import MARGIN, SECOND, Schedule
 from msg_agents.timers import DueTimer
@@ -142,12 +142,12 @@ class RealtimeAgent(Agent):
         """See Agent."""
         unwrap = self._frame.unwrap
         offer = self._newest.offer
-        topic = state_topic(peer)
+        topic, replicas = state_topic(peer), self.record.experiment.run.replicas
 
         def receive(data: bytes) -> None:
             frame = unwrap(data)
             if frame is None or frame[0] != peer + 1:
-                self.refuse(OTHER_RUN, topic)
+                self.refuse(why_not(data, self.record, peer, replicas), topic)
                 return
             state = frame[3]
             reason = offer(peer, frame[1], (state, stamp_ns(data))) if all_finite(state) else NOT_FINITE

@@ -5,37 +5,42 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
 from msg_agents_interfaces.msg import AgentState as AgentStateMsg
 from msg_agents_interfaces.msg import Progress as ProgressMsg
 from std_msgs.msg import String
 
-from msg_agents.checkpoint import MOST
+from msg_agents.checkpoint import longest_heard
 from msg_agents.health import Health
 from msg_agents.node import (
     EXPERIMENT_TOPIC,
     GRAPH_TOPIC,
     NOT_AN_AGENT,
+    OTHER_LAYOUT,
+    OTHER_RUN,
+    OUT_OF_RANGE,
     PROGRESS_TOPIC,
     RECORDED,
+    UNDECODABLE,
+    WRONG_LENGTH,
     NetworkNode,
-    longest_heard,
     state_topic,
     truth_topic,
+    why_not,
 )
 from msg_agents.qos import LATCHED, STREAM
+from msg_agents.synchronizer import AGAIN, Refusal
 from msg_agents.timers import every
-from msg_analysis.bags.cdr import ActiveGraph, AgentState, CdrError, StateFrame, decode_string, stamp_ns
+from msg_analysis.bags.cdr import ActiveGraph, CdrError, StateFrame, decode_string, stamp_ns
 from msg_analysis.bags.schemas import network_topics
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
 from msg_analysis.model.payload import all_finite
 from msg_analysis.model.record import RunRecord
 
-Message = TypeVar("Message", AgentState, ActiveGraph)
-OTHER_RUN, OTHER_AGENT = "of another run", "of another agent than its topic"
+TELLING = {WRONG_LENGTH, OTHER_LAYOUT}
+"""What is wrong with states that are recorded all the same: they are of this run, and the reader of the bag tells."""
 BATCH = 512  # states collected before they are written
 WRITE_PERIOD = 0.1  # s of wall time between two looks at what has been collected, in slow runs and at the end
 FLUSH_PERIOD = 1.0
@@ -68,6 +73,7 @@ class Recorder(NetworkNode):
             for agent in range(experiment.agents)
         ]
         self._known: list[dict[int, int]] = [{} for _ in self._sources]  # step -> hash of what was written
+        self._row = [-1] * len(self._sources)  # newest step up to which all came one after the other
         self._seen: set[bytes] = set()  # all but the states that have been written
         self._pending: list[tuple[int, bytes]] = []  # states collected and not yet written, with their sources
         # Topics whose last message (last state, last sojourn, experiment) has not come.
@@ -109,34 +115,53 @@ class Recorder(NetworkNode):
             agent, topic, layout = self._sources[source]
             frame = layout.unwrap(data)
             if frame is None or frame[0] != agent + 1:  # not what the agents of this run send: have a closer look
-                message = self._decode(AgentState, data, topic)
-                if message is None:
+                reason = why_not(data, self.record, agent, layout.replicas)
+                self.refuse(reason, topic)
+                if reason not in TELLING:
                     continue
-                if message.agent != agent + 1:
-                    self.refuse(OTHER_AGENT, topic)
-                    continue
-            elif self._have(source, frame[1], data):
-                self.refuse(RECORDED, topic)
+            elif objection := self._objection(source, frame[1], data):
+                self.refuse(objection, topic)
                 continue
             write(topic, data, stamp_ns(data))
             if frame is not None and frame[1] == last and all_finite(frame[3]):
                 self._came(topic)
         self._pending.clear()
 
-    def _have(self, source: int, step: int, data: bytes) -> bool:
-        """Whether the very same message has been written: agents send theirs again when one of them was killed."""
-        known, mark = self._known[source], hash(data)
-        if known.get(step) == mark:
-            return True
+    def _objection(self, source: int, step: int, data: bytes) -> str | None:
+        """Why a state is not written; None if it is.
+
+        Agents send theirs again when one of them was killed, none older than ``AGAIN`` steps. Where two say different
+        things of a step, one is forged: both are written, and the reader of the bag takes neither.
+        """
+        known, mark, row = self._known[source], hash(data), self._row[source]
+        before = known.get(step)
+        if before == mark:
+            return RECORDED
+        if step > self._last:
+            return OUT_OF_RANGE
+        if step < row - AGAIN:
+            return Refusal.PAST
+        if 0 <= row < step - AGAIN:
+            return Refusal.FAR
+        if before is not None:
+            self.refuse(Refusal.CONTRADICTION, self._sources[source][1])
+        if step == row + 1:
+            self._row[source] = step
         known[step] = mark
-        if len(known) > 2 * MOST:
-            self._known[source] = {k: v for k, v in known.items() if k > step - MOST}
-        return False
+        if len(known) > 2 * AGAIN:
+            self._known[source] = {k: v for k, v in known.items() if k > step - AGAIN}
+        return None
 
     def _record_graph(self, data: bytes) -> None:
-        graph = self._decode(ActiveGraph, data, GRAPH_TOPIC)
-        if graph is not None:
-            self._write(GRAPH_TOPIC, data, graph.stamp, last=graph.last_step == self._last - 1)
+        try:
+            graph = ActiveGraph.decode(data)
+        except CdrError:
+            self.refuse(UNDECODABLE, GRAPH_TOPIC)
+            return
+        if graph.run != self.run:
+            self.refuse(OTHER_RUN, GRAPH_TOPIC)
+            return
+        self._write(GRAPH_TOPIC, data, graph.stamp, last=graph.last_step == self._last - 1)
 
     def _record_experiment(self, data: bytes) -> None:
         try:
@@ -147,18 +172,6 @@ class Recorder(NetworkNode):
             self._write(EXPERIMENT_TOPIC, data, 0, last=True)
         else:
             self.refuse(OTHER_RUN, EXPERIMENT_TOPIC)
-
-    def _decode(self, kind: type[Message], data: bytes, topic: str) -> Message | None:
-        """The message, if it is one of this run. What is wrong with those of this run, the reader of the bag tells."""
-        try:
-            message = kind.decode(data)
-        except CdrError as error:
-            self.refuse(str(error), topic)
-            return None
-        if message.run != self.run:
-            self.refuse(OTHER_RUN, topic)
-            return None
-        return message
 
     def _write(self, topic: str, data: bytes, time: int, *, last: bool) -> None:
         if data in self._seen:

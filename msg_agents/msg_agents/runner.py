@@ -10,13 +10,16 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from msg_agents.checkpoint import longest_heard, room_for
 from msg_agents.domain import free_domain
-from msg_agents.environment import node_environment
+from msg_agents.environment import RESTARTS, node_environment
 from msg_agents.network import count_processes, plan_network
-from msg_agents.supervisor import Supervisor
+from msg_agents.pace import Pace
+from msg_agents.supervisor import ACCOUNTS, CRASHED, Supervisor
 from msg_agents.workshop import workshop
+from msg_analysis.bags.cdr import StateFrame
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.writer import RECORDING_MARKER
@@ -29,7 +32,6 @@ if TYPE_CHECKING:
     from msg_analysis.inference.compare import Comparison
 
 POLL = 0.05  # s
-CHECKPOINTS = "checkpoints"
 REPORT_FILE, RESULT_FILE = "report.html", "result.json"
 
 
@@ -45,6 +47,7 @@ class RunResult:
     wall_time : s from the first state to the last one
     rate : steps per second of wall time
     restarts : what was killed and started again, one line each
+    strangers : what the nodes refused: "node", "topic", "reason", "count"
     trajectory, comparison : of the bag, if it could be read
     """
 
@@ -54,6 +57,7 @@ class RunResult:
     wall_time: float = 0.0
     rate: float = 0.0
     restarts: list[str] = field(default_factory=list)
+    strangers: list[dict[str, Any]] = field(default_factory=list)
     trajectory: Trajectory | None = None
     comparison: Comparison | None = None
 
@@ -75,9 +79,10 @@ def run_network(
     out: Path | None,
     *,
     domain: int | None = None,
-    restarts: int = 0,
+    restarts: int = RESTARTS,
     use_sim_time: bool = False,
     on_progress: Callable[[int], None] = lambda _: None,
+    on_note: Callable[[str], None] = lambda _: None,
     environment: Mapping[str, str] | None = None,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
@@ -87,9 +92,10 @@ def run_network(
     experiment : what to run
     out : directory in which a new bag is made; None: do not record
     domain : ROS_DOMAIN_ID; a free one is chosen if not given
-    restarts : how often an agent or the switcher may be killed and is started again; once more ends the run
+    restarts : how often, in all, agents or the switcher are started again when they were killed; once more ends the run
     use_sim_time : whether the nodes take the time from ``/clock``, which somebody else publishes in the same domain
     on_progress : called a few times a second with the step that every agent has reached
+    on_note : called with a line about what happens: a restart, a standstill
     environment : changes to the environment of the processes
 
     Returns
@@ -107,21 +113,24 @@ def run_network(
     bag = make_bag_directory(experiment, out.absolute()) if out is not None else None
     result = RunResult(bag)
     try:
-        with workshop() as folder:
+        record = new_record(experiment)
+        longest = StateFrame(record.run.bytes, experiment.width, longest_heard(record)).size
+        keeping = workshop(experiment.agents * room_for(longest)) if restarts else nullcontext()
+        with workshop() as folder, keeping as checkpoints:
             run_file = folder / "run.json"
-            run_file.write_text(new_record(experiment).to_json(), encoding="utf-8")
+            run_file.write_text(record.to_json(), encoding="utf-8")
             with (
                 free_domain() if domain is None else nullcontext(domain) as chosen,
                 _interruptible() as interrupted,
                 Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
             ):
-                checkpoints = folder / CHECKPOINTS if restarts else None
                 supervisor.start(
                     plan_network(experiment, run_file, bag, checkpoints=checkpoints, use_sim_time=use_sim_time)
                 )
-                _watch(supervisor, experiment.steps, result, restarts, interrupted, on_progress)
+                _watch(supervisor, experiment.steps, result, restarts, interrupted, on_progress, on_note)
                 # Before the others are ended: what ends because we end it has not failed.
-                _collect_failures(supervisor, result, interrupted)
+                _collect_failures(supervisor, result, interrupted, restarts)
+            result.strangers = supervisor.account().strangers()
             if bag is not None:
                 _settle(bag, result)
                 _keep_logs(folder, bag / "log", result)
@@ -139,13 +148,17 @@ def _watch(
     restarts: int,
     interrupted: list[int],
     on_progress: Callable[[int], None],
+    on_note: Callable[[str], None],
 ) -> None:
     """Until all have done their part, one has failed for good, or the user has had enough."""
     began: float | None = None
-    while not interrupted and _revive(supervisor, result, restarts) and supervisor.running:
+    pace = Pace()
+    while not interrupted and _revive(supervisor, result, restarts, on_note) and supervisor.awaited:
         time.sleep(POLL)
         supervisor.read_status()
         reached = min(supervisor.steps, default=-1)
+        if pace.look(sum(supervisor.steps)) and 0 <= reached < steps:
+            on_note(f"no step for {pace.stalled:.0f} s: {_standstill(supervisor)}")
         if reached < 0:
             continue
         now = time.monotonic()
@@ -157,30 +170,48 @@ def _watch(
         result.rate = min(supervisor.steps, default=0) / result.wall_time
 
 
-def _revive(supervisor: Supervisor, result: RunResult, restarts: int) -> bool:
+def _standstill(supervisor: Supervisor) -> str:
+    """Where it waits, as far as anybody says; a process that says nothing is stopped, or waits for one that is."""
+    words = [f"{node}: {message}" for node, message in sorted(supervisor.account().waiting.items())]
+    silent = [child.plan.name for child in supervisor.silent]
+    if silent:
+        words.append("nothing heard from " + ", ".join(silent))
+    return "; ".join(words) or "nobody says why"
+
+
+def _revive(supervisor: Supervisor, result: RunResult, restarts: int, on_note: Callable[[str], None]) -> bool:
     """Start again who has been killed; False if somebody cannot be."""
     for child in supervisor.failures:
         if not child.resumes or len(result.restarts) >= restarts:
             return False
         step = min((supervisor.steps[i] for i in child.plan.agents), default=-1) if supervisor.steps else -1
         after = f" after step {step}" if step >= 0 else ""
-        result.restarts.append(f"{child.plan.name}: {child.failure}{after}, started again")
+        words = f" ({child.last_words()})" if child.process.returncode == CRASHED else ""
+        result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
+        on_note(result.restarts[-1])
         supervisor.restart(child)
     return True
 
 
-def _collect_failures(supervisor: Supervisor, result: RunResult, interrupted: list[int]) -> None:
+def _collect_failures(supervisor: Supervisor, result: RunResult, interrupted: list[int], restarts: int) -> None:
     if interrupted:
         result.interrupted = True
         result.failures.append(f"ended by {signal.Signals(interrupted[0]).name}")
     for child in supervisor.failures:
         words = child.last_words()
-        result.failures.append(f"{child.plan.name}: {child.failure}" + (f": {words}" if words else ""))
+        line = f"{child.plan.name}: {child.failure}" + (f": {words}" if words else "")
+        if child.resumes and result.restarts:
+            counts = {c.plan.name: c.number - 1 for c in supervisor.children if c.number > 1}
+            listed = ", ".join(
+                f"{name} {times} times" if times > 1 else f"{name} once" for name, times in counts.items()
+            )
+            line += f". Not started again: all restarts are used up (--restarts {restarts}): {listed}"
+        result.failures.append(line)
 
 
 def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
     try:
-        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(CHECKPOINTS))
+        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS))
     except OSError as error:
         # Of a tree, the error is a list of (from, to, why).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)
@@ -233,4 +264,5 @@ def conclude(result: RunResult) -> None:
     if result.trajectory is None or result.bag is None:
         return
     result.comparison = compare(result.trajectory)
-    write_report(result.comparison, result.trajectory, result.bag / REPORT_FILE)
+    report = result.bag / REPORT_FILE
+    write_report(result.comparison, result.trajectory, report, restarts=result.restarts, strangers=result.strangers)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -15,12 +16,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from msg_agents.network import RECORDER, ProcessPlan
+from msg_agents.account import Account, read_accounts
+from msg_agents.network import RECORDER, SWITCHER, ProcessPlan
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
 """Signals and the seconds that a process has to obey each."""
 
 POLL = 0.02  # s
+SILENCE = 3.0  # s; accounts are kept once a second
+CRASHED = 1  # exit code of Python after an exception that nobody expected
+ACCOUNTS = "accounts"
 
 
 @dataclass(slots=True)
@@ -32,16 +37,32 @@ class Child:
     plan : what it is
     process : the running process
     log : file with what it printed
+    number : how many times it has been started
     """
 
     plan: ProcessPlan
     process: subprocess.Popen[bytes]
     log: Path
+    number: int = 1
 
     @property
     def running(self) -> bool:
         """Whether it has not ended yet."""
         return self.process.poll() is None
+
+    @property
+    def age_of_account(self) -> float:
+        """Seconds since it has last said how it is."""
+        path = self.log.parent / ACCOUNTS / f"{self.plan.name}.{self.number}.json"
+        try:
+            return time.time() - path.stat().st_mtime
+        except OSError:
+            return math.inf
+
+    @property
+    def ended_well(self) -> bool:
+        """Whether it has done its part."""
+        return self.process.poll() is not None and self.failure is None
 
     @property
     def failure(self) -> str | None:
@@ -56,9 +77,15 @@ class Child:
 
     @property
     def resumes(self) -> bool:
-        """Whether it was killed and can take over from itself. An error of its own would only come again."""
+        """Whether it is worth while to start it again, and it then takes over from itself.
+
+        It is when it was killed, by whomever. A crash of its own most probably comes again: one more try. Bad input,
+        a node that was not found or an order to stop remain what they are.
+        """
         code = self.process.poll()
-        return self.plan.resumes and code is not None and code < 0
+        if not self.plan.resumes or code is None:
+            return False
+        return code < 0 or (code == CRASHED and self.number == 1)
 
     def last_words(self) -> str:
         """The last line that it printed."""
@@ -91,6 +118,7 @@ class Supervisor:
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _status: tuple[int, int] = field(default=(-1, -1), init=False)
     _pending: bytes = field(default=b"", init=False)
+    _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts
 
     def start(self, plans: Sequence[ProcessPlan]) -> None:
         """Start all processes."""
@@ -101,13 +129,16 @@ class Supervisor:
 
     def restart(self, child: Child) -> None:
         """Start again what has been killed."""
-        self.children[self.children.index(child)] = self._start(child.plan)
+        self.children[self.children.index(child)] = self._start(child.plan, child.number + 1)
 
-    def _start(self, plan: ProcessPlan) -> Child:
+    def _start(self, plan: ProcessPlan, number: int = 1) -> Child:
         log = self.logs / f"{plan.name}.log"
-        options = ["--lifeline", str(self._lifeline[0])]
+        account = self.logs / ACCOUNTS / f"{plan.name}.{number}.json"
+        account.parent.mkdir(exist_ok=True)
+        self._accounts.append(account)
+        options = ["--lifeline", str(self._lifeline[0]), "--account", str(account)]
         descriptors = [self._lifeline[0]]
-        if plan.name == "switcher":
+        if plan.name == SWITCHER:
             options += ["--status", str(self._status[1])]
             descriptors.append(self._status[1])
         with log.open("ab") as output:
@@ -120,7 +151,7 @@ class Supervisor:
                 pass_fds=descriptors,
                 start_new_session=True,
             )
-        return Child(plan, process, log)
+        return Child(plan, process, log, number)
 
     def read_status(self) -> None:
         """Take in what the switcher has reported since the last call."""
@@ -136,10 +167,34 @@ class Supervisor:
         """Those that have not ended."""
         return [child for child in self.children if child.running]
 
+    def account(self) -> Account:
+        """What the nodes have refused, and what they wait for."""
+        return read_accounts(self._accounts)
+
+    @property
+    def silent(self) -> list[Child]:
+        """Those that run and have kept no account lately."""
+        return [child for child in self.running if child.age_of_account > SILENCE]
+
+    @property
+    def over(self) -> bool:
+        """Whether all have done their part: nobody leaves before, and the switcher only after it has said so."""
+        ended = {child.plan.name for child in self.children if child.ended_well}
+        rest = {child.plan.name for child in self.children} - ended
+        return SWITCHER in ended or (bool(ended) and rest == {SWITCHER})
+
+    @property
+    def awaited(self) -> list[Child]:
+        """Those that have not ended and have something to do; who came back after the end has not."""
+        return [child for child in self.running if child.number == 1 or not self.over]
+
     @property
     def failures(self) -> list[Child]:
-        """Those that ended, and not well."""
-        return [child for child in self.children if child.failure]
+        """Those that ended, and not well. Who is killed after the end has done its part, except for the recorder."""
+        failed = [child for child in self.children if child.failure]
+        if failed and self.over:
+            return [child for child in failed if child.plan.name == RECORDER]
+        return failed
 
     def stop(self) -> None:
         """End everybody: the agents and the switcher first, so that the recorder gets all that they sent."""

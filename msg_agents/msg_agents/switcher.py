@@ -48,6 +48,7 @@ BEHIND = 5000
 
 REPORT_PERIOD = 0.1  # s
 
+NAMESAKE = "a second node of this name"
 HEAD_START = SECOND // 2
 """ns of the clock from the publication of the epoch to the epoch: by then everybody should know it."""
 
@@ -84,6 +85,7 @@ class Switcher(NetworkNode):
         self._heard = False  # from an agent since the last call of on_progress
         self._recorded = RECORDER not in readers
         self._on_progress = on_progress
+        self._namesakes: set[str] = set()  # at the last look
         self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
         self._expected = [agent_name(i) for i in range(model.agents)] + readers
         self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LATCHED)
@@ -103,6 +105,7 @@ class Switcher(NetworkNode):
 
     def health(self) -> Health:
         """See NetworkNode."""
+        self._look_for_namesakes()
         values = {"step of the slowest agent": str(self._slowest)}
         if self._slowest < 0:
             silent = [agent_name(i) for i, step in enumerate(self._reached) if step < 0]
@@ -112,6 +115,15 @@ class Switcher(NetworkNode):
     def _how(self, values: dict[str, str]) -> Health:
         """How it is once all agents have started; ``values`` are what there is to say anyway."""
         raise NotImplementedError
+
+    def _look_for_namesakes(self) -> None:
+        """Say who is there twice, once it has been seen twice: someone that was killed may not be gone yet."""
+        there = set(self.namesakes())
+        for name in there & self._namesakes:
+            if not self.refused[name, NAMESAKE]:
+                self.refused[name, NAMESAKE] = 1
+                self.get_logger().warning(f"there is a second node called {name}: what only one of them says is taken")
+        self._namesakes = there
 
     def begin(self) -> None:
         """Publish the experiment, to begin with."""

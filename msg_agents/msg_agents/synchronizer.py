@@ -18,16 +18,25 @@ Value = TypeVar("Value")
 WINDOW = 64
 """Steps that an agent may be ahead of a peer. Small enough for a burst to fit a socket's receive buffer."""
 
+AGAIN = 6000
+"""Steps that agents keep, and send again when one of them was killed. What is older nobody sends."""
+
+KEPT = WINDOW
+"""Steps for which a value is kept after its use. Whoever is given another one for the same step notices: one of the two
+is forged, and as the true one may be the second, it comes when its sender, up to a window behind, makes that step."""
+
 
 class Refusal:
     """Why something offered was not taken."""
 
     STRANGER = "not a peer"
     OLD = "a step already done or already here"
+    PAST = "a step long past"
     FAR = "a step that a peer cannot have reached"
     SEQUENCE = "a sojourn out of sequence"
     KNOWN = "a sojourn known already"
     EARLY = "a sojourn before its time"
+    CONTRADICTION = "contradicts an earlier copy"
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +124,10 @@ class Synchronizer(Generic[Value]):
             return Refusal.STRANGER
         if step < self.step or step in buffer:
             # A peer that is behind is heard of here too: its value is of no use, its progress is.
+            if step in buffer and buffer[step] != value:
+                return Refusal.CONTRADICTION
+            if step < self.step - self._window - AGAIN:
+                return Refusal.PAST
             if step <= self._newest[agent]:
                 return Refusal.OLD
             self._newest[agent] = step
@@ -146,7 +159,7 @@ class Synchronizer(Generic[Value]):
         """The step that was ready has been made: move on to x(step + 1)."""
         step = self.step
         for buffer in self._buffers.values():
-            buffer.pop(step, None)
+            buffer.pop(step - KEPT, None)
         self.step = step + 1
         if self._known[0].last <= step:
             self._known.popleft()
@@ -190,5 +203,5 @@ class Synchronizer(Generic[Value]):
 
     @property
     def buffered(self) -> int:
-        """Most values held of any one peer; never more than window + 2."""
-        return max((len(buffer) for buffer in self._buffers.values()), default=0)
+        """Most values held of any one peer for steps to come; never more than window + 2."""
+        return max((sum(k >= self.step for k in buffer) for buffer in self._buffers.values()), default=0)

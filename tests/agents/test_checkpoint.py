@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -79,3 +80,19 @@ def test_killed_in_the_middle_of_it(tmp_path: Path) -> None:
         assert steps == list(range(steps[0], steps[0] + len(steps)))
         assert len(steps) > 1000
         assert all(data == step.to_bytes(8, "little") * 1000 for step, data in found)
+
+
+def test_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Said at once: who writes to a map without room behind it is killed by SIGBUS."""
+
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(InputError, match=r"no room for \d+ bytes \(No space left on device\).*--restarts 0"):
+        Checkpoint(tmp_path / "states", LARGE)
+
+
+def test_whether_somebody_was_there_before(tmp_path: Path) -> None:
+    assert not Checkpoint(None, 100).found
+    assert [Checkpoint(tmp_path / "states", 100).found for _ in range(2)] == [False, True]

@@ -146,6 +146,45 @@ def test_failures_in_words(
     assert child.last_words() == words
 
 
+@pytest.mark.parametrize(
+    ("code", "number", "resumes"),
+    [
+        ("import os; os.kill(os.getpid(), 9)", 1, True),
+        ("import os; os.kill(os.getpid(), 11)", 3, True),
+        ("raise MemoryError", 1, True),
+        ("raise MemoryError", 2, False),  # its own fault, again
+        ("import sys; sys.exit(2)", 1, False),  # bad input
+        ("import sys; sys.exit(3)", 1, False),  # told to stop
+        ("print('done')", 1, False),
+    ],
+)
+def test_which_deaths_are_worth_a_restart(start: Callable[..., Child], code: str, number: int, resumes: bool) -> None:
+    child = start(code)
+    child.process.wait()
+    child.number = number
+    assert not child.resumes  # without a checkpoint, never
+    child.plan = ProcessPlan("agent_1", (), resumes=True)
+    assert child.resumes == resumes
+
+
+@pytest.mark.parametrize("still_there", ["agent_1", "switcher"])
+def test_who_is_killed_after_the_end_has_not_failed(
+    tmp_path: Path, start: Callable[..., Child], still_there: str
+) -> None:
+    names = ["agent_1", "agent_2", "recorder", "switcher"]
+    children = {
+        name: start("import os; os.kill(os.getpid(), 9)" if name == still_there else "", name) for name in names
+    }
+    for child in children.values():
+        child.process.wait()
+    supervisor = Supervisor(tmp_path, {}, list(children.values()))
+    assert supervisor.over
+    assert supervisor.failures == []
+    children["recorder"].process.returncode = -9
+    assert supervisor.over == (still_there == "agent_1")
+    assert children["recorder"] in supervisor.failures
+
+
 def test_status_is_read_in_pieces(tmp_path: Path) -> None:
     supervisor = Supervisor(tmp_path, {})
     reading, writing = os.pipe()

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from msg_agents.synchronizer import Refusal, Synchronizer
+from msg_agents.synchronizer import AGAIN, WINDOW, Refusal, Synchronizer
 
 PRIME = 2**61 - 1
 Sojourn = tuple[int, int, int, int]  # sequence, mode, first step, last step
@@ -267,8 +267,8 @@ def everything(node: Synchronizer[str]) -> object:
         (2, 0, Refusal.STRANGER),
         (0, 0, Refusal.STRANGER),
         (-1, 0, Refusal.STRANGER),
-        (1, 0, Refusal.OLD),
-        (1, 1, Refusal.OLD),
+        (1, 0, Refusal.CONTRADICTION),
+        (1, 1, Refusal.CONTRADICTION),
         (1, 5, Refusal.FAR),
         (1, 2**64 - 1, Refusal.FAR),
     ],
@@ -282,7 +282,30 @@ def test_refused_states_change_nothing(agent: int, step: int, reason: str) -> No
     before = everything(node)
     assert node.offer(agent, step, "forged") == reason
     assert everything(node) == before
+    assert [node.offer(1, 0, "zero"), node.offer(1, 1, "one")] == [Refusal.OLD] * 2  # the true ones again
+    assert everything(node) == before
     assert make_step(node) == (0, ["one"])
+
+
+def test_another_value_is_noticed_for_as_long_as_the_true_one_can_take() -> None:
+    """Whoever forges a message is heard first and used; the true one comes at most a window of steps later."""
+    node = pair(window=WINDOW, steps=10 * WINDOW)
+    node.learn(0, 0, 0, 10 * WINDOW - 1)
+    for k in range(2 * WINDOW):
+        assert node.offer(1, k, f"{k}") is None
+        make_step(node)
+    assert node.offer(1, WINDOW, "forged") == Refusal.CONTRADICTION
+    assert node.offer(1, WINDOW - 1, "forged") == Refusal.OLD
+    assert node.buffered == 0
+
+
+def test_what_is_long_past_is_no_repetition() -> None:
+    node: Synchronizer[str] = Synchronizer(
+        agent=0, steps=10**6, inputs=[[1]], peers=[1], start=AGAIN + 100, window=WINDOW
+    )
+    assert node.offer(1, AGAIN + 100, "now") is None
+    assert node.offer(1, 100 - WINDOW, "the oldest that is sent again") == Refusal.OLD
+    assert node.offer(1, 99 - WINDOW, "forged") == Refusal.PAST
 
 
 @pytest.mark.parametrize(

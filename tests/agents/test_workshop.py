@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from msg_agents import workshop as module
 from msg_agents.workshop import PREFIX, YOUTH, workshop
 
 HOLD = """
@@ -40,6 +41,22 @@ def test_gone_afterwards() -> None:
     with workshop() as folder:
         (folder / "log").write_text("x")
     assert not folder.exists()
+
+
+def test_in_memory_if_there_is_plenty(tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = tmp_path / "memory"
+    monkeypatch.setattr(module, "MEMORY", memory)
+    with workshop(1) as folder:  # there is none
+        assert folder.parent == temporary
+    memory.mkdir()
+    with workshop(1) as folder, workshop(10**18) as too_large, workshop() as ordinary:
+        assert folder.parent == memory
+        assert {too_large.parent, ordinary.parent} == {temporary}
+        age(folder, YOUTH + 60)
+    (memory / f"{PREFIX}abandoned").mkdir()
+    age(memory / f"{PREFIX}abandoned", YOUTH + 60)
+    with workshop():
+        assert list(memory.iterdir()) == []
 
 
 def test_of_a_killed_run_is_cleared_and_of_a_living_one_kept(temporary: Path) -> None:

@@ -1,13 +1,16 @@
 """Networks of real processes, and the means to see what became of each of them.
 
 Every process that a test starts, however indirectly, carries the test's mark in its environment. So a test can find a
-child of a child, and no test ends well while any process of it is left.
+child of a child, and no test ends well while any process of it is left, or anything else that its networks made for
+themselves only: shared memory, the folder of a run.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import random
 import re
 import signal
 import subprocess
@@ -15,7 +18,7 @@ import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +27,15 @@ import yaml
 
 pytest.importorskip("rclpy")
 
+from msg_agents.check import check
 from msg_agents.runner import RunResult, run_network
+from msg_agents.workshop import PREFIX
+from msg_analysis.bags.reader import read_bag
 from msg_analysis.model.experiment import Experiment
 
 MARK = "MSG_AGENTS_TEST"
 PROGRAM = Path(sys.executable).with_name("msg-agents")
+LOOK = 0.5  # s between two looks at what the processes of a test have made for themselves
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -40,7 +47,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Tests of random faults take a ``repetition``: once by default, as often as ``make stress`` says otherwise."""
     if "repetition" in metafunc.fixturenames:
-        metafunc.parametrize("repetition", range(int(os.environ.get("STRESS", "1"))))
+        count = int(os.environ.get("STRESS", "1"))
+        metafunc.parametrize("repetition", range(count), ids=[f"repetition_{i}" for i in range(count)])
 
 
 def document(**changes: Any) -> dict[str, Any]:
@@ -87,6 +95,13 @@ class Process:
             os.kill(self.pid, number)
 
 
+def _mapped(pid: int) -> set[Path]:
+    """Files of Fast DDS in shared memory that a process has mapped."""
+    with contextlib.suppress(OSError):
+        return {Path(name) for name in re.findall(r"/dev/shm/fastrtps\w+", Path(f"/proc/{pid}/maps").read_text())}
+    return set()
+
+
 def _born(pid: int) -> str | None:
     """Start time of a living process; None for one that has ended, reaped or not."""
     try:
@@ -102,6 +117,8 @@ class Network:
 
     mark: str
     directory: Path
+    traces: set[Path] = field(default_factory=set)  # what nobody should find after the end
+    _looked: list[float] = field(default_factory=lambda: [0.0])
 
     def processes(self, *kinds: str) -> list[Process]:
         """Living processes of this test, of all kinds or only of some."""
@@ -119,20 +136,32 @@ class Network:
             born = _born(int(entry.name))
             if born is not None:
                 found.append(Process(int(entry.name), born, tuple(command)))
+        self._look(found)
         return [process for process in found if not kinds or process.kind in kinds]
+
+    def _look(self, processes: list[Process]) -> None:
+        """Note what they have made for themselves."""
+        if time.monotonic() < self._looked[0] + LOOK:
+            return
+        self._looked[0] = time.monotonic()
+        for process in processes:
+            self.traces.update(_mapped(process.pid))
+            for word in process.command:
+                if found := re.match(rf"(/.*/{PREFIX}[^/]*)/", word):
+                    self.traces.add(Path(found[1]))
 
     def nodes(self) -> list[Process]:
         """The processes of the network itself."""
         return self.processes("agent", "switcher", "recorder")
 
+    def run_file(self) -> Path:
+        """The run record of the run."""
+        (path,) = {word for node in self.nodes() for word in node.command if word.endswith("run.json")}
+        return Path(path)
+
     def shared_memory(self) -> set[Path]:
         """Files of Fast DDS in shared memory that the nodes have mapped: a killed node would leave them behind."""
-        found: set[str] = set()
-        for node in self.nodes():
-            with contextlib.suppress(OSError):
-                maps = Path(f"/proc/{node.pid}/maps").read_text()
-                found |= set(re.findall(r"/dev/shm/fastrtps\w+", maps))
-        return {Path(name) for name in found}
+        return {path for node in self.nodes() for path in _mapped(node.pid)}
 
     def start(self, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
         """Start ``msg-agents`` with these arguments."""
@@ -159,6 +188,26 @@ class Network:
         """A whole run from this process, without comparison and report."""
         return run_network(what, self.directory / out, **options)
 
+    @staticmethod
+    def completed(run: subprocess.Popen[str]) -> dict[str, Any]:
+        """Wait for the end of ``msg-agents run --json``: all is there, once, and as the twin says.
+
+        Its result comes back, and what it noted on the way. Whether a run agrees with the prediction depends on its
+        seed only.
+        """
+        stdout, stderr = run.communicate(timeout=150)
+        assert run.returncode == 0, stderr
+        assert "Traceback" not in stderr
+        result: dict[str, Any] = json.loads(stdout)
+        assert result["failures"] == []
+        assert json.loads((Path(result["bag"]) / "result.json").read_text()) == result
+        trajectory = read_bag(result["bag"])
+        assert trajectory.completeness.complete
+        assert trajectory.completeness.duplicates == 0
+        outcome = check(trajectory)
+        assert (outcome.difference, outcome.missing) == (None, 0)
+        return result | {"notes": re.findall(r"^note: (.*)", stderr, re.MULTILINE)}
+
     def recorded_bytes(self, out: str = "runs") -> int:
         """Size of what has been recorded so far."""
         return sum(file.stat().st_size for file in (self.directory / out).glob("*/*.mcap"))
@@ -169,7 +218,7 @@ class Network:
         deadline = time.monotonic() + seconds
         while not (value := condition()):
             assert time.monotonic() < deadline, f"not within {seconds:g} s: {what}"
-            time.sleep(0.02)
+            time.sleep(0.05)
         return value
 
     def wait_until_moving(self, out: str = "runs") -> None:
@@ -191,3 +240,14 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network
     for process in left:
         process.kill()
     assert not left, "processes outlived the test"
+    assert [path for path in network.traces if path.exists()] == []
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> random.Random:
+    """Chance of a test's own. To repeat a failure, run the same test with the same STRESS and STRESS_SEED."""
+    seed = f"{os.environ.get('STRESS_SEED', '0')} {request.node.name}"
+    print(
+        f"STRESS={os.environ.get('STRESS', '1')} STRESS_SEED={os.environ.get('STRESS_SEED', '0')} {request.node.nodeid}"
+    )
+    return random.Random(seed)

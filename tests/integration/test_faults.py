@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 import re
 import signal
@@ -20,9 +19,8 @@ from msg_analysis.bags.reader import read_bag
 PAUSE = 10.0  # s
 
 
-def test_stopped_recorder(network: Any, repetition: int) -> None:
+def test_stopped_recorder(network: Any, repetition: int, rng: random.Random) -> None:
     """At full speed everybody waits for it in the end, and nothing is lost."""
-    rng = random.Random(f"stopped {repetition}")
     file = network.file(run={"duration": 600, "processes": 2})
     run = network.start("run", file, "--out", network.directory / "runs", "--json")
     network.wait_until_moving()
@@ -31,20 +29,16 @@ def test_stopped_recorder(network: Any, repetition: int) -> None:
     recorder.kill(signal.SIGSTOP)
     time.sleep(PAUSE)
     recorder.kill(signal.SIGCONT)
-    stdout, stderr = run.communicate(timeout=120)
-    assert run.returncode in (0, 1), stderr  # by chance one run in a hundred disagrees
-    trajectory = read_bag(json.loads(stdout)["bag"])
-    assert trajectory.completeness.complete
-    assert trajectory.completeness.duplicates == 0
-    assert check(trajectory).difference is None
+    assert network.completed(run)["restarts"] == []
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of its own, of 1 MB."""
+def small_disk(tmp_path: Path, rng: random.Random) -> Iterator[Path]:
+    """A file system of its own, of about 1 MB."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", disk], capture_output=True, check=False)
+    size = f"size={rng.randrange(700, 1300)}k"
+    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", size, "none", disk], capture_output=True, check=False)
     if mount.returncode:
         pytest.skip("cannot mount a small file system here: not root")
     try:
@@ -54,7 +48,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_full_disk(network: Any, small_disk: Path) -> None:
+def test_full_disk(network: Any, small_disk: Path, repetition: int) -> None:
     """The run ends, says why, and what was written can be read."""
     file = network.file(run={"duration": 10_000, "processes": 2})
     run = network.start("run", file, "--out", small_disk)

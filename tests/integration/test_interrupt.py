@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import random
 import signal
+import time
 from typing import Any
 
-import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -16,10 +17,11 @@ from msg_analysis.bags.reader import read_bag
 LONG = {"duration": 10_000, "replicas": 1, "processes": 2}  # 200,000 steps: no test waits for them
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_in_the_middle(network: Any, number: signal.Signals) -> None:
+def test_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
+    number = signal.SIGTERM if repetition % 2 else signal.SIGINT
     run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs", "--json")
     network.wait_until_moving()
+    time.sleep(rng.uniform(0.0, 1.0) if repetition else 0.0)
     assert network.shared_memory() == set()
     run.send_signal(number)
     stdout, stderr = run.communicate(timeout=60)
@@ -42,14 +44,16 @@ def test_in_the_middle(network: Any, number: signal.Signals) -> None:
     assert check(trajectory).difference is None
 
 
-def test_before_anything_has_begun(network: Any) -> None:
+def test_before_anything_has_begun(network: Any, repetition: int, rng: random.Random) -> None:
     """While the processes start and look for each other."""
     run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs")
     network.wait_for(network.nodes, 60, "a child")
-    run.send_signal(signal.SIGINT)
+    time.sleep(rng.uniform(0.0, 1.5) if repetition else 0.0)
+    number = signal.SIGINT if repetition % 2 else signal.SIGTERM
+    run.send_signal(number)
     _, stderr = run.communicate(timeout=60)
     assert run.returncode == 3, stderr
-    assert "ended by SIGINT" in stderr
+    assert f"ended by {number.name}" in stderr
     assert "Traceback" not in stderr
     assert network.processes() == []
 
@@ -61,6 +65,7 @@ def test_a_killed_runner_takes_everybody_along(network: Any) -> None:
     run.kill()
     run.communicate(timeout=60)
     network.wait_for(lambda: network.processes() == [], 10, "the end of every child")
+    network.traces.clear()  # whoever runs the next network clears its folder away
     (bag,) = (network.directory / "runs").iterdir()
     trajectory = read_bag(bag)  # its recorder had the time to close it
     assert trajectory.completeness.received > 0

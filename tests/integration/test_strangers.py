@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import html
+import random
+import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +24,10 @@ from msg_agents.network import ProcessPlan, plan_network
 from msg_agents.supervisor import Supervisor
 from msg_analysis.bags.cdr import ActiveGraph, AgentState, Progress, encode_string
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.inference.compare import compare
+from msg_analysis.model.path import sojourns
 from msg_analysis.model.record import RunRecord
+from msg_analysis.model.step import build_step_model
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.twin import new_record
 
@@ -61,13 +68,17 @@ for topic, kind in topics.items():
 time.sleep(600)
 """
 Forgery = tuple[str, bytes]  # topic, message
+Refused = Counter[tuple[str, str, str]]
 
 
 @pytest.fixture
-def run_beside(network: Any) -> Callable[[RunRecord, list[Forgery]], tuple[Trajectory, dict[str, str]]]:
-    """Runs a network while a stranger's messages meet every reader before those of the run."""
+def run_beside(network: Any) -> Callable[[RunRecord, list[Forgery]], tuple[Trajectory, dict[str, str], Refused]]:
+    """Runs a network while a stranger's messages meet every reader before those of the run.
 
-    def run(record: RunRecord, forgeries: list[Forgery]) -> tuple[Trajectory, dict[str, str]]:
+    What comes back: trajectory, logs by process, and what was refused by (node, topic, reason).
+    """
+
+    def run(record: RunRecord, forgeries: list[Forgery]) -> tuple[Trajectory, dict[str, str], Refused]:
         directory: Path = network.directory
         (directory / "run.json").write_text(record.to_json())
         (directory / "forged").write_text("".join(f"{topic} {data.hex()}\n" for topic, data in forgeries))
@@ -79,7 +90,8 @@ def run_beside(network: Any) -> Callable[[RunRecord, list[Forgery]], tuple[Traje
                 network.wait_for(lambda: not nodes.running or nodes.failures, 90, "the end of the run")
                 failures = [(child.plan.name, child.failure, child.last_words()) for child in nodes.failures]
         assert failures == []
-        return read_bag(directory / "bag"), {child.plan.name: child.log.read_text() for child in nodes.children}
+        logs = {child.plan.name: child.log.read_text() for child in nodes.children}
+        return read_bag(directory / "bag"), logs, nodes.account().refused
 
     return run
 
@@ -127,13 +139,22 @@ def test_another_run_of_the_same_experiment(network: Any, run_beside: Any) -> No
     forged += [message for agent in range(1, 6) for message in states(run, agent)]
     forged += [("progress", Progress(0, run, agent, STEPS).encode()) for agent in range(6)]
     forged += [("end", Progress(0, run, 0, STEPS).encode())]
-    trajectory, logs = run_beside(record, forged)
+    trajectory, logs, refused = run_beside(record, forged)
     assert trajectory.completeness.complete
     assert trajectory.record.run == record.run
     outcome = check(trajectory)
     assert (outcome.difference, outcome.missing) == (None, 0)
     for name, log in logs.items():
         assert "refused a message on" in log, name
+    for agent in (1, 2, 3, 5):  # who are heard in the other process
+        (by_agent,) = (n for (node, topic, _), n in refused.items() if topic == f"agent_{agent}/state")
+        assert by_agent == STEPS + 1
+    assert refused["recorder", "/agent_4/state", "other run"] == STEPS + 1
+    assert refused["switcher", "progress", "other run"] == 6
+    for node in ("agent_1", "agent_3", "recorder"):
+        assert refused[node, "end", "other run"] == 1
+        assert refused[node, "graph", "other run"] == 1
+    assert {reason for _, _, reason in refused} == {"other run"}
 
 
 def test_nonsense(network: Any, run_beside: Any) -> None:
@@ -155,11 +176,19 @@ def test_nonsense(network: Any, run_beside: Any) -> None:
     forged += [graph(run, sequence=7), graph(run, first_step=5), graph(run, first_step=9, last_step=3)]
     forged += [("progress", Progress(0, run, agent, STEPS).encode()) for agent in (6, 2**32 - 1)]
     forged += [("experiment", encode_string(text)) for text in ("", "{}", "[1]", '{"run": 1}', "hello")]
-    trajectory, _ = run_beside(record, forged)
+    trajectory, logs, refused = run_beside(record, forged)
     assert trajectory.completeness.received == trajectory.completeness.expected
     assert check(trajectory).difference is None
     assert trajectory.completeness.duplicates == 0
     assert trajectory.completeness.refused["wrong length"] == 2 * (STEPS + 1)
+    assert refused["agent_3", "agent_2/state", "wrong length"] == STEPS + 1
+    assert refused["recorder", "/agent_4/state", "of another agent than its topic"] == 10
+    assert refused["agent_5", "agent_1/state", "undecodable"] == len(garbage) - 1
+    assert refused["switcher", "progress", "unknown agent"] == 2
+    assert refused["recorder", "experiment", "other run"] == 5 + len(garbage) - 1
+    for name, log in logs.items():  # one warning for each reason and topic
+        warnings = [line.partition("refused a message on ")[2] for line in log.splitlines() if "refused a" in line]
+        assert len(warnings) == len(set(warnings)) > 0, name
     # Sojourns that the agents refused are in the bag beside the true ones: no verdict rather than a wrong one.
     assert trajectory.completeness.missing_modes > 0
 
@@ -169,7 +198,161 @@ def test_states_of_this_run_that_are_not_finite(network: Any, run_beside: Any, v
     """Right run, right agent, right steps, and there before the truth."""
     record = new_record(network.experiment(run={"processes": 2}))
     forged = [message for agent in range(1, 6) for message in states(record.run.bytes, agent, value=value)]
-    trajectory, _ = run_beside(record, forged)
+    trajectory, _, refused = run_beside(record, forged)
     assert trajectory.completeness.complete
     assert trajectory.completeness.refused["not finite"] == 5 * (STEPS + 1)
+    assert refused["agent_2", "agent_3/state", "not finite"] == STEPS + 1
     assert check(trajectory).difference is None
+
+
+def test_a_forged_state_is_noticed_and_nothing_is_concluded(network: Any, run_beside: Any) -> None:
+    """Right run, right agent, a step that is to come, another value: whoever hears it first believes it.
+
+    Who of the two is right nobody can know. But all notice, and the state counts as missing.
+    """
+    record = new_record(network.experiment(run={"processes": 2}))
+    first = next(sojourns(record.experiment, build_step_model(record.experiment).initial))
+    false = {"mode": 2 - first.mode, "last_step": first.last_step}
+    forged = [states(record.run.bytes, 2)[5], graph(record.run.bytes, **false)]
+    trajectory, _, refused = run_beside(record, forged)
+    assert refused["agent_3", "agent_2/state", "contradicts an earlier copy"] == 1
+    assert refused["recorder", "/agent_2/state", "contradicts an earlier copy"] == 1
+    for host in ("agent_1", "agent_3"):
+        assert refused[host, "graph", "contradicts an earlier copy"] >= 1
+    assert trajectory.completeness.refused == {"contradicts an earlier copy": 1}
+    assert not trajectory.present[5, 1]
+    assert trajectory.completeness.missing == 1
+    assert trajectory.completeness.missing_modes == first.last_step + 1
+    assert compare(trajectory).verdict == "incomplete"
+
+
+# Listens, and sends what cannot be as seen from the step at which the run is; says what it sent.
+INTRUDER = """
+import random, sys, time
+from pathlib import Path
+import numpy as np
+import rclpy
+from rclpy.qos import qos_profile_sensor_data
+from msg_agents_interfaces.msg import ActiveGraph as GraphMsg, AgentState as StateMsg, Progress as ProgressMsg
+from msg_agents.qos import LATCHED, STREAM
+from msg_analysis.bags.cdr import ActiveGraph, AgentState, Progress, StateFrame
+from msg_analysis.model.record import RunRecord
+
+record = RunRecord.from_json(Path(sys.argv[1]).read_text(), "run.json")
+rng = random.Random(sys.argv[2])
+run, last = record.run.bytes, record.experiment.steps
+other = rng.randbytes(16)
+frame = StateFrame(run, 2, 0)
+now = [0]
+rclpy.init()
+node = rclpy.create_node("intruder", enable_rosout=False)
+state = node.create_publisher(StateMsg, "agent_2/state", STREAM)
+graph = node.create_publisher(GraphMsg, "graph", LATCHED)
+progress = node.create_publisher(ProgressMsg, "progress", LATCHED)
+end = node.create_publisher(ProgressMsg, "end", LATCHED)
+
+def listen(data):  # to the true agent, not to itself
+    agent, step, _, value = frame.unwrap(data) or (0, 0, 0, b"")
+    if agent == 2 and np.isfinite(np.frombuffer(value)).all() and np.frombuffer(value)[0] != 9:
+        now[0] = step
+
+# Not reliable: whoever is as slow as this would hold back the whole network.
+node.create_subscription(StateMsg, "agent_2/state", listen, qos_profile_sensor_data, raw=True)
+while state.get_subscription_count() < 3:  # the recorder, a neighbour, and this process
+    time.sleep(0.1)
+
+def send_state(run=run, agent=2, step=None, value=9.0, replicas=2):
+    step = now[0] if step is None else step
+    state.publish(AgentState(0, run, agent, step, 1, np.full(replicas, value)).encode())
+
+forge = {
+    "other run": lambda: send_state(run=other),
+    "unknown agent": lambda: send_state(agent=rng.choice([0, 6, 2**32 - 1])),
+    "of another agent than its topic": lambda: send_state(agent=3),
+    "wrong length": lambda: send_state(replicas=rng.choice([0, 1, 3, 50])),
+    "not finite": lambda: send_state(value=rng.choice([np.nan, np.inf, -np.inf]), step=now[0] + 60),
+    "step out of range": lambda: send_state(step=rng.choice([last + 1, 2**40, 2**63 - 1, 2**64 - 1])),
+    "a step long past": lambda: send_state(step=rng.randrange(now[0] - 6100)),
+    "a step that a peer cannot have reached": lambda: send_state(step=min(now[0] + 12_500, last)),
+    "undecodable": lambda: state.publish(bytes([0, 1, 0, 0]) + rng.randbytes(rng.randrange(1, 200))),
+    "other run, graph": lambda: graph.publish(ActiveGraph(0, other, 0, 1, "line", 0, last - 1).encode()),
+    "other run, progress": lambda: progress.publish(Progress(0, other, rng.randrange(6), last).encode()),
+    "other run, end": lambda: end.publish(Progress(0, other, 0, last).encode()),
+    "unknown agent, progress": lambda: progress.publish(Progress(0, run, 6, last).encode()),
+}
+while now[0] < 6300:
+    rclpy.spin_once(node, timeout_sec=0.1)
+order = [name for name in forge for _ in range(20)]
+rng.shuffle(order)
+for name in order:
+    for _ in range(20):
+        rclpy.spin_once(node, timeout_sec=0)
+    forge[name]()
+print(now[0], flush=True)
+while True:
+    rclpy.spin_once(node, timeout_sec=1)
+"""
+
+
+def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
+    """Everything that cannot be, in any order, sent to a run that is under way; the intruder is killed at last."""
+    file = network.file(run={"duration": 1250, "processes": 3})
+    with free_domain() as domain:
+        options = ("--out", network.directory / "runs", "--domain", str(domain), "--json")
+        run = network.start("run", file, *options)
+        network.wait_for(network.nodes, 30, "a node")
+        intruder = subprocess.Popen(
+            [sys.executable, "-P", "-c", INTRUDER, str(network.run_file()), str(rng.random())],
+            env=node_environment(domain),
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            assert intruder.stdout is not None
+            assert int(intruder.stdout.readline()) < 18_000  # it was in time
+            result = network.completed(run)
+        finally:
+            intruder.kill()
+            intruder.wait()
+            intruder.stdout.close()
+    refused = {(entry["topic"].lstrip("/"), entry["reason"]): entry for entry in result["strangers"]}
+    for reason in (
+        "other run",
+        "unknown agent",
+        "of another agent than its topic",
+        "wrong length",
+        "not finite",
+        "step out of range",
+        "a step long past",
+        "a step that a peer cannot have reached",
+    ):
+        assert refused["agent_2/state", reason]["count"] > 0, reason
+    for topic in ("graph", "progress", "end"):
+        assert refused[topic, "other run"]["count"] > 0
+    report = html.unescape(Path(result["report"]).read_text())
+    assert all(f"<td>{entry['reason']}</td>" in report for entry in result["strangers"])
+
+
+def test_second_processes_of_agents(network: Any) -> None:
+    """Of the same run and of another one: they find their names taken and leave; the run says who was there."""
+    other = network.directory / "other.json"
+    other.write_text(new_record(network.experiment(run={"duration": 900, "seed": 8})).to_json())
+    with free_domain() as domain:
+        file = network.file(run={"duration": 700, "processes": 3})
+        run = network.start("run", file, "--out", network.directory / "runs", "--domain", str(domain), "--json")
+        network.wait_until_moving()
+        environment = node_environment(domain)
+        doubles = {
+            agent: network.start("agent", record, "--agent", agent, "--discovery-timeout", "3", **environment)
+            for agent, record in (("2", network.run_file()), ("4", other))
+        }
+        for agent, double in doubles.items():
+            _, stderr = double.communicate(timeout=60)
+            assert double.returncode == 2, stderr
+            assert re.search(rf"there was still more than one .*agent_{agent}.* in the same ROS_DOMAIN_ID", stderr), (
+                stderr
+            )
+        result = network.completed(run)
+    for agent in doubles:
+        entry = {"node": "switcher", "topic": f"agent_{agent}", "reason": "a second node of this name", "count": 1}
+        assert entry in result["strangers"]

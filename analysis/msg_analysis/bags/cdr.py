@@ -136,12 +136,13 @@ class StateFrame:
 
     Attributes
     ----------
+    replicas : as given
     size : bytes of the longest message
     """
 
     def __init__(self, run: bytes, replicas: int, most_heard: int = 0) -> None:
         self._fixed = b"\x01\x00\x00\x00\x00" + bytes(run)
-        self._replicas = replicas
+        self.replicas = replicas
         self._least = _STATE.size + 8 * replicas
         self.size = self._least + 8 * most_heard
 
@@ -153,7 +154,7 @@ class StateFrame:
         if len(data) != self._least:
             return self._unwrap_heard(data)
         header, fixed, agent, step, mode, heard, replicas = _STATE_FIXED.unpack_from(data)
-        if fixed != self._fixed or heard or replicas != self._replicas or header != LITTLE_ENDIAN:
+        if fixed != self._fixed or heard or replicas != self.replicas or header != LITTLE_ENDIAN:
             return None
         return agent, step, mode, data[_STATE.size :]
 

@@ -262,6 +262,10 @@ class _Collected:
         if realtime:
             differs |= taken.stamp[copy] != taken.stamp[original]
         refused["contradicts an earlier copy"] += int(differs.sum())
+        # One of them is forged, and nobody knows which: the state counts as missing.
+        certain = np.ones(len(cells), dtype=np.bool_)
+        certain[owner[again[differs]]] = False
+        cells, kept = cells[certain], kept[certain]
 
         states = np.full(((steps + 1) * agents, width), np.nan)
         states[cells] = taken.state[kept]
@@ -282,7 +286,7 @@ class _Collected:
             lost = np.zeros(((steps + 1) * agents, links.most), dtype=np.bool_)
             lost[cells] = taken.heard[kept] == LOST
             self.lost = lost.reshape(steps + 1, agents, links.most)[1:]
-        self.received, self.duplicates = len(cells), len(cell) - len(cells)
+        self.received, self.duplicates = len(cells), len(again)
         self.out_of_order = _out_of_order(taken, kept)
 
 

@@ -8,6 +8,7 @@ import os
 import shlex
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,14 @@ _SMALL_CHAIN = 8  # graphs up to which all transitions are listed
 _NODE_TEST = "error of agent "  # how the tests of the nodes begin
 
 
-def write_report(comparison: Comparison, trajectory: Trajectory, path: str | Path) -> None:
+def write_report(
+    comparison: Comparison,
+    trajectory: Trajectory,
+    path: str | Path,
+    *,
+    restarts: Sequence[str] = (),
+    strangers: Sequence[Mapping[str, Any]] = (),
+) -> None:
     """Write the report of a comparison, whole or not at all.
 
     Parameters
@@ -42,13 +50,15 @@ def write_report(comparison: Comparison, trajectory: Trajectory, path: str | Pat
         what was compared
     path : str | Path
         of the HTML file; replaced where it exists
+    restarts, strangers
+        of the network, see ``render``
 
     Raises
     ------
     InputError : the file cannot be written
     """
     path = Path(path)
-    html = render(comparison, trajectory)
+    html = render(comparison, trajectory, restarts=restarts, strangers=strangers)
     try:
         with tempfile.NamedTemporaryFile(
             "w", encoding="utf-8", dir=path.absolute().parent, prefix=f".{path.name}.", delete=False
@@ -61,7 +71,13 @@ def write_report(comparison: Comparison, trajectory: Trajectory, path: str | Pat
         raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
 
 
-def render(comparison: Comparison, trajectory: Trajectory) -> str:
+def render(
+    comparison: Comparison,
+    trajectory: Trajectory,
+    *,
+    restarts: Sequence[str] = (),
+    strangers: Sequence[Mapping[str, Any]] = (),
+) -> str:
     """The report as HTML text.
 
     Parameters
@@ -70,6 +86,10 @@ def render(comparison: Comparison, trajectory: Trajectory) -> str:
         the result
     trajectory : Trajectory
         what was compared
+    restarts : Sequence[str]
+        processes that were started again during the run, a line each
+    strangers : Sequence[Mapping[str, Any]]
+        messages that the nodes refused: ``node``, ``topic``, ``reason``, ``count``
     """
     document = comparison.to_json()
     experiment = trajectory.record.experiment
@@ -100,6 +120,8 @@ def render(comparison: Comparison, trajectory: Trajectory) -> str:
         pictures["lateness"] = figures.lateness(timing)
     return environment.get_template("report.html.j2").render(
         document=document,
+        restarts=restarts,
+        strangers=strangers,
         headline=verdict_line(_HEADLINES[document["verdict"]], document),
         timing_facts=timing_facts(timing) if timing else [],
         times=TIMES,

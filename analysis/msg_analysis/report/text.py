@@ -79,7 +79,7 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
 
     Parameters
     ----------
-    document : of ``Comparison.to_json()``
+    document : of ``Comparison.to_json()``; with ``strangers`` of a run's result where there are some
     console : where to print
     """
     verdict, style = _VERDICTS[document["verdict"]]
@@ -100,11 +100,26 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
     if loss.get("lost") is not None:
         console.print(f"{loss['lost']} messages lost, {loss['expected']:.6g} expected")
     _print_timing(document, console)
+    _print_strangers(document.get("strangers") or [], console)
     interval = document["batch_means"]["interval"]
     console.print(f"95 % interval of batch means, free of the model: {_interval(interval)}", style="dim")
     continuous = document["continuous"]["system_error"]
     if continuous is not None and not document.get("laws"):
         console.print(f"System error in continuous time, for reference: {number_text(continuous)}", style="dim")
+
+
+def _print_strangers(strangers: Sequence[dict[str, Any]], console: Console) -> None:
+    if not strangers:
+        return
+    console.print(Text("Messages that the nodes refused", style="bold"))
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("node", "topic", "reason"):
+        table.add_column(heading, overflow="fold")
+    table.add_column("number", justify="right")
+    for entry in strangers[:_ROWS]:
+        table.add_row(*(Text(str(entry[key])) for key in ("node", "topic", "reason", "count")))
+    _note_cut(table, len(strangers), "kinds")
+    console.print(table)
 
 
 def _print_errors(document: dict[str, Any], console: Console) -> None:

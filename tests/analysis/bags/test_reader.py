@@ -203,14 +203,17 @@ def test_order_does_not_matter(tmp_path: Path, make_run: MakeRun) -> None:
     assert found.completeness.out_of_order == late
 
 
-def test_first_of_contradicting_copies_counts(tmp_path: Path, make_run: MakeRun) -> None:
+def test_contradicting_copies_count_as_missing(tmp_path: Path, make_run: MakeRun) -> None:
     run = make_run()
     messages = _messages(run)
     messages.append(("/agent_1/state", AGENT_STATE.full_name, _state(run, 4, 0, state=np.zeros(2)).encode(), 5))
+    messages.append(("/agent_2/state", AGENT_STATE.full_name, _state(run, 6, 1).encode(), 5))  # the same again
     found = read_bag(_mcap(tmp_path / "x.mcap", messages))
-    _same(found, run)
     assert found.completeness.refused == {"contradicts an earlier copy": 1}
-    assert found.completeness.duplicates == 1
+    assert found.completeness.duplicates == 2
+    assert found.completeness.missing == 1
+    assert np.argwhere(~found.present).tolist() == [[4, 0]]
+    assert np.array_equal(found.states[found.present], run.states[found.present])
 
 
 def test_gaps_and_overlaps_of_sojourns(tmp_path: Path, make_run: MakeRun) -> None:

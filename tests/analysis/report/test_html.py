@@ -157,6 +157,19 @@ def test_incomplete(tmp_path: Path, first_gap: int) -> None:
     assert "set aside: torn file" in page.text
 
 
+def test_what_became_of_the_network(tmp_path: Path) -> None:
+    """Only where something did; texts from outside are texts."""
+    comparison = _comparison(_trajectory(2, 60))
+    assert "Network" not in _page(comparison, tmp_path / "quiet.html").text
+    stranger = {"node": "agent_1", "topic": "<b>graph", "reason": "other run", "count": 1234}
+    path = tmp_path / "report.html"
+    restarts = ["agent_2: killed by SIGKILL after step 7, started again"]
+    write_report(comparison, comparison.trajectory, path, restarts=restarts, strangers=[stranger])
+    page = Page(path.read_text(encoding="utf-8"))
+    for words in (*restarts, "<b>graph", "other run", "1234"):
+        assert words in page.text
+
+
 def test_hostile_names(tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>$\\frac$&\"'"
     trajectory = _trajectory(3, 60, line=evil)

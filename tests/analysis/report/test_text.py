@@ -60,6 +60,14 @@ def test_comparison() -> None:
     assert "not done" in output
 
 
+def test_strangers() -> None:
+    entry = {"node": "agent_1", "topic": "[red]graph", "reason": "other run", "count": 1234}
+    output = shown(text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": [entry]})
+    (line,) = (line for line in output.splitlines() if "1234" in line)
+    assert line.split() == ["agent_1", "[red]graph", "other", "run", "1234"]
+    assert "refused" not in shown(text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": []})
+
+
 def test_comparison_without_numbers() -> None:
     output = shown(text.print_comparison, comparison("incomplete", 2, None))
     assert output.startswith("No verdict: the data are incomplete.")

@@ -1,0 +1,89 @@
+"""A network that stands still says where it waits; and then goes on."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from msg_agents.domain import free_domain
+from msg_agents.environment import node_environment
+
+# Prints every DiagnosticArray of /diagnostics, level and values included, a line each.
+MONITOR = """
+import json, rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+
+def say(array):
+    statuses = [
+        {"name": s.name, "level": s.level[0], "message": s.message, **{v.key: v.value for v in s.values}}
+        for s in array.status
+    ]
+    print(json.dumps(statuses), flush=True)
+
+rclpy.init()
+node = rclpy.create_node("monitor", enable_rosout=False)
+node.create_subscription(DiagnosticArray, "/diagnostics", say, 100)
+rclpy.spin(node)
+"""
+
+
+def statuses(file: Path) -> list[dict[str, Any]]:
+    lines = file.read_text().splitlines(keepends=True)
+    return [status for line in lines if line.endswith("\n") for status in json.loads(line)]
+
+
+def test_a_stopped_agent_is_named(network: Any) -> None:
+    """On /diagnostics, in the log of its neighbour, and to the user; then all goes on as if nothing had been."""
+    heard = network.directory / "heard"
+    with free_domain() as domain, heard.open("w") as output:
+        file = network.file(run={"duration": 300, "processes": "one_per_agent"})
+        run = network.start("run", file, "--out", network.directory / "runs", "--domain", str(domain), "--json")
+        monitor = subprocess.Popen([sys.executable, "-P", "-c", MONITOR], env=node_environment(domain), stdout=output)
+        try:
+            network.wait_until_moving()
+            network.wait_for(lambda: len(statuses(heard)) > 7, 30, "diagnostics")
+            (victim,) = (process for process in network.processes("agent") if process.agent == 2)
+            victim.kill(signal.SIGSTOP)
+
+            log = network.run_file().with_name("agent_1.log")
+
+            def complaints() -> list[str]:
+                return re.findall(r"agent_1.*no step for \d+ s at step (\d+): waiting for (.*)", log.read_text())
+
+            complaint = network.wait_for(complaints, 30, "the watchdog")
+            victim.kill(signal.SIGCONT)
+            result = network.completed(run)
+        finally:
+            monitor.kill()
+            monitor.wait()
+    assert result["restarts"] == result["strangers"] == []
+    ((step, words),) = complaint
+    assert words in (f"step {step} of agent 2", "agents too far behind: 2")
+    (note,) = result["notes"]
+    assert re.match(rf"no step for \d+ s: .*agent_1: at step {step}, waiting for {words}", note)
+    assert note.endswith("; nothing heard from agent_2")
+
+    known = statuses(heard)
+    assert {status["name"] for status in known} == {
+        *(f"agent_{i}: network" for i in range(1, 6)),
+        "switcher: network",
+        "recorder: network",
+    }
+    agents = [status for status in known if status["name"].startswith("agent")]
+    for status in agents:
+        assert int(status["step"]) >= 0
+        assert float(status["steps per second"]) >= 0
+        waits = "waiting for" in status
+        assert status["level"] == (1 if waits else 0)
+        assert waits == ("waiting for" in status["message"])
+    blamed = {
+        s["waiting for"] for s in agents if s["name"] == "agent_1: network" and s.get("step") == step and len(s) > 5
+    }
+    assert blamed == {words}
+    moving = [s for s in agents if re.fullmatch(r"at step \d+", s["message"]) and float(s["steps per second"]) > 0]
+    assert moving
