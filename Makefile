@@ -45,7 +45,7 @@ test-fast: setup ## Run the tests that start no network
 STRESS ?= 20
 
 stress: setup ## Repeat every random fault 20 times (STRESS=N: N times): about an hour
-	STRESS=$(STRESS) $(BIN)/python -m pytest --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py)
+	STRESS=$(STRESS) $(BIN)/python -m pytest --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py realtime.py)
 
 lint: setup ## Check style and types
 	$(BIN)/ruff check

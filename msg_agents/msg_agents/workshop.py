@@ -13,8 +13,8 @@ from pathlib import Path
 
 PREFIX = "msg_agents_run_"
 MEMORY = Path("/dev/shm")
-"""A file system in memory, where there is one. Maps of files on a disk cost much more: 8 % of the speed of 100 agents,
-against less than 1 %."""
+"""A file system in memory, where there is one: pages of files on a disk cost about twice as much when they are written
+for the first time, and again whenever the system has saved them."""
 
 SPARE = 4  # times the room that is needed there must be free, for others to live
 YOUTH = 60.0  # s; younger folders may belong to a run that has not locked its own yet

@@ -338,12 +338,12 @@ def test_second_processes_of_agents(network: Any) -> None:
     other = network.directory / "other.json"
     other.write_text(new_record(network.experiment(run={"duration": 900, "seed": 8})).to_json())
     with free_domain() as domain:
-        file = network.file(run={"duration": 700, "processes": 3})
+        file = network.file(run={"duration": 1800, "processes": 3})
         run = network.start("run", file, "--out", network.directory / "runs", "--domain", str(domain), "--json")
         network.wait_until_moving()
         environment = node_environment(domain)
         doubles = {
-            agent: network.start("agent", record, "--agent", agent, "--discovery-timeout", "3", **environment)
+            agent: network.start("agent", record, "--agent", agent, "--discovery-timeout", "6", **environment)
             for agent, record in (("2", network.run_file()), ("4", other))
         }
         for agent, double in doubles.items():
