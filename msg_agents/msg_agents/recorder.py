@@ -41,7 +41,7 @@ from msg_analysis.model.record import RunRecord
 
 TELLING = {WRONG_LENGTH, OTHER_LAYOUT}
 """What is wrong with states that are recorded all the same: they are of this run, and the reader of the bag tells."""
-BATCH = 512  # states collected before they are written
+BATCH = 16  # states collected before they are written: cheaper than one by one, and nobody waits long for the core
 WRITE_PERIOD = 0.1  # s of wall time between two looks at what has been collected, in slow runs and at the end
 FLUSH_PERIOD = 1.0
 """s of wall time. What a killed recorder loses at most, where a chunk takes longer to fill."""
