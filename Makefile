@@ -36,11 +36,12 @@ $(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
 	$(BIN)/msg-agents run $(EXPERIMENTS)/line_ring.yaml --out $(RUNS)
 
-test: setup ## Run all tests
-	$(BIN)/python -m pytest
+# Tests that start no network share the CPUs; each network has them to itself.
+test: test-fast ## Run all tests
+	$(BIN)/python -m pytest -m integration
 
 test-fast: setup ## Run the tests that start no network
-	$(BIN)/python -m pytest -m "not integration"
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto -m "not integration"
 
 STRESS ?= 20
 

@@ -46,8 +46,8 @@ from msg_agents.qos import LATCHED, STREAM
 AGENTS, PROCESSES = 5, 2
 rclpy.init()
 node = rclpy.create_node("stranger", enable_rosout=False)
-kinds = {"graph": ActiveGraph, "progress": Progress, "end": Progress, "experiment": String}
-readers = {"graph": PROCESSES + 1, "progress": 1, "end": PROCESSES + 1, "experiment": 1}
+kinds = {"graph": ActiveGraph, "progress": Progress, "end": Progress, "epoch": Progress, "experiment": String}
+readers = {"graph": PROCESSES + 1, "progress": 1, "end": PROCESSES + 1, "epoch": PROCESSES, "experiment": 1}
 readers |= {f"agent_{i}/state": 2 for i in (1, 2, 3, 5)}  # the recorder and the neighbour in the other process
 readers["agent_4/state"] = 1
 messages = [line.split() for line in Path(sys.argv[1]).read_text().splitlines()]
@@ -203,6 +203,28 @@ def test_states_of_this_run_that_are_not_finite(network: Any, run_beside: Any, v
     assert trajectory.completeness.refused["not finite"] == 5 * (STEPS + 1)
     assert refused["agent_2", "agent_3/state", "not finite"] == STEPS + 1
     assert check(trajectory).difference is None
+
+
+def test_in_real_time(network: Any, run_beside: Any) -> None:
+    """Before simulated time has begun: another epoch, states of other runs and layouts, what nobody can have yet."""
+    record = new_record(network.experiment(run={"processes": 2, "pace": "realtime", "speed": 5}))
+    run, other = record.run.bytes, new_record(record.experiment).run.bytes
+    forged = [message for agent in range(1, 6) for message in states(other, agent)]
+    forged += states(run, 1, replicas=3) + states(run, 2, value=np.nan)
+    forged += [("agent_3/state", AgentState(0, run, 3, STEPS + 1, 1, np.zeros(2)).encode())]
+    forged += [("epoch", Progress(0, other, 0, 0).encode()), ("epoch", Progress(0, run, 2, 0).encode())]
+    forged += [graph(other), ("end", Progress(0, other, 0, STEPS).encode())]
+    trajectory, _, refused = run_beside(record, forged)
+    assert trajectory.completeness.complete
+    outcome = check(trajectory)
+    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert refused["agent_5", "agent_1/state", "other run"] == STEPS + 1
+    assert refused["agent_5", "agent_1/state", "wrong length"] == STEPS + 1
+    assert refused["agent_3", "agent_2/state", "not finite"] == STEPS + 1
+    assert refused["agent_2", "agent_3/state", "a step that a peer cannot have reached"] == 1
+    for host in ("agent_1", "agent_3"):
+        assert refused[host, "epoch", "other run"] >= 1
+        assert refused[host, "graph", "other run"] == 1
 
 
 def test_a_forged_state_is_noticed_and_nothing_is_concluded(network: Any, run_beside: Any) -> None:
