@@ -122,7 +122,8 @@ def plot(path: Path, points: Sequence[Point]) -> None:
         axes.minorticks_off()
         axes.set_xlabel("agents")
         axes.set_ylabel(label)
-    panels[0].legend(frameon=False)
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=len(names), frameon=False, fontsize="small")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, metadata={"Date": None})
 
