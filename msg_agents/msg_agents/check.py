@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msg_analysis.inference.reception import neighbour_tables
 from msg_analysis.model.path import mode_path
 from msg_analysis.model.step import build_model, build_step_model
 from msg_analysis.model.trajectory import Trajectory
@@ -94,12 +95,8 @@ def _first_early_use(trajectory: Trajectory) -> tuple[float, str] | None:
     assert made is not None
     assert modes is not None
     model = build_step_model(trajectory.record.experiment)
-    senders = np.zeros((model.modes + 1, *used.shape[1:]), dtype=np.int64)  # the last one where there is no graph
-    for mode in range(model.modes):
-        for i in range(model.agents):
-            neighbours = model.neighbours(mode, i)
-            senders[mode, i, : len(neighbours)] = neighbours
-    sender = senders[modes[1:], np.arange(model.agents)]
+    # Where a state is missing, and with it its graph, these are those of some graph: nothing was used there.
+    sender = neighbour_tables(model).senders[modes[1:], np.arange(model.agents)]
     early = (used >= 0) & (made[1:] >= 0)[:, :, None] & (made[used, sender] >= made[1:, :, None])
 
     def describe(step: int, agent: int, which: int) -> str:
