@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-import networkx as nx
 import numpy as np
-import scipy.linalg
 
+from msg_analysis.model.graphs import hops
 from msg_analysis.types import FloatArray
 
 Time = Literal["continuous", "discrete"]
@@ -58,21 +58,24 @@ class MarkovChain:
         """Number of graphs n."""
         return len(self.matrix)
 
-    def _graph(self) -> nx.DiGraph:
-        digraph: nx.DiGraph = nx.DiGraph()
-        digraph.add_nodes_from(range(self.modes))
-        digraph.add_edges_from((int(i), int(j)) for i, j in np.argwhere(self.matrix > 0))
-        return digraph
-
     @property
     def irreducible(self) -> bool:
         """Whether every graph can be reached from every other one."""
-        return bool(nx.is_strongly_connected(self._graph()))
+        jumps = self.matrix > 0
+        return bool((hops(jumps, [0]) >= 0).all() and (hops(jumps.T, [0]) >= 0).all())
+
+    @property
+    def period(self) -> int:
+        """Greatest common divisor of the lengths of all cycles of an irreducible chain; 1 in continuous time."""
+        if self.time == "continuous":
+            return 1
+        level, jumps = hops(self.matrix > 0, [0]), np.argwhere(self.matrix > 0)
+        return math.gcd(*(int(level[i]) + 1 - int(level[j]) for i, j in jumps))
 
     @property
     def ergodic(self) -> bool:
         """Irreducible and, in discrete time, aperiodic (assumption 1 of the paper)."""
-        return self.irreducible and (self.time == "continuous" or bool(nx.is_aperiodic(self._graph())))
+        return self.irreducible and self.period == 1
 
     @property
     def stationary(self) -> FloatArray:
@@ -83,6 +86,8 @@ class MarkovChain:
         """(n, n) law of the graph one step later: expm(Gamma dt), or P itself in discrete time."""
         if self.time == "discrete":
             return self.matrix.copy()
+        import scipy.linalg  # here, since every agent's process would wait for it
+
         transition = np.clip(np.asarray(scipy.linalg.expm(self.matrix * dt), dtype=float), 0.0, None)
         return np.asarray(transition / transition.sum(axis=1, keepdims=True))
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import scipy
 
 import msg_analysis
 from msg_analysis.errors import InputError
@@ -26,6 +25,8 @@ FORMAT = 1
 
 def software_versions() -> dict[str, str]:
     """Versions of what computes a run's numbers."""
+    import scipy  # here, since the processes of a run only read their record
+
     return {
         "msg_analysis": msg_analysis.__version__,
         "python": platform.python_version(),

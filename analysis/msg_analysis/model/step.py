@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.linalg
 from threadpoolctl import threadpool_limits
 
+from msg_analysis.model.chain import MarkovChain
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -24,16 +24,14 @@ class Wiring:
     Attributes
     ----------
     links : (n, m, m) whether agent i uses what agent j publishes; the diagonal means nothing
-    transition : (n, n) P
-    stationary : (n,) pi
+    chain : the Markov chain that switches between the graphs
     initial : (n,) law of g(0)
     dt : simulated time of a step
     loss : probability that a directed message is ignored in a step
     """
 
     links: BoolArray
-    transition: FloatArray
-    stationary: FloatArray
+    chain: MarkovChain
     initial: FloatArray
     dt: float
     loss: float
@@ -47,6 +45,17 @@ class Wiring:
     def agents(self) -> int:
         """Number of agents m."""
         return int(self.links.shape[1])
+
+    @property
+    def transition(self) -> FloatArray:
+        """(n, n) P, the law of the graph one step later."""
+        with threadpool_limits(1):
+            return self.chain.transition(self.dt)
+
+    @property
+    def stationary(self) -> FloatArray:
+        """(n,) stationary law pi of the graph."""
+        return self.chain.stationary
 
     def inputs(self, mode: int, agent: int) -> IntArray:
         """Agents, ascending, whose values an agent uses under a mode; the agent itself always among them."""
@@ -108,12 +117,10 @@ def build_model(experiment: Experiment) -> Wiring:
     """What a run needs to know of its network: a ``StepModel`` where the law is linear, else its wiring alone."""
     if experiment.protocol is None or experiment.protocol.linear:
         return build_step_model(experiment)
-    transition, stationary, initial = _chain(experiment)
     return Wiring(
         links=_arcs(experiment),
-        transition=transition,
-        stationary=stationary,
-        initial=initial,
+        chain=experiment.chain,
+        initial=_first_graph(experiment),
         dt=experiment.step_length,
         loss=experiment.noise.loss,
     )
@@ -154,7 +161,6 @@ def build_step_model(experiment: Experiment) -> StepModel:
     lost = loss * coupling
     mean = weights - lost
     mean[:, range(agents), range(agents)] += lost.sum(axis=2)
-    transition, stationary, initial = _chain(experiment)
     return StepModel(
         links=links,
         weights=mean,
@@ -165,9 +171,8 @@ def build_step_model(experiment: Experiment) -> StepModel:
         delay=experiment.noise.delay,
         loss=loss,
         loss_variance=loss * (1 - loss) * coupling**2,
-        transition=transition,
-        stationary=stationary,
-        initial=initial,
+        chain=experiment.chain,
+        initial=_first_graph(experiment),
         grounded=grounded,
         reference=reference,
         dt=dt,
@@ -188,20 +193,19 @@ def _built_in(experiment: Experiment) -> FloatArray:
                 weights[mode, grounded] = 0.0
             else:
                 # The limit of exp(-(L + K)) for gains to infinity: leaders forget, followers no longer hear them.
+                import scipy.linalg  # here, since every agent's process would wait for it
+
                 block = np.ix_(follows, follows)
                 weights[mode][block] = scipy.linalg.expm(-z[block])
     return weights
 
 
-def _chain(experiment: Experiment) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """P, pi, and the law of g(0)."""
-    chain, first = experiment.chain, experiment.switching.initial
-    with threadpool_limits(1):
-        transition = chain.transition(experiment.step_length)
-    initial = chain.stationary
-    if first != "stationary":
-        initial = np.array([float(graph.name == first) for graph in experiment.graph_list])
-    return transition, chain.stationary, initial
+def _first_graph(experiment: Experiment) -> FloatArray:
+    """(n,): the law of g(0)."""
+    first = experiment.switching.initial
+    if first == "stationary":
+        return experiment.chain.stationary
+    return np.array([float(graph.name == first) for graph in experiment.graph_list])
 
 
 def _arcs(experiment: Experiment) -> BoolArray:

@@ -6,7 +6,6 @@ from itertools import combinations, pairwise
 from pathlib import Path
 from xml.etree.ElementTree import ParseError
 
-import networkx as nx
 import numpy as np
 
 from msg_analysis.model.graphs import Graph
@@ -43,9 +42,9 @@ def links(spec: GraphSpec, agents: int) -> list[Link]:
     elif spec.star is not None:
         pairs = [(spec.star.center, j) for j in range(1, agents + 1) if j != spec.star.center]
     elif spec.grid is not None:
-        columns = spec.grid[1]
-        grid = nx.grid_2d_graph(*spec.grid)
-        pairs = [(r * columns + c + 1, u * columns + v + 1) for (r, c), (u, v) in grid.edges]
+        labels = np.arange(1, spec.grid[0] * spec.grid[1] + 1).reshape(spec.grid)
+        beside, below = zip(labels[:, :-1].flat, labels[:, 1:].flat), zip(labels[:-1].flat, labels[1:].flat)
+        pairs = [(int(i), int(j)) for i, j in (*beside, *below)]
     else:
         pairs = list(combinations(range(1, agents + 1), 2))
     return [(i, j, 1.0) for i, j in pairs]
@@ -90,6 +89,8 @@ def read_graphml(name: str, file: Path) -> tuple[GraphSpec, int, list[str]]:
     -------
     the graph, the number of agents it has, and problems (then the rest means nothing)
     """
+    import networkx as nx  # here, since every process of a run would wait for it
+
     key = f"graphs.{name}.graphml"
     empty = GraphSpec(edges=[])
     try:

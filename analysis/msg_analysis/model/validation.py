@@ -7,14 +7,13 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-import networkx as nx
 import numpy as np
 
 from msg_analysis.model.chain import MarkovChain, Time
-from msg_analysis.model.graphs import Graph
+from msg_analysis.model.graphs import Graph, hops
 from msg_analysis.model.problems import problem, show
 from msg_analysis.model.spec import LeadersSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
-from msg_analysis.types import FloatArray
+from msg_analysis.types import BoolArray, FloatArray
 
 SUM_TOLERANCE = 1e-9
 STEP_TOLERANCE = 1e-9
@@ -134,18 +133,12 @@ def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> l
     """Graphs that cannot be reached from others, or the period of the chain (assumption 1 of the paper)."""
     if chain.ergodic:
         return []
-    jumps: nx.DiGraph[int] = nx.DiGraph()
-    jumps.add_nodes_from(range(chain.modes))
-    jumps.add_edges_from((int(i), int(j)) for i, j in np.argwhere(chain.matrix > 0))
     for source in range(chain.modes):
-        reached = nx.descendants(jumps, source) | {source}
-        if len(reached) < chain.modes:
-            lost = ", ".join(names[mode] for mode in range(chain.modes) if mode not in reached)
-            text = f"{lost} cannot be reached from {names[source]}"
+        unreached = np.flatnonzero(hops(chain.matrix > 0, [source]) < 0)
+        if unreached.size:
+            text = f"{', '.join(names[mode] for mode in unreached)} cannot be reached from {names[source]}"
             return [problem(key, text, "expected an ergodic chain", "let every graph lead to every other one")]
-    level = nx.single_source_shortest_path_length(jumps, 0)
-    period = math.gcd(*(level[i] + 1 - level[j] for i, j in jumps.edges))
-    text = f"the chain has period {period}"
+    text = f"the chain has period {chain.period}"
     return [problem(key, text, "expected an ergodic chain", "give some graph a probability > 0 to stay")]
 
 
@@ -155,22 +148,32 @@ def connection_problems(graphs: Sequence[Graph], leaders: LeadersSpec | None) ->
     Disagreement (deviation from the reference) is mean-square stable only if the union has an agent (leaders)
     from which every other one is reached.
     """
-    union = nx.from_numpy_array(np.sum([graph.adjacency for graph in graphs], axis=0).T, create_using=nx.DiGraph)
-    if leaders is not None:
-        sources = {label - 1 for label in leaders.agents}
-        reached = sources.union(*(nx.descendants(union, source) for source in sources))
-    else:
-        groups = nx.condensation(union)
-        roots = [groups.nodes[group]["members"] for group in groups if groups.in_degree(group) == 0]
-        reach = [set(members) | nx.descendants(union, next(iter(members))) for members in roots]
-        reached = max(reach, key=len)
-        sources = roots[reach.index(reached)]
-    lost = sorted(set(union) - reached)
+    union = np.any([graph.adjacency.T > 0 for graph in graphs], axis=0)
+    sources = _widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
+    lost = np.flatnonzero(hops(union, sources) < 0).tolist()
     if not lost:
         return []
-    start = "a leader" if leaders is not None else f"agent{_list(sorted(sources))}"
+    start = "a leader" if leaders is not None else f"agent{_list(sources)}"
     text = f"agent{_list(lost)} cannot be reached from {start} in the union of all graphs"
     return [problem("graphs", text, "expected a union that connects everybody", "add an edge, or lower `agents`")]
+
+
+def _widest_reaching(leads: BoolArray) -> list[int]:
+    """The vertices from which the most others are reached, those only of one strongly connected component.
+
+    Parameters
+    ----------
+    leads : (v, v) whether an arc leads from i to j
+    """
+    known = np.zeros(len(leads), dtype=bool)
+    widest, reached = 0, known.copy()
+    for vertex in range(len(leads)):
+        if not known[vertex]:  # else whoever was found to reach it reaches as many at least
+            found = hops(leads, [vertex]) >= 0
+            known |= found
+            if found.sum() > reached.sum():
+                widest, reached = vertex, found
+    return np.flatnonzero(reached & (hops(leads.T, [widest]) >= 0)).tolist()
 
 
 def _list(agents: Sequence[int], longest: int = 8) -> str:
