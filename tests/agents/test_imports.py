@@ -108,3 +108,19 @@ def test_what_needs_no_ros_does_without(file: str) -> None:
     needed = {name.split(".")[0] for name in imported(AGENTS / file)}
     assert "rclpy" not in needed
     assert "msg_agents_interfaces" not in needed
+
+
+def test_processes_of_a_run_import_little() -> None:
+    """With these a network would take twice as long to start: every agent is a process that imports all it needs."""
+    code = (
+        "import sys\n"
+        "import msg_agents.agent, msg_agents.group, msg_agents.process, msg_agents.recorder, msg_agents.switcher\n"
+        "from msg_analysis.model.experiment import Experiment\n"
+        "from msg_analysis.model.step import build_model\n"
+        "document = {'name': 'two', 'graphs': {'pair': {'path': [1, 2]}, 'grid': {'grid': [1, 2]}},\n"
+        "            'switching': {'generator': [[-1, 1], [1, -1]]}}\n"
+        "build_model(Experiment.parse(document))\n"
+        "print([name for name in ('scipy', 'networkx', 'matplotlib', 'rich', 'rosbags') if name in sys.modules])"
+    )
+    process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
+    assert process.stdout.splitlines()[-1:] == ["[]"], process.stdout + process.stderr

@@ -13,6 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from msg_analysis.errors import NotAvailableError
 from msg_analysis.model import protocols, topology, validation
 from msg_analysis.model.chain import MarkovChain, Time
+from msg_analysis.model.document import read_yaml
 from msg_analysis.model.graphs import Graph
 from msg_analysis.model.problems import ExperimentError, problem, show, translate
 from msg_analysis.model.protocols import ChosenProtocol, ProtocolInfo
@@ -69,8 +70,6 @@ class Experiment:
         InputError : the file cannot be read or is not YAML
         ExperimentError : the experiment is not valid; names every mistake
         """
-        from msg_analysis.model.document import read_yaml  # here, since the processes of a run read no YAML
-
         path = Path(path)
         return cls.parse(read_yaml(path), source=str(path), directory=path.parent)
 

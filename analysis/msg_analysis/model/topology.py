@@ -43,7 +43,8 @@ def links(spec: GraphSpec, agents: int) -> list[Link]:
         pairs = [(spec.star.center, j) for j in range(1, agents + 1) if j != spec.star.center]
     elif spec.grid is not None:
         labels = np.arange(1, spec.grid[0] * spec.grid[1] + 1).reshape(spec.grid)
-        beside, below = zip(labels[:, :-1].flat, labels[:, 1:].flat), zip(labels[:-1].flat, labels[1:].flat)
+        beside = np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1)
+        below = np.stack([labels[:-1].ravel(), labels[1:].ravel()], axis=1)
         pairs = [(int(i), int(j)) for i, j in (*beside, *below)]
     else:
         pairs = list(combinations(range(1, agents + 1), 2))

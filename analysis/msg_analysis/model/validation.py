@@ -134,8 +134,8 @@ def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> l
     if chain.ergodic:
         return []
     for source in range(chain.modes):
-        unreached = np.flatnonzero(hops(chain.matrix > 0, [source]) < 0)
-        if unreached.size:
+        unreached = np.flatnonzero(hops(chain.matrix > 0, [source]) < 0).tolist()
+        if unreached:
             text = f"{', '.join(names[mode] for mode in unreached)} cannot be reached from {names[source]}"
             return [problem(key, text, "expected an ergodic chain", "let every graph lead to every other one")]
     text = f"the chain has period {chain.period}"

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import math
+import re
 
+import networkx as nx
 import numpy as np
 import pytest
 import scipy.linalg
@@ -13,8 +16,10 @@ from hypothesis import strategies as st
 
 from msg_analysis.model.chain import MarkovChain, stationary_law
 from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.graphs import Graph, hops
 from msg_analysis.model.path import mode_path, sojourns
 from msg_analysis.model.step import build_step_model
+from msg_analysis.model.validation import connection_problems
 
 
 def generator_of(seed: int, n: int) -> np.ndarray:
@@ -45,6 +50,37 @@ def test_ergodicity() -> None:
     assert MarkovChain("discrete", flip).irreducible
     assert not MarkovChain("discrete", flip).ergodic
     assert MarkovChain("continuous", np.zeros((1, 1))).ergodic
+
+
+@given(st.integers(0, 10_000), st.integers(1, 7), st.floats(0.05, 0.9))
+def test_reachability_and_period_against_networkx(seed: int, n: int, density: float) -> None:
+    jumps = np.random.default_rng(seed).random((n, n)) < density
+    digraph = nx.from_numpy_array(jumps, create_using=nx.DiGraph)
+    level = hops(jumps, [0])
+    assert {v: d for v, d in enumerate(level.tolist()) if d >= 0} == nx.single_source_shortest_path_length(digraph, 0)
+    chain = MarkovChain("discrete", jumps / np.maximum(jumps.sum(axis=1, keepdims=True), 1))
+    assert chain.irreducible == nx.is_strongly_connected(digraph)
+    if chain.irreducible and jumps.any():
+        assert chain.period == math.gcd(*(len(cycle) for cycle in nx.simple_cycles(digraph)))
+
+
+@given(st.integers(0, 10_000), st.integers(2, 8), st.floats(0.05, 0.4))
+def test_whom_nothing_connects_against_networkx(seed: int, agents: int, density: float) -> None:
+    hears = np.random.default_rng(seed).random((agents, agents)) < density
+    np.fill_diagonal(hears, False)
+    digraph = nx.from_numpy_array(hears.T, create_using=nx.DiGraph)
+    reached = max(len(nx.descendants(digraph, v)) + 1 for v in digraph)
+    found = connection_problems([Graph("graph", hears.astype(float))], None)
+    assert bool(found) == (reached < agents)
+    if found:
+        lost, sources = re.fullmatch(
+            r".*: agents? (.*) cannot be reached from agents? ([\d, ]*) in.*", found[0]
+        ).groups()  # type: ignore[union-attr]
+        unreached, roots = ({int(label) - 1 for label in text.split(", ")} for text in (lost, sources))
+        for root in roots:
+            assert set(digraph) - nx.descendants(digraph, root) - {root} == unreached
+        assert len(unreached) == agents - reached
+        assert roots in list(nx.strongly_connected_components(digraph))
 
 
 def setup(time: str, matrix: np.ndarray, steps: int, dt: float = 0.3, **switching: object) -> Experiment:
