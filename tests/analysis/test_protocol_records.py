@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from euler import Euler, EulerSteps, experiment
 from pydantic import Field
 
 from msg_agents.check import check
@@ -16,47 +17,10 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.store import write_trajectory
 from msg_analysis.errors import InputError
 from msg_analysis.inference.compare import compare
-from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord
-from msg_analysis.protocol import Heard, LinearProtocol, Parameters, Protocol
+from msg_analysis.protocol import Parameters
 from msg_analysis.report.info import describe_bag
 from msg_analysis.twin import new_record, simulate
-from msg_analysis.types import FloatArray
-
-
-def document(protocol: dict[str, Any] | None, **changes: Any) -> dict[str, Any]:
-    """Five agents on a line and a ring; ``run`` is merged, other keys are replaced."""
-    run = {"dt": 0.1, "duration": 60, "replicas": 3, "seed": 5, "start": [1, 2, 3, 4, 5]} | changes.pop("run", {})
-    return {
-        "name": "net",
-        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"edges": [[1, 2], [2, 3, 0.5], [3, 4], [4, 5], [5, 1]]}},
-        "switching": {"generator": [[-1, 1], [2, -2]]},
-        **({"protocol": protocol} if protocol else {}),
-        **changes,
-        "run": run,
-    }
-
-
-def experiment(protocol: dict[str, Any] | None, **changes: Any) -> Experiment:
-    return Experiment.parse(document(protocol, **changes))
-
-
-class Euler(LinearProtocol):
-    """The built-in law, declared."""
-
-    def weights(self, mode: int) -> FloatArray:
-        return np.eye(self.network.agents) - self.network.dt * self.network.graphs[mode].laplacian
-
-
-class EulerSteps(Protocol):
-    """The built-in law, step by step."""
-
-    tracking = True
-
-    def step(self, k: int, mode: int, state: FloatArray, heard: Heard, noise: FloatArray) -> FloatArray:
-        gain = self.network.leader_gains[self.agent]
-        pull = heard.weighted_sum(heard.values - state[0]) + gain * (self.network.reference - state[0])
-        return state + self.network.dt * pull + noise
 
 
 class OptionalParameters(Parameters):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import yaml
+from euler import DIRECTED, Euler, EulerSteps, experiment
 
 from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
@@ -35,42 +36,6 @@ from msg_analysis.twin import new_record, simulate
 from msg_analysis.types import FloatArray
 
 AIR = {"process": 0.3, "broadcast": 0.2, "link": 0.1, "loss": 0.25}
-DIRECTED = {"a": {"arcs": [[1, 2], [2, 3], [3, 4], [4, 5], [5, 1]]}, "b": {"path": [1, 2, 3, 4, 5]}}
-
-
-def document(protocol: dict[str, Any] | None, **changes: Any) -> dict[str, Any]:
-    """Five agents on a line and a ring; ``run`` is merged, other keys are replaced."""
-    run = {"dt": 0.1, "duration": 60, "replicas": 3, "seed": 5, "start": [1, 2, 3, 4, 5]} | changes.pop("run", {})
-    return {
-        "name": "net",
-        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"edges": [[1, 2], [2, 3, 0.5], [3, 4], [4, 5], [5, 1]]}},
-        "switching": {"generator": [[-1, 1], [2, -2]]},
-        **({"protocol": protocol} if protocol else {}),
-        **changes,
-        "run": run,
-    }
-
-
-def experiment(protocol: dict[str, Any] | None, **changes: Any) -> Experiment:
-    return Experiment.parse(document(protocol, **changes))
-
-
-class Euler(LinearProtocol):
-    """The built-in law, declared."""
-
-    def weights(self, mode: int) -> FloatArray:
-        return np.eye(self.network.agents) - self.network.dt * self.network.graphs[mode].laplacian
-
-
-class EulerSteps(Protocol):
-    """The built-in law, step by step."""
-
-    tracking = True
-
-    def step(self, k: int, mode: int, state: FloatArray, heard: Heard, noise: FloatArray) -> FloatArray:
-        gain = self.network.leader_gains[self.agent]
-        pull = heard.weighted_sum(heard.values - state[0]) + gain * (self.network.reference - state[0])
-        return state + self.network.dt * pull + noise
 
 
 class Rounding(Protocol):
