@@ -7,19 +7,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from pydantic import TypeAdapter, ValidationError
-
 from msg_analysis.errors import NotAvailableError
-from msg_analysis.model import protocols, topology, validation
+from msg_analysis.model import protocols, validation
 from msg_analysis.model.chain import MarkovChain, Time
 from msg_analysis.model.document import read_yaml
 from msg_analysis.model.graphs import Graph
-from msg_analysis.model.problems import ExperimentError, problem, show, translate
+from msg_analysis.model.problems import ExperimentError, problem, show
 from msg_analysis.model.protocols import ChosenProtocol, ProtocolInfo
+from msg_analysis.model.sections import Sections
 from msg_analysis.model.spec import (
     ExperimentSpec,
-    GraphSpec,
     LeadersSpec,
     NoiseSpec,
     Purpose,
@@ -100,13 +97,25 @@ class Experiment:
                 source,
                 [problem("experiment", show(mapping), "expected keys with values", "start with `name:`")],
             )
-        sections = _Sections(mapping, recorded)
+        sections = Sections(mapping, recorded)
         sections.resolve(directory or Path())
         if sections.problems:
             raise ExperimentError(source, sections.problems)
-        experiment = sections.experiment(source)
-        if sections.problems:
-            raise ExperimentError(source, sections.problems)
+        assert sections.chain is not None
+        assert sections.noise_gain is not None
+        experiment = cls(
+            sections.spec(), sections.graphs, sections.chain, sections.noise_gain, source, sections.protocol
+        )
+        return experiment._with_protocol(sections.protocol, recorded) if sections.protocol else experiment
+
+    def _with_protocol(self, protocol: ChosenProtocol, recorded: ProtocolInfo | None) -> Experiment:
+        """The same with a protocol that knows its network."""
+        bound, found = protocols.bind(protocol, self, recorded)
+        experiment = replace(self, protocol=bound)
+        size = experiment.agents, len(self.graph_list), experiment.steps, experiment.width
+        found += validation.memory_problems(*size, 0, experiment.truth)
+        if found:
+            raise ExperimentError(self.source, found)
         return experiment
 
     def to_document(self) -> dict[str, Any]:
@@ -233,7 +242,7 @@ class Experiment:
     @property
     def leader_gains(self) -> FloatArray:
         """(m,) kappa; 0 for followers, inf for grounded leaders."""
-        return _leader_gains(self.leaders, self.agents)
+        return validation.leader_gains(self.leaders, self.agents)
 
     @property
     def reference(self) -> float:
@@ -254,159 +263,3 @@ class Experiment:
 def json_schema() -> dict[str, Any]:
     """JSON Schema of the experiment file, for editors."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | ExperimentSpec.model_json_schema()
-
-
-def _leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
-    gains = np.zeros(agents)
-    if leaders:
-        gains[np.array(leaders.agents) - 1] = leaders.gain
-    return gains
-
-
-class _Sections:
-    """A document on its way: each section is None as long as it is not known to be good.
-
-    So a mistake in one section does not hide those in the others.
-    """
-
-    def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
-        self.problems: list[str] = []
-        bad: set[str] = set()
-        try:
-            ExperimentSpec.model_validate(dict(mapping))
-        except ValidationError as error:
-            self.problems += [translate(detail) for detail in error.errors(include_url=False)]
-            bad = {str(detail["loc"][0]) for detail in error.errors(include_url=False)}
-
-        def section(key: str) -> Any:
-            if key in bad:
-                return None
-            info = ExperimentSpec.model_fields[key]
-            if key not in mapping:
-                return info.get_default(call_default_factory=True, validated_data={})
-            annotation: Any = info.annotation
-            return TypeAdapter(annotation).validate_python(mapping[key])
-
-        self.values = {key: section(key) for key in ExperimentSpec.model_fields}
-        self.known = set(self.values) - bad
-        run = self.values["run"]
-        if run is not None and self.values["time"] == "discrete" and "dt" not in run.model_fields_set:
-            self.values["run"] = run.model_copy(update={"dt": 1.0})
-        self.agents: int | None = None
-        self.graphs: tuple[Graph, ...] = ()
-        self.chain: MarkovChain | None = None
-        self.noise_gain: FloatArray | None = None
-        self._recorded = recorded
-        self._protocol: ChosenProtocol | None = None
-
-    def resolve(self, directory: Path) -> None:
-        """Find everything that several keys say together, and every mistake in it."""
-        time, run, leaders = self.values["time"], self.values["run"], self.values["leaders"]
-        self._find_protocol()
-        self._count_agents(directory)
-        leaders_good = self.values["problem"] is not None and "leaders" in self.known
-        if leaders_good:
-            found = validation.leader_problems(self.values["problem"], leaders, self.agents)
-            leaders_good = not found
-            self.problems += found
-        if self.values["graphs"] and self.values["switching"] and time:
-            self.chain, found = validation.chain_of(self.values["switching"], list(self.values["graphs"]), time)
-            self.problems += found
-        whole_steps = False
-        if run and time:
-            found = validation.run_problems(run, time, self.agents)
-            whole_steps = not found
-            self.problems += found
-        if self.agents is None or not self._fits(run if whole_steps else None):
-            return
-        if self.values["noise"]:
-            names = list(self.values["graphs"])
-            self.noise_gain, found = validation.noise_gain_of(self.values["noise"], names, self.agents)
-            self.problems += found
-        self._build_graphs()
-        if not self.graphs or not leaders_good:
-            return
-        self.problems += validation.connection_problems(self.graphs, leaders)
-        built_in = "protocol" in self.known and self.values["protocol"] is None
-        if time == "continuous" and run and built_in:
-            gains = _leader_gains(leaders, self.agents)
-            self.problems += validation.stability_problems(self.graphs, gains, run.dt)
-
-    def experiment(self, source: str) -> Experiment:
-        """The experiment, once there are no problems."""
-        assert self.chain is not None
-        assert self.noise_gain is not None
-        spec = ExperimentSpec.model_construct(**(self.values | {"agents": self.agents}))
-        experiment = Experiment(spec, self.graphs, self.chain, self.noise_gain, source, self._protocol)
-        return self._with_protocol(experiment, self._protocol) if self._protocol else experiment
-
-    def _find_protocol(self) -> None:
-        """The protocol and its parameters, with their defaults written out."""
-        spec = self.values["protocol"]
-        if spec is None:
-            return
-        self._protocol, found = protocols.find(spec, self._recorded)
-        self.problems += found
-        if self._protocol and self._protocol.parameters is not None:
-            parameters = self._protocol.parameters.model_dump(mode="json")
-            self.values["protocol"] = type(spec).model_validate({"name": spec.name, **parameters})
-
-    def _with_protocol(self, experiment: Experiment, protocol: ChosenProtocol) -> Experiment:
-        """The same with a protocol that knows its network."""
-        bound, found = protocols.bind(protocol, experiment, self._recorded)
-        self.problems += found
-        experiment = replace(experiment, protocol=bound)
-        size = experiment.agents, len(self.graphs), experiment.steps, experiment.width
-        self.problems += validation.memory_problems(*size, 0, experiment.truth)
-        return experiment
-
-    def _count_agents(self, directory: Path) -> None:
-        """The number of agents, once every graph says which it needs; GraphML files are read here."""
-        graphs: dict[str, GraphSpec] | None = self.values["graphs"]
-        if graphs is None or "agents" not in self.known:
-            return
-        declared = self.values["agents"]
-        largest = 0
-        before = len(self.problems)
-        for name, spec in list(graphs.items()):
-            if name == "stationary":
-                wanted = "expected another name, since switching.initial uses this one"
-                self.problems.append(problem("graphs", "'stationary'", wanted, "rename the graph"))
-            if len(spec.kinds) != 1:
-                given = " and ".join(spec.kinds) or "nothing"
-                wanted = f"expected one of {', '.join(GraphSpec.model_fields)}"
-                self.problems.append(problem(f"graphs.{name}", given, wanted, "give exactly one"))
-            elif spec.graphml is not None:
-                resolved, count, found = topology.read_graphml(name, directory / spec.graphml)
-                graphs[name] = resolved
-                largest = max(largest, count)
-                self.problems += found
-            else:
-                largest = max(largest, topology.largest_label(spec))
-        if len(self.problems) > before:
-            return
-        untold = all(spec.complete or spec.star for spec in graphs.values())
-        if declared is None and (untold or largest < 2):
-            wanted = "expected the number of agents, since no graph tells it"
-            self.problems.append(problem("agents", "missing", wanted, "for example agents: 5"))
-        else:
-            self.agents = declared or largest
-
-    def _fits(self, run: RunSpec | None) -> bool:
-        assert self.agents is not None
-        steps = round(run.duration / run.dt) if run else 1
-        replicas = run.replicas if run else 1
-        noise = self.values["noise"]
-        delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)
-        modes = len(self.values["graphs"])
-        found = validation.memory_problems(self.agents, modes, steps, replicas, delay, truth)
-        self.problems += found
-        return not found
-
-    def _build_graphs(self) -> None:
-        assert self.agents is not None
-        graphs: dict[str, GraphSpec] = self.values["graphs"]
-        found = [line for name, spec in graphs.items() for line in topology.link_problems(name, spec, self.agents)]
-        self.problems += found
-        if not found:
-            self.graphs = tuple(topology.build_graph(name, spec, self.agents) for name, spec in graphs.items())

@@ -357,3 +357,11 @@ def amount(size: float) -> str:
             return f"{size:.3g} {unit}"
         size /= 1000
     raise AssertionError
+
+
+def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
+    """(m,) kappa; 0 for followers, inf for grounded leaders."""
+    gains = np.zeros(agents)
+    if leaders:
+        gains[np.array(leaders.agents) - 1] = leaders.gain
+    return gains
