@@ -14,11 +14,12 @@ import click
 
 import msg_analysis
 from msg_analysis import cli_theory
+from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, print_json, result_console
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    pass
+    from msg_analysis.bags.storage import Compression
 
 
 _json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
@@ -61,7 +62,15 @@ def predict(experiment: Path, as_json: bool) -> None:
 @click.option("--out", type=click.Path(path_type=Path), help="Bag directory to write; <name>_twin by default.")
 @click.option("--seed", type=int, help="Instead of run.seed.")
 @click.option("--duration", type=float, help="Instead of run.duration [units of simulated time].")
-def simulate(experiment: Path, out: Path | None, seed: int | None, duration: float | None) -> None:
+@storage_options
+def simulate(
+    experiment: Path,
+    out: Path | None,
+    seed: int | None,
+    duration: float | None,
+    compression: Compression,
+    split_size: float | None,
+) -> None:
     """Run EXPERIMENT without ROS and write its bag, whose name is printed."""
     from msg_analysis.bags.store import write_trajectory
     from msg_analysis.model.experiment import Experiment
@@ -73,7 +82,7 @@ def simulate(experiment: Path, out: Path | None, seed: int | None, duration: flo
     directory = out or Path(f"{loaded.name}_twin")
     if directory.exists():
         raise InputError(f"{directory}: exists already: remove it, or choose another name with --out")
-    write_trajectory(simulate_experiment(loaded), directory)
+    write_trajectory(simulate_experiment(loaded), directory, storage(compression, split_size))
     click.echo(directory)
 
 
@@ -188,17 +197,38 @@ def figures(example: str, out: Path, formats: tuple[str, ...]) -> None:
 def info(source: Path, as_json: bool) -> None:
     """Explain an experiment file, or say what a bag holds."""
     from msg_analysis.model.experiment import Experiment
-    from msg_analysis.report import text
+    from msg_analysis.report import bag_text, text
     from msg_analysis.report.info import describe_bag, describe_experiment
 
-    if source.is_dir() or source.suffix == ".mcap":
-        document, show = describe_bag(source), text.print_bag
+    if source.is_dir() or ".mcap" in source.suffixes:
+        document, show = describe_bag(source), bag_text.print_bag
     else:
         document, show = describe_experiment(Experiment.load(source)), text.print_experiment
     if as_json:
         print_json(document)
     else:
         show(document, result_console())
+
+
+@main.command(epilog=examples("msg-analysis salvage runs/line_ring_20250101_120000 whole"))
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path))
+@_json
+def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
+    """Make OUT, a valid bag, of what is whole in the torn or damaged BAG; say what was dropped.
+
+    BAG is left as it is; OUT must not exist.
+    """
+    from msg_analysis.bags.salvage import salvage as salvage_bag
+    from msg_analysis.report.info import describe_salvage
+
+    document = describe_salvage(out, salvage_bag(bag, out))
+    if as_json:
+        print_json(document)
+    else:
+        from msg_analysis.report.bag_text import print_salvage
+
+        print_salvage(document, result_console())
 
 
 main.add_command(cli_theory.transient)

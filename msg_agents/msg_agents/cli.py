@@ -17,11 +17,13 @@ import click
 
 import msg_agents
 from msg_agents.environment import DISCOVERY_TIMEOUT, RESTARTS
+from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, result_console
 
 if TYPE_CHECKING:
     from msg_agents.node import NetworkNode
     from msg_agents.runner import RunResult
+    from msg_analysis.bags.storage import Compression
     from msg_analysis.model.experiment import Experiment
     from msg_analysis.model.record import RunRecord
 
@@ -64,6 +66,7 @@ def main() -> None:
 )
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own.")
 @click.option("--use-sim-time", is_flag=True, help=USE_SIM_TIME_HELP)
+@storage_options
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
 def run(
@@ -79,6 +82,8 @@ def run(
     restarts: int,
     domain: int | None,
     use_sim_time: bool,
+    compression: Compression,
+    split_size: float | None,
     executor: str | None,
     as_json: bool,
 ) -> None:
@@ -100,6 +105,7 @@ def run(
             domain=domain,
             restarts=restarts,
             use_sim_time=use_sim_time,
+            storage=storage(compression, split_size),
             on_progress=on_progress,
             on_note=lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True),
             environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
@@ -339,14 +345,17 @@ def switcher(
 @main.command(cls=_RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
 @_node_options
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Directory of the bag; must not exist.")
-def recorder(run_record: Path, *, out: Path, **options: Any) -> None:
+@storage_options
+def recorder(
+    run_record: Path, *, out: Path, compression: Compression, split_size: float | None, **options: Any
+) -> None:
     """Record the run in RUN_RECORD to a bag."""
     record = _load_record(run_record)
 
     def nodes() -> list[NetworkNode]:
         from msg_agents.recorder import Recorder
 
-        return [Recorder(record=record, directory=out)]
+        return [Recorder(record=record, directory=out, storage=storage(compression, split_size))]
 
     _run_nodes(nodes, record, **options)
 

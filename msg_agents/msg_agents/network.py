@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from msg_agents.environment import DISCOVERY_TIMEOUT
+from msg_analysis.bags.storage import DEFAULT, MEGABYTE, Storage
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import Experiment
 
@@ -73,6 +74,7 @@ def plan_network(
     checkpoints: Path | None = None,
     *,
     use_sim_time: bool = False,
+    storage: Storage = DEFAULT,
 ) -> list[ProcessPlan]:
     """The processes of a run, in the order in which they should be started.
 
@@ -83,6 +85,7 @@ def plan_network(
     bag : directory to record to; None: no recorder
     checkpoints : directory for what agents and switcher need to go on after being killed; None: they cannot
     use_sim_time : whether the nodes take the time from ``/clock``
+    storage : how the recorder stores the bag
 
     Raises
     ------
@@ -99,7 +102,10 @@ def plan_network(
     resumes = checkpoints is not None
     plans = []
     if bag is not None:
-        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *common)))
+        files: tuple[str, ...] = ("--compression", storage.compression)
+        if storage.split_size is not None:
+            files += ("--split-size", repr(storage.split_size / MEGABYTE))
+        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
     for index in range(count):
         # Neighbouring numbers share a process: in most graphs they are neighbours, and their messages stay inside.
         agents = tuple(range(index * experiment.agents // count, (index + 1) * experiment.agents // count))

@@ -34,6 +34,7 @@ from msg_agents.synchronizer import AGAIN, Refusal
 from msg_agents.timers import every
 from msg_analysis.bags.cdr import ActiveGraph, CdrError, StateFrame, decode_string, stamp_ns
 from msg_analysis.bags.schemas import network_topics
+from msg_analysis.bags.storage import DEFAULT, Storage
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
 from msg_analysis.model.payload import all_finite
@@ -56,13 +57,14 @@ class Recorder(NetworkNode):
     ----------
     record : of the run
     directory : of the bag; must not exist
+    storage : compression and size of its files
     """
 
-    def __init__(self, *, record: RunRecord, directory: Path) -> None:
+    def __init__(self, *, record: RunRecord, directory: Path, storage: Storage = DEFAULT) -> None:
         super().__init__("recorder", record=record)
         experiment = record.experiment
         topics = network_topics(experiment.agents, self.get_namespace(), truth=experiment.truth)
-        self.bag = BagWriter(directory, topics, record=record.to_json())
+        self.bag = BagWriter(directory, topics, record=record.to_json(), storage=storage)
         self._last = experiment.steps
         kinds = [(state_topic, experiment.run.replicas)]
         if experiment.truth:

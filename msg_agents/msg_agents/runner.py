@@ -22,6 +22,7 @@ from msg_agents.workshop import workshop
 from msg_analysis.bags.cdr import StateFrame
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
+from msg_analysis.bags.storage import DEFAULT, Storage
 from msg_analysis.bags.writer import RECORDING_MARKER
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment import Experiment
@@ -81,6 +82,7 @@ def run_network(
     domain: int | None = None,
     restarts: int = RESTARTS,
     use_sim_time: bool = False,
+    storage: Storage = DEFAULT,
     on_progress: Callable[[int], None] = lambda _: None,
     on_note: Callable[[str], None] = lambda _: None,
     environment: Mapping[str, str] | None = None,
@@ -94,6 +96,7 @@ def run_network(
     domain : ROS_DOMAIN_ID; a free one is chosen if not given
     restarts : how often, in all, agents or the switcher are started again when they were killed; once more ends the run
     use_sim_time : whether the nodes take the time from ``/clock``, which somebody else publishes in the same domain
+    storage : compression of the bag and size of its files
     on_progress : called a few times a second with the step that every agent has reached
     on_note : called with a line about what happens: a restart, a standstill
     environment : changes to the environment of the processes
@@ -125,7 +128,14 @@ def run_network(
                 Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
             ):
                 supervisor.start(
-                    plan_network(experiment, run_file, bag, checkpoints=checkpoints, use_sim_time=use_sim_time)
+                    plan_network(
+                        experiment,
+                        run_file,
+                        bag,
+                        checkpoints=checkpoints,
+                        use_sim_time=use_sim_time,
+                        storage=storage,
+                    )
                 )
                 _watch(supervisor, experiment.steps, result, restarts, interrupted, on_progress, on_note)
                 # Before the others are ended: what ends because we end it has not failed.

@@ -104,6 +104,9 @@ class McapFile:
                     stream = stack.enter_context(io.BufferedReader(unpacked))
                 yield from self._batches(stream, size)
         except (OSError, zstandard.ZstdError) as error:
+            if self.whole_bytes and isinstance(error, zstandard.ZstdError):
+                self.torn = f"cannot be unpacked beyond byte {self.whole_bytes}"
+                return
             raise BagError(f"{self.path}: cannot be read ({error})") from error
 
     def _batches(self, stream: io.BufferedReader, size: int) -> Iterator[Batch]:

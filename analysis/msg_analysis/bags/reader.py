@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from msg_analysis.bags.cdr import ActiveGraph, CdrError, decode_string
+from msg_analysis.bags.inventory import Inventory
 from msg_analysis.bags.mcapfile import Batch, McapFile
-from msg_analysis.bags.metadata import read_metadata
+from msg_analysis.bags.metadata import METADATA_FILE, read_metadata
 from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
 from msg_analysis.bags.states import StateColumns, States
 from msg_analysis.bags.writer import RECORD_NAME, recording_pid
@@ -29,9 +31,14 @@ _TOPICS = {
     ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
     STRING.full_name: re.compile(r"(?:^|/)(experiment)$"),
 }
+_ZSTD_FRAME, _COMPRESSED = b"\x28\xb5\x2f\xfd", "compressed message"
+_EACH_COMPRESSED = (
+    "every message in it is compressed by itself, which cannot be read: convert it, or record with "
+    "`--storage-preset-profile zstd_fast`"
+)
 
 
-def read_bag(path: str | Path) -> Trajectory:
+def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory:
     """The run that a bag holds.
 
     Parameters
@@ -39,6 +46,8 @@ def read_bag(path: str | Path) -> Trajectory:
     path : str | Path
         the directory of a bag, with metadata.yaml or without, or one of its .mcap files; torn files are read
         up to the tear
+    inventory : Inventory | None
+        is filled with what the files hold, also where no run can be made of it
 
     Returns
     -------
@@ -52,8 +61,18 @@ def read_bag(path: str | Path) -> Trajectory:
     """
     path = Path(path)
     contents = _Contents()
-    for file in bag_files(path):
-        contents.read(McapFile(file))
+    unreadable: list[BagError] = []
+    files = bag_files(path)
+    for file in files:
+        entry = (inventory or Inventory()).add(McapFile(file))
+        try:
+            contents.read(entry.file, entry.watch() if inventory else entry.file.batches())
+        except BagError as error:  # the recorder died when it had just made it, or it is damaged from the start
+            entry.problem = str(error)
+            unreadable.append(error)
+    if len(unreadable) == len(files):
+        raise unreadable[0]
+    contents.refused["unreadable file"] += len(unreadable)
     record = _choose(contents, path)
     return _trajectory(contents, record)
 
@@ -86,15 +105,14 @@ def bag_files(path: Path) -> list[Path]:
             f"{path}: its storage is {storage}, expected mcap: record with `ros2 bag record -s mcap`, or convert it"
         )
     if str(information.get("compression_mode", "")).lower() == "message":
-        raise BagError(
-            f"{path}: every message in it is compressed by itself, which cannot be read: convert it, or "
-            f"record with "
-            "`--storage-preset-profile zstd_fast`"
-        )
+        raise BagError(f"{path}: {_EACH_COMPRESSED}")
     files = [path / str(name) for name in information.get("relative_file_paths") or []]
     lost = [file.name for file in files if not file.is_file()]
     if lost or not files:
-        raise BagError(f"{path}: {', '.join(lost) or 'every file'} of its metadata.yaml is missing: copy the whole bag")
+        raise BagError(
+            f"{path}: {', '.join(lost) or 'every file'} of its {METADATA_FILE} is missing: copy the whole bag, or move "
+            f"{METADATA_FILE} away to read the files that are there"
+        )
     return files
 
 
@@ -115,9 +133,9 @@ class _Contents:
     records: dict[str, None] = field(default_factory=dict)  # the same from the metadata of our own files
     refused: Counter[str] = field(default_factory=Counter)
 
-    def read(self, file: McapFile) -> None:
+    def read(self, file: McapFile, batches: Iterable[Batch]) -> None:
         kinds: dict[int, str | None] = {}
-        for batch in file.batches():
+        for batch in batches:
             for number, channel in file.channels.items():
                 if number not in kinds:
                     schema = file.schemas.get(channel.schema_id)
@@ -147,12 +165,14 @@ class _Contents:
                 else:
                     self.experiments[decode_string(data)] = None
             except CdrError:
-                self.refused["undecodable"] += 1
+                self.refused[_COMPRESSED if data.startswith(_ZSTD_FRAME) else "undecodable"] += 1
 
 
 def _choose(contents: _Contents, path: Path) -> RunRecord:
     """The run record of the one run that has states."""
-    texts = contents.experiments or contents.records
+    texts = contents.experiments | contents.records
+    if not texts and contents.refused[_COMPRESSED]:
+        raise BagError(f"{path}: {_EACH_COMPRESSED}")
     if not texts:
         pid = recording_pid(path)
         hint = f" (process {pid} is still recording it)" if pid else ""

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import json
 import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import yaml
-from mcap.records import Channel
 from mcap.writer import CompressionType, Writer
 
+from msg_analysis.bags.inventory import FileInventory, channel_count
 from msg_analysis.bags.mcapfile import Batch, McapFile
-from msg_analysis.bags.metadata import (
-    METADATA_FILE,
-    ChannelCount,
-    FileCount,
-    bag_information,
-    dump,
-    write_metadata,
-)
+from msg_analysis.bags.metadata import METADATA_FILE, FileCount, bag_information, dump, write_metadata
 from msg_analysis.bags.reader import bag_files
-from msg_analysis.bags.writer import CHUNK_SIZE, RECORDING_MARKER, ROSBAG2_RECORD, recording_pid
+from msg_analysis.bags.writer import CHUNK_SIZE, RECORD_NAME, RECORDING_MARKER, ROSBAG2_RECORD, recording_pid
 from msg_analysis.errors import BagError
-
-_CUSTOM = {"complete": "false", "salvaged": "true"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +27,22 @@ class SalvageReport:
 
     Attributes
     ----------
-    kept_messages : in the new file; how many were in the lost part cannot be known
-    kept_bytes, dropped_bytes : of the torn file: its whole records, and what follows them
+    kept_messages : in the new bag
+    kept_bytes, dropped_bytes : of the torn files: their whole records, and what follows them. Of a file that is
+        compressed as a whole: kept when unpacked; how many are dropped is not known (0)
+    lost_messages : in damaged chunks of files that still say how many they had; what was in a part that is cut off
+        cannot be known
     damaged_chunks : chunks in the whole part whose content was lost
-    torn : what was there instead of the end of the file; None where it ended well
+    dropped_files : files of which nothing can be read
+    torn : what was there instead of the end of the file; None where all ended well
     """
 
     kept_messages: int
     kept_bytes: int
     dropped_bytes: int
+    lost_messages: int = 0
     damaged_chunks: int = 0
+    dropped_files: int = 0
     torn: str | None = None
 
     def __add__(self, other: SalvageReport) -> SalvageReport:
@@ -54,7 +51,9 @@ class SalvageReport:
             self.kept_messages + other.kept_messages,
             self.kept_bytes + other.kept_bytes,
             self.dropped_bytes + other.dropped_bytes,
+            self.lost_messages + other.lost_messages,
             self.damaged_chunks + other.damaged_chunks,
+            self.dropped_files + other.dropped_files,
             "; ".join(filter(None, (self.torn, other.torn))) or None,
         )
 
@@ -71,30 +70,42 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
 
     Raises
     ------
-    BagError : nothing can be read, or ``out`` exists or cannot be written
+    BagError : no message can be read, it is still being recorded, or ``out`` exists or cannot be written
     """
     out = Path(out).absolute()
+    _refuse_living(Path(torn))
     files = bag_files(Path(torn))
     workshop = out.with_name(f".{out.name}.{os.getpid()}")
     try:
         if out.exists():
             raise BagError(f"{out}: exists already: choose another name, or move it away first")
+        entries, total = _look(files)
+        if not total.kept_messages:
+            raise BagError(f"{torn}: no whole message is left in it: nothing can be salvaged")
         workshop.mkdir(parents=True)
-        report, counts = _copy_all(files, [workshop / f"{out.name}_{i}.mcap" for i in range(len(files))])
-        write_metadata(workshop, bag_information(counts, _CUSTOM))
+        counts = []
+        for number, entry in enumerate(entry for entry in entries if not entry.problem):
+            copy = workshop / f"{out.name}_{number}.mcap"
+            if entry.whole:
+                shutil.copyfile(entry.file.path, copy)
+                entry.count.name = copy.name
+                counts.append(entry.count)
+            else:
+                counts.append(_copy(entry.file.path, copy))
+        write_metadata(workshop, bag_information(counts, _custom(entries)))
         workshop.rename(out)
     except OSError as error:
         raise BagError(f"{out}: cannot be written ({error.strerror}): choose another place") from error
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
-    return report
+    return total
 
 
 def salvage_in_place(directory: str | Path) -> SalvageReport:
     """Make the directory of a recording that was cut short a bag.
 
-    Each file is first copied beside itself and replaced only when all copies are written; then comes
-    metadata.yaml. Where this fails, nothing is lost and it can be done again.
+    Whole files stay as they are. Each other one is first copied beside itself and replaced only when all copies are
+    written; then comes metadata.yaml. Where this fails, nothing is lost and it can be done again.
 
     Parameters
     ----------
@@ -108,40 +119,79 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
     directory = Path(directory).absolute()
     if (directory / METADATA_FILE).exists():
         raise BagError(f"{directory}: has its {METADATA_FILE}: it is a bag already, nothing to salvage")
-    pid = recording_pid(directory)
-    if pid is not None:
-        raise BagError(f"{directory}: process {pid} is recording it: stop that first")
-    files = bag_files(directory)
-    copies = [file.with_name(f".{file.name}.salvaged") for file in files]
+    _refuse_living(directory)
+    entries, total = _look(bag_files(directory))
+    saved: list[tuple[Path, Path | None, FileCount]] = []  # file, its copy, what is in it
     try:
-        report, counts = _copy_all(files, copies)
-        for file, copy, count in zip(files, copies, counts, strict=True):
-            target = file.with_name(file.name.removesuffix(".zstd"))  # the copy is compressed by chunks
-            copy.replace(target)
-            if target != file:
-                file.unlink()
-            count.name = target.name
-        write_metadata(directory, bag_information(counts, _CUSTOM))
+        for entry in (entry for entry in entries if not entry.problem):
+            file = entry.file.path
+            copy = None if entry.whole else file.with_name(f".{file.name}.salvaged")
+            saved.append((file, copy, entry.count))
+            if copy is not None:
+                saved[-1] = (file, copy, _copy(file, copy))
+        for file, copy, count in saved:
+            count.name = file.name
+            if copy is not None:
+                count.name = file.name.removesuffix(".zstd")  # the copy is compressed by chunks
+                copy.replace(file.with_name(count.name))
+                if count.name != file.name:
+                    file.unlink()
+        counts = [count for _, _, count in saved]
+        write_metadata(directory, bag_information(counts, _custom(entries)))
         (directory / RECORDING_MARKER).unlink(missing_ok=True)
     except OSError as error:
         raise BagError(f"{directory}: cannot be written ({error.strerror}): nothing was lost, try again") from error
     finally:
-        for copy in copies:
-            copy.unlink(missing_ok=True)
-    return report
+        for _, copy, _ in saved:
+            if copy is not None:
+                copy.unlink(missing_ok=True)
+    return total
 
 
-def _copy_all(files: Sequence[Path], copies: Sequence[Path]) -> tuple[SalvageReport, list[FileCount]]:
-    total = SalvageReport(0, 0, 0)
-    counts: list[FileCount] = []
-    for file, copy in zip(files, copies, strict=True):
-        report, count = _copy(file, copy)
-        total += report
-        counts.append(count)
-    return total, counts
+def _refuse_living(bag: Path) -> None:
+    pid = recording_pid(bag if bag.is_dir() else bag.parent)
+    if pid is not None:
+        raise BagError(f"{bag}: process {pid} is recording it: stop that first")
 
 
-def _copy(file: Path, copy: Path) -> tuple[SalvageReport, FileCount]:
+def _look(files: Sequence[Path]) -> tuple[list[FileInventory], SalvageReport]:
+    """Read all files, to know what is in them and what is not."""
+    entries, total = [], SalvageReport(0, 0, 0)
+    for file in files:
+        entry = FileInventory(McapFile(file), FileCount(file.name))
+        entries.append(entry)
+        try:
+            for _ in entry.watch():
+                pass
+        except BagError as error:
+            entry.problem = str(error)
+            if len(entries) == len(files) and all(entry.problem for entry in entries):
+                raise
+        total += _report(entry)
+    return entries, total
+
+
+def _report(entry: FileInventory) -> SalvageReport:
+    source, size = entry.file, entry.file.path.stat().st_size
+    if entry.problem:
+        return SalvageReport(0, 0, size, dropped_files=1)
+    dropped = 0 if source.torn is None else max(0, size - source.whole_bytes)
+    lost, damaged = entry.lost_messages or 0, source.damaged_chunks
+    return SalvageReport(entry.count.messages, source.whole_bytes, dropped, lost, damaged, torn=source.torn)
+
+
+def _custom(entries: Sequence[FileInventory]) -> dict[str, str]:
+    """Our entries in metadata.yaml: the first of the torn bag's own, and what became of it."""
+    custom = {"complete": "false", "salvaged": "true"}
+    for entry in entries:
+        for record in entry.file.metadata:
+            with contextlib.suppress(ValueError, KeyError, AttributeError):  # another's record of the same name
+                if record.name == RECORD_NAME:
+                    return {"run": str(json.loads(record.metadata["record"])["run"]), **custom}
+    return custom
+
+
+def _copy(file: Path, copy: Path) -> FileCount:
     """Write what is whole in one file to a new one."""
     source = McapFile(file)
     count = FileCount(copy.name)
@@ -158,13 +208,13 @@ def _copy(file: Path, copy: Path) -> tuple[SalvageReport, FileCount]:
             writer.add_metadata(record.name, record.metadata)
         for item in source.attachments:
             writer.add_attachment(item.create_time, item.log_time, item.name, item.media_type, item.data)
-        writer.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(bag_information([count], _CUSTOM))})
+        writer.add_metadata(
+            ROSBAG2_RECORD, {"serialized_metadata": dump(bag_information([count], {"salvaged": "true"}))}
+        )
         writer.finish()
         stream.flush()
         os.fsync(stream.fileno())
-    dropped = 0 if source.torn is None else max(0, file.stat().st_size - source.whole_bytes)
-    report = SalvageReport(count.messages, source.whole_bytes, dropped, source.damaged_chunks, source.torn)
-    return report, count
+    return count
 
 
 class _Channels:
@@ -194,7 +244,7 @@ class _Channels:
         self._channels[number] = self._writer.register_channel(
             channel.topic, channel.message_encoding, copied, channel.metadata
         )
-        self._count.channels.setdefault(channel.topic, _channel_count(channel, schema.name if schema else ""))
+        self._count.channels.setdefault(channel.topic, channel_count(channel, schema.name if schema else ""))
         return self._channels[number]
 
     def write(self, batch: Batch) -> None:
@@ -206,12 +256,3 @@ class _Channels:
             self._writer.add_message(self._register(number), log_time, data, publish_time, sequence)
             file.start, file.end = min(file.start, log_time), max(file.end, log_time)
             file.channels[self._source.channels[number].topic].messages += 1
-
-
-def _channel_count(channel: Channel, type_name: str) -> ChannelCount:
-    try:
-        qos: Any = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "[]"))
-    except yaml.YAMLError:
-        qos = []
-    type_hash = channel.metadata.get("topic_type_hash", "")
-    return ChannelCount(channel.topic, type_name, type_hash, qos if isinstance(qos, list) else [])

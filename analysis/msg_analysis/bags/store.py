@@ -10,6 +10,7 @@ import numpy as np
 
 from msg_analysis.bags.cdr import ActiveGraph, StateCodec, StepClock, encode_string
 from msg_analysis.bags.schemas import network_topics, state_topic, truth_topic
+from msg_analysis.bags.storage import DEFAULT, Storage
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
 from msg_analysis.model.air import LOST
@@ -19,7 +20,7 @@ from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.types import IntArray
 
 
-def write_trajectory(trajectory: Trajectory, directory: str | Path) -> None:
+def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT) -> None:
     """Write a bag, whole or not at all.
 
     Parameters
@@ -28,6 +29,8 @@ def write_trajectory(trajectory: Trajectory, directory: str | Path) -> None:
         of the twin, or read from another bag; what is missing in it is missing in the bag
     directory : str | Path
         of the bag; must not exist
+    storage : Storage
+        compression and size of its files
 
     Raises
     ------
@@ -44,7 +47,7 @@ def write_trajectory(trajectory: Trajectory, directory: str | Path) -> None:
             unfinished = Path(workshop) / directory.name
             noisy = trajectory.published is not None
             topics = network_topics(trajectory.record.experiment.agents, truth=noisy)
-            with BagWriter(unfinished, topics, record=record) as bag:
+            with BagWriter(unfinished, topics, record=record, storage=storage) as bag:
                 bag.write("/experiment", encode_string(record), 0)
                 for topic, data, time in _messages(trajectory):
                     bag.write(topic, data, time)

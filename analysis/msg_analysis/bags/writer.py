@@ -1,4 +1,4 @@
-"""Writes a bag that rosbag2, rosbags, Foxglove and PlotJuggler open: a directory with one MCAP file."""
+"""Writes a bag that rosbag2, rosbags, Foxglove and PlotJuggler open: a directory with MCAP files."""
 
 from __future__ import annotations
 
@@ -15,24 +15,29 @@ from mcap.writer import CompressionType, Writer
 
 from msg_analysis.bags.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
 from msg_analysis.bags.schemas import Topic
+from msg_analysis.bags.storage import DEFAULT, Compression, Storage
 from msg_analysis.errors import BagError
 
 # Small enough that a killed recorder loses little, large enough that zstd finds what the messages have in
-# common. Measured: 4 us of CPU per message of 16 replicas, with zstd or without; zstd takes a third off the
-# size.
+# common.
 CHUNK_SIZE = 256 * 1024
 RECORDING_MARKER = ".recording"
 RECORD_NAME = "msg_agents"  # of the MCAP metadata record with the run record
 ROSBAG2_RECORD = "rosbag2"
+COMPRESSION_TYPES: dict[Compression, CompressionType] = {
+    "none": CompressionType.NONE,
+    "zstd": CompressionType.ZSTD,
+    "lz4": CompressionType.LZ4,
+}
 
 
 class _Channel:
-    """Number of a topic in the file, and its count."""
+    """Number of a topic in the current file, its count there, and its messages in the files before."""
 
-    __slots__ = ("count", "id")
+    __slots__ = ("before", "count", "id")
 
-    def __init__(self, number: int, count: ChannelCount) -> None:
-        self.id, self.count = number, count
+    def __init__(self, number: int, count: ChannelCount, before: int) -> None:
+        self.id, self.count, self.before = number, count, before
 
 
 class BagWriter:
@@ -42,25 +47,34 @@ class BagWriter:
     ----------
     directory : of the bag; must not exist, or be empty
     topics : what it will hold
-    record : the run record as JSON; kept in the file as well, so that a torn bag still tells what run it is
-        of
+    record : the run record as JSON; kept in every file as well, so that a torn bag, or a single file of it, still tells
+        what run it is of
+    storage : compression, and whether the bag goes on in a new file when one is large enough. Each file is finished,
+        and on the disk, before the next one begins
 
     Raises
     ------
     BagError : the directory exists or cannot be made
     """
 
-    def __init__(self, directory: Path, topics: Sequence[Topic], *, record: str | None = None) -> None:
+    def __init__(
+        self, directory: Path, topics: Sequence[Topic], *, record: str | None = None, storage: Storage = DEFAULT
+    ) -> None:
         self.directory = Path(directory).absolute()
-        self._file = FileCount(f"{self.directory.name}_0.mcap")
+        self._topics, self._record = tuple(topics), record
+        self._compression, self._split_size = COMPRESSION_TYPES[storage.compression], storage.split_size
+        self._files: list[FileCount] = []
+        self._channels: dict[str, _Channel] = {}
         self._custom: dict[str, str] = {}
+        if record is not None:
+            self._custom["run"] = str(json.loads(record).get("run", ""))
         self._closed = False
         try:
             # It may be there already, empty: whoever starts several runs at once reserves their names that way.
             self.directory.mkdir(parents=True, exist_ok=True)
             if any(self.directory.iterdir()):
                 raise FileExistsError
-            self._stream: BinaryIO = (self.directory / self._file.name).open("xb")
+            self._stream: BinaryIO = self._next_stream()
             self._marker = (self.directory / RECORDING_MARKER).open("w", encoding="utf-8")
         except FileExistsError as error:
             raise BagError(f"{directory}: exists already: choose another name, or move it away first") from error
@@ -70,29 +84,51 @@ class BagWriter:
             fcntl.flock(self._marker, fcntl.LOCK_EX)  # the system takes it away when this process dies
             json.dump({"pid": os.getpid()}, self._marker)
             self._marker.flush()
-            self._mcap = Writer(self._stream, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD)
-            self._mcap.start(profile="ros2", library="mcap")
-            self._add_information()
-            if record is not None:
-                self._custom["run"] = str(json.loads(record).get("run", ""))
-                self._mcap.add_metadata(RECORD_NAME, {"record": record})
-            schemas: dict[str, int] = {}
-            self._channels: dict[str, _Channel] = {}
-            for topic in topics:
-                kind = topic.type.full_name
-                if kind not in schemas:
-                    schemas[kind] = self._mcap.register_schema(kind, "ros2msg", topic.type.schema.encode())
-                self._add_channel(topic, schemas[kind])
-            self._mcap.flush()
+            self._begin_file()
         except OSError as error:
             raise self._failed(error) from error
+
+    def _next_stream(self) -> BinaryIO:
+        self._file = FileCount(f"{self.directory.name}_{len(self._files)}.mcap")
+        self._files.append(self._file)
+        return (self.directory / self._file.name).open("xb")
+
+    def _begin_file(self) -> None:
+        """All that is needed to read this file without the others."""
+        self._mcap = Writer(self._stream, chunk_size=CHUNK_SIZE, compression=self._compression)
+        self._mcap.start(profile="ros2", library="mcap")
+        self._add_information()
+        if self._record is not None:
+            self._mcap.add_metadata(RECORD_NAME, {"record": self._record})
+        schemas: dict[str, int] = {}
+        for topic in self._topics:
+            kind = topic.type.full_name
+            if kind not in schemas:
+                schemas[kind] = self._mcap.register_schema(kind, "ros2msg", topic.type.schema.encode())
+            self._add_channel(topic, schemas[kind])
+        self._mcap.flush()
+        # What stands at the head is not counted: it may be larger than the limit, and every file has it.
+        self._full = None if self._split_size is None else self._stream.tell() + self._split_size
 
     def _add_channel(self, topic: Topic, schema: int) -> None:
         count = ChannelCount(topic.name, topic.type.full_name, topic.type.type_hash, topic.qos)
         metadata = {"offered_qos_profiles": dump(topic.qos), "topic_type_hash": topic.type.type_hash}
         number = self._mcap.register_channel(topic.name, "cdr", schema, metadata)
-        self._channels[topic.name] = _Channel(number, count)
+        last = self._channels.get(topic.name)
+        self._channels[topic.name] = _Channel(number, count, last.before + last.count.messages if last else 0)
         self._file.channels[topic.name] = count
+
+    def _finish_file(self) -> None:
+        self._add_information()
+        self._mcap.finish()
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._stream.close()
+
+    def _split(self) -> None:
+        self._finish_file()
+        self._stream = self._next_stream()
+        self._begin_file()
 
     def write(self, topic: str, data: bytes, time_ns: int) -> None:
         """Append one message.
@@ -114,9 +150,12 @@ class BagWriter:
         if channel is None or self._closed:
             reason = "is closed" if self._closed else f"has no topic {topic}"
             raise BagError(f"{self.directory}: {reason}: nothing more can be written to it")
-        count = channel.count
         try:
-            self._mcap.add_message(channel.id, time_ns, data, time_ns, count.messages)
+            if self._full is not None and self._stream.tell() >= self._full:
+                self._split()
+                channel = self._channels[topic]
+            count = channel.count
+            self._mcap.add_message(channel.id, time_ns, data, time_ns, channel.before + count.messages)
         except OSError as error:
             raise self._failed(error) from error
         count.messages += 1
@@ -129,7 +168,7 @@ class BagWriter:
     @property
     def messages(self) -> int:
         """Written so far."""
-        return self._file.messages
+        return sum(file.messages for file in self._files)
 
     def flush(self) -> None:
         """Hand everything so far to the operating system, so that it survives the end of this process.
@@ -159,12 +198,8 @@ class BagWriter:
             return
         self._custom["complete"] = "true" if complete else "false"
         try:
-            self._add_information()
-            self._mcap.finish()
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
-            self._stream.close()
-            write_metadata(self.directory, bag_information([self._file], self._custom))
+            self._finish_file()
+            write_metadata(self.directory, bag_information(self._files, self._custom))
             (self.directory / RECORDING_MARKER).unlink()
             self._marker.close()
         except OSError as error:
@@ -172,7 +207,7 @@ class BagWriter:
         self._closed = True
 
     def _add_information(self) -> None:
-        information = bag_information([self._file], self._custom)
+        information = bag_information(self._files, self._custom)
         self._mcap.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(information)})
 
     def _failed(self, error: OSError) -> BagError:
@@ -208,6 +243,6 @@ def recording_pid(directory: Path) -> int | None:
                 fcntl.flock(marker, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 return int(json.load(marker)["pid"])
-    except OSError:
+    except (OSError, ValueError, KeyError, TypeError):  # no marker, or not one of ours
         pass
     return None

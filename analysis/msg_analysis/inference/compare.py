@@ -112,7 +112,7 @@ class Comparison:
             "experiment": record.experiment.name,
             "seed": record.experiment.run.seed,
             "level": self.level,
-            "completeness": asdict(self.trajectory.completeness),
+            "completeness": asdict(self.trajectory.completeness) | {"stretch": self.trajectory.stretch},
             "steps": self.steps,
             "simulated_time": self.steps * record.experiment.step_length,
             "law": self.laws.measured_against if self.laws else step_law(record.experiment),

@@ -95,3 +95,13 @@ class Trajectory:
         known = self.modes >= 0
         modes = int(np.argmin(known)) if not known.all() else len(known)
         return min(states - 1, modes)
+
+    @property
+    def stretch(self) -> tuple[int, int] | None:
+        """First and last step of the longest stretch in which every state is there; None where no step is whole."""
+        whole = np.concatenate(([0], self.present.all(axis=1), [0])).astype(np.int64)
+        first, behind = np.flatnonzero(np.diff(whole) == 1), np.flatnonzero(np.diff(whole) == -1)
+        if not len(first):
+            return None
+        longest = int(np.argmax(behind - first))
+        return int(first[longest]), int(behind[longest]) - 1

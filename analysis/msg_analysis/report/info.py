@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,10 @@ from msg_analysis.model import validation
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.graphs import Graph
 from msg_analysis.theory.prediction import predict
+
+if TYPE_CHECKING:
+    from msg_analysis.bags.inventory import FileInventory, Inventory
+    from msg_analysis.bags.salvage import SalvageReport
 
 
 def describe_experiment(experiment: Experiment) -> dict[str, Any]:
@@ -71,7 +75,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
 
 
 def describe_bag(path: Path) -> dict[str, Any]:
-    """What a bag holds.
+    """What a bag holds: whole or torn, of a run of ours or not.
 
     Parameters
     ----------
@@ -79,22 +83,56 @@ def describe_bag(path: Path) -> dict[str, Any]:
 
     Returns
     -------
-    ``bag``, ``run``, ``experiment``, ``seed``, ``agents``, ``replicas``, ``steps``, ``simulated_time``,
-    ``completeness``, ``files`` (each ``name``, ``size`` [bytes]), ``protocol`` (as of an experiment), ``versions``
+    ``bag``, ``recording`` (process that is writing it, or None), ``problem`` (why no run can be made of it; then what
+    is said of the run is None), ``run``, ``experiment``, ``seed``, ``agents``, ``replicas``, ``steps``,
+    ``simulated_time``, ``completeness``, ``prefix``, ``topics`` (each ``name``, ``type``, ``messages``), ``files``
+    (each ``name``, ``size`` [bytes]; those of the bag also ``messages``, ``start``, ``end`` [ns], ``compression``,
+    ``torn``, ``damaged_chunks``, ``lost_messages``, ``problem``), ``protocol`` (as of an experiment), ``versions``
 
     Raises
     ------
-    InputError : not a bag of a run
+    InputError : nothing of it can be read
     """
-    from msg_analysis.bags.reader import read_bag  # here: an experiment does not need it
+    from msg_analysis.bags.inventory import Inventory  # here: an experiment does not need it
+    from msg_analysis.bags.metadata import total_channels
+    from msg_analysis.bags.writer import recording_pid
 
-    trajectory = read_bag(path)
+    inventory = Inventory()
+    run = _describe_run(path, inventory)
+    entries = {entry.file.path: entry for entry in inventory.files}
+    others = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else []
+    files = [*entries, *(file for file in others if file not in entries)]
+    return {
+        "bag": str(path),
+        "recording": recording_pid(path),
+        **run,
+        "topics": [
+            {"name": topic.topic, "type": topic.type_name, "messages": topic.messages}
+            for topic in total_channels([entry.count for entry in inventory.files]).values()
+        ],
+        "files": [
+            {"name": file.name, "size": file.stat().st_size}
+            | (_describe_file(entries[file]) if file in entries else {})
+            for file in files
+        ],
+    }
+
+
+def _describe_run(path: Path, inventory: Inventory) -> dict[str, Any]:
+    from msg_analysis.bags.reader import read_bag
+
+    try:
+        trajectory = read_bag(path, inventory)
+    except InputError as error:
+        if all(entry.problem for entry in inventory.files):
+            raise
+        keys = ("run", "experiment", "seed", "agents", "replicas", "steps", "simulated_time", "completeness", "prefix")
+        return {"problem": str(error), **dict.fromkeys(keys), "protocol": None, "versions": {}}
     record = trajectory.record
     run = record.experiment.run
     completeness = trajectory.completeness
-    files = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
     return {
-        "bag": str(path),
+        "problem": None,
         "run": str(record.run),
         "experiment": record.experiment.name,
         "seed": run.seed,
@@ -102,11 +140,43 @@ def describe_bag(path: Path) -> dict[str, Any]:
         "replicas": run.replicas,
         "steps": record.experiment.steps,
         "simulated_time": run.duration,
-        "completeness": dataclasses.asdict(completeness) | {"complete": completeness.complete},
-        "files": [{"name": file.name, "size": file.stat().st_size} for file in files],
+        "completeness": dataclasses.asdict(completeness)
+        | {"complete": completeness.complete, "stretch": trajectory.stretch},
+        "prefix": trajectory.prefix,
         "protocol": _protocol(record.experiment),
         "versions": record.versions,
     }
+
+
+def _describe_file(entry: FileInventory) -> dict[str, Any]:
+    count, some = entry.count, entry.count.messages > 0
+    return {
+        "messages": count.messages,
+        "start": count.start if some else None,
+        "end": count.end if some else None,
+        "compression": entry.compression,
+        "torn": entry.file.torn,
+        "damaged_chunks": entry.file.damaged_chunks,
+        "lost_messages": entry.lost_messages,
+        "problem": entry.problem,
+    }
+
+
+def describe_salvage(out: Path, report: SalvageReport) -> dict[str, Any]:
+    """What was salvaged, and what run is in it: the new bag is read for that.
+
+    Parameters
+    ----------
+    out : the new bag
+    report : of :func:`msg_analysis.bags.salvage.salvage`
+
+    Returns
+    -------
+    ``bag``, the report's fields, and of the run what :func:`describe_bag` says
+    """
+    from msg_analysis.bags.inventory import Inventory
+
+    return {"bag": str(out), **dataclasses.asdict(report), **_describe_run(out, Inventory())}
 
 
 def _protocol(experiment: Experiment) -> dict[str, Any] | None:

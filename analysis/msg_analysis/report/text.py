@@ -90,6 +90,8 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
         f"({number_text(document['simulated_time'])} units of time): {count['missing']} missing, "
         f"{count['duplicates']} twice, {count['out_of_order']} out of order"
     )
+    for line in gaps(count):
+        console.print(Text(line))
     if document.get("unpredicted"):
         console.print(Text(f"Unpredicted: {document['unpredicted']}."))
     if document.get("transient"):
@@ -106,6 +108,30 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
     continuous = document["continuous"]["system_error"]
     if continuous is not None and not document.get("laws"):
         console.print(f"System error in continuous time, for reference: {number_text(continuous)}", style="dim")
+
+
+def gaps(count: dict[str, Any]) -> list[str]:
+    """Where the gaps of a log are, and what was refused; nothing of a whole log.
+
+    Parameters
+    ----------
+    count : ``completeness`` of ``Comparison.to_json()``
+    """
+    lines = []
+    if count["missing"]:
+        first, last = count.get("stretch") or (None, None)
+        if first is None:
+            lines.append("No step has the states of all agents.")
+        elif first == 0:
+            lines.append(f"All states are there up to step {last}.")
+        else:
+            lines.append(
+                f"The longest stretch without a gap is that of steps {first} to {last}; numbers need one from step 0."
+            )
+    if count.get("refused"):
+        reasons = ", ".join(f"{number} x {reason}" for reason, number in count["refused"].items())
+        lines.append(f"Refused: {reasons}")
+    return lines
 
 
 def _print_strangers(strangers: Sequence[dict[str, Any]], console: Console) -> None:
@@ -232,7 +258,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
         leaders = document["leaders"]
         text = f"{_names(leaders['agents'])}, gain {leaders['gain']}, reference {leaders['reference']}"
         facts.add_row("leaders", text)
-    _add_protocol(facts, document.get("protocol"))
+    add_protocol(facts, document.get("protocol"))
     facts.add_row("noise", ", ".join(f"{key} {_short(value)}" for key, value in document["noise"].items()))
     facts.add_row("steps", f"{run['steps']} of {number_text(run['dt'])}, {number_text(run['duration'])} units of time")
     facts.add_row("stability limit of a step", number_text(document["stability_limit"]))
@@ -270,35 +296,14 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
         console.print(Text(line, style="yellow"))
 
 
-def print_bag(document: dict[str, Any], console: Console) -> None:
-    """What a bag holds.
+def add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
+    """Rows for what the agents do instead of the built-in law.
 
     Parameters
     ----------
-    document : of ``msg_analysis.report.info.describe_bag``
-    console : where to print
+    facts : gets the rows
+    protocol : ``protocol`` of a document of ``msg_analysis.report.info``; None adds nothing
     """
-    count = document["completeness"]
-    facts = fact_table(console, document["bag"])
-    facts.add_row("run", document["run"])
-    facts.add_row("experiment", f"{document['experiment']}, seed {document['seed']}")
-    _add_protocol(facts, document.get("protocol"))
-    facts.add_row("agents, replicas", f"{document['agents']}, {document['replicas']}")
-    facts.add_row("steps", f"{document['steps']}, {number_text(document['simulated_time'])} units of time")
-    state = "complete" if count["complete"] else "incomplete"
-    facts.add_row("states", f"{state}: {count['received']} of {count['expected']}, {count['missing']} missing")
-    facts.add_row("came twice, out of order", f"{count['duplicates']}, {count['out_of_order']}")
-    facts.add_row("steps without a graph", str(count["missing_modes"]))
-    for reason, number in count["refused"].items():
-        facts.add_row("refused", Text(f"{number}: {reason}"))
-    for file in document["files"]:
-        facts.add_row("file", Text(f"{file['name']}, {amount(file['size'])}"))
-    for name, version in document["versions"].items():
-        facts.add_row(Text(name), Text(str(version)))
-    console.print(facts)
-
-
-def _add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
     if protocol is None:
         return
     kind = "linear" if protocol["linear"] else "not linear, no prediction"

@@ -25,7 +25,7 @@ from msg_analysis.bags.salvage import salvage, salvage_in_place
 from msg_analysis.bags.schemas import network_topics
 from msg_analysis.bags.store import write_trajectory
 from msg_analysis.bags.writer import BagWriter
-from msg_analysis.errors import BagError
+from msg_analysis.errors import BagError, InputError
 from msg_analysis.model.trajectory import Completeness, Trajectory
 
 MakeRun = Callable[..., Trajectory]
@@ -124,26 +124,39 @@ def recorded(tmp_path: Path, make_run: MakeRun, monkeypatch: pytest.MonkeyPatch)
     return run, tmp_path / "whole" / "whole_0.mcap"
 
 
-def test_torn_anywhere(recorded: tuple[Trajectory, Path], tmp_path: Path) -> None:
+def test_torn_at_every_chunk_and_at_500_bytes(recorded: tuple[Trajectory, Path], tmp_path: Path) -> None:
+    """What is there up to the tear comes back; every tenth, and those at chunks, salvaged and read by rosbags."""
     run, whole = recorded
     data, boundaries = whole.read_bytes(), _boundaries(whole)
     assert len(boundaries) > 5
     everything = _messages(whole.parent)
     cuts = {*boundaries, *(b - 1 for b in boundaries), len(data) - 1, len(data) - 9}
-    cuts |= set(random.Random(2).sample(range(boundaries[0], len(data)), 25))
+    cuts |= set(random.Random(2).sample(range(len(data)), 500))
+    known = {cut: _records(data[:cut]) for cut in boundaries}
+    head = data.index(b"/experiment") - 200  # the run record stands before the topics
     torn, out = tmp_path / "torn.mcap", tmp_path / "out"
     previous = -1
-    for cut in sorted(cuts):
+    for number, cut in enumerate(sorted(cuts)):
         torn.write_bytes(data[:cut])
-        found = read_bag(torn)
-        known = found.present
-        assert np.array_equal(found.states[known], run.states[known])
+        try:
+            found = read_bag(torn)
+        except BagError:
+            assert cut < head  # before that nobody can know what run it is of
+            continue
+        present = found.present
+        assert np.array_equal(found.states[present], run.states[present])
         assert found.completeness.refused["torn file"] == 1
         assert found.completeness.received >= previous  # a later tear never loses more
         previous = found.completeness.received
         if cut in boundaries:  # that chunk is whole
-            expected = _count(data[:cut])
-            assert found.completeness.received == expected - _others(data[:cut])
+            assert previous == sum(message.channel_id > 2 for message in known[cut])  # 1, 2: experiment, graph
+        if cut not in boundaries and number % 10:
+            continue
+        if cut < boundaries[0]:
+            with pytest.raises(BagError, match="no whole message"):
+                salvage(torn, out)
+            assert not out.exists()
+            continue
         report = salvage(torn, out)
         kept = _messages(out)
         assert report.kept_messages == len(kept)
@@ -154,6 +167,39 @@ def test_torn_anywhere(recorded: tuple[Trajectory, Path], tmp_path: Path) -> Non
     assert previous == 123
 
 
+def test_200_flipped_bytes(recorded: tuple[Trajectory, Path], tmp_path: Path) -> None:
+    """A flipped byte costs its chunk, or what is behind it, and never puts a wrong number in."""
+    run, whole = recorded
+    data, everything = whole.read_bytes(), {(topic, raw) for topic, _, raw in _messages(whole.parent)}
+    end = _boundaries(whole)[-1]
+    flipped, out, rng = tmp_path / "flipped.mcap", tmp_path / "out", random.Random(3)
+    costs = 0
+    for number in range(200):
+        place = rng.randrange(len(data))
+        flipped.write_bytes(data[:place] + bytes([data[place] ^ 1 << rng.randrange(8)]) + data[place + 1 :])
+        try:
+            found = read_bag(flipped)
+        except InputError as error:
+            assert str(flipped) in str(error)  # noqa: PT017
+            assert place < end
+            continue
+        if found.record.to_json() != run.record.to_json():
+            continue  # in the uncompressed run record, which has no CRC
+        present = found.present
+        assert np.array_equal(found.states[present], run.states[present])
+        if found.completeness.missing:
+            costs += 1
+            assert found.completeness.refused
+        if number % 10 == 0 and found.completeness.received:
+            report = salvage(flipped, out)
+            assert report.kept_messages == len(_messages(out))
+            assert {(topic, raw) for topic, _, raw in _messages(out)} <= everything
+            if report.damaged_chunks and not report.torn:
+                assert report.lost_messages == len(everything) - report.kept_messages
+            shutil.rmtree(out)
+    assert costs > 20
+
+
 def _records(data: bytes) -> list[Any]:
     """Messages of the whole chunks, by the mcap library."""
     found: list[Any] = []
@@ -162,15 +208,6 @@ def _records(data: bytes) -> list[Any]:
             if isinstance(record, Chunk):
                 found += [r for r in breakup_chunk(record, validate_crc=True) if isinstance(r, Message)]
     return found
-
-
-def _count(data: bytes) -> int:
-    return len(_records(data))
-
-
-def _others(data: bytes) -> int:
-    """Messages on the first two channels, experiment and graph."""
-    return sum(message.channel_id <= 2 for message in _records(data))
 
 
 def test_torn_before_the_first_message(recorded: tuple[Trajectory, Path], tmp_path: Path) -> None:

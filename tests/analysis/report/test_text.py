@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from msg_analysis.model.experiment import Experiment
-from msg_analysis.report import text
+from msg_analysis.report import bag_text, text
 from msg_analysis.report.info import algebraic_connectivity, describe_experiment
 
 
@@ -192,13 +192,41 @@ def test_bag() -> None:
         "replicas": 1,
         "steps": 1,
         "simulated_time": 0.05,
-        "completeness": completeness | {"missing_modes": 0, "refused": {"other run": 5}, "complete": False},
-        "files": [{"name": "bag_0.mcap", "size": 1234567}],
+        "completeness": completeness
+        | {"missing_modes": 0, "refused": {"other run": 5}, "complete": False, "stretch": [1, 1]},
+        "recording": 4711,
+        "problem": None,
+        "topics": [{"name": f"/[red]{i}", "type": "pkg/msg/Kind", "messages": i} for i in range(14)],
+        "files": [
+            {"name": "log.txt", "size": 1234567},
+            {
+                "name": "bag_0.mcap",
+                "size": 3,
+                "messages": 8,
+                "compression": "lz4",
+                "torn": "cut off",
+                "damaged_chunks": 2,
+                "lost_messages": 77,
+                "problem": None,
+            },
+        ],
         "versions": {"numpy": "2.0"},
     }
-    output = shown(text.print_bag, document)
-    for part in ("[bold]bag", "d3ba43f6", "incomplete: 3 of 4, 1 missing", "5: other run", "1.23 MB", "2.0"):
+    output = " ".join(shown(bag_text.print_bag, document).split())
+    for part in (
+        *("[bold]bag", "d3ba43f6", "incomplete: 3 of 4, 1 missing", "5: other run", "1.23 MB", "2.0"),
+        *("process 4711", "steps 1 to 1; numbers need one from step 0", "/[red]11, 11 messages, pkg/msg/Kind"),
+        *("and 2 more with 25 messages", "8 messages, compression lz4, torn: cut off", "2 damaged chunks, 77 messages"),
+    ):
         assert part in output
+    nothing = dict.fromkeys(document) | {
+        "bag": "b",
+        "problem": "no [run]",
+        "topics": [],
+        "files": [],
+        "versions": {},
+    }
+    assert "no [run]" in shown(bag_text.print_bag, nothing)
 
 
 def test_real_time() -> None:

@@ -1,0 +1,37 @@
+"""How a bag lies on the disk: compressed or not, in one file or in several."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from msg_analysis.errors import InputError
+
+Compression = Literal["none", "zstd", "lz4"]
+COMPRESSIONS: tuple[Compression, ...] = ("none", "zstd", "lz4")
+MEGABYTE = 10**6
+
+
+@dataclass(frozen=True, slots=True)
+class Storage:
+    """The choices that there are.
+
+    Attributes
+    ----------
+    compression : of the chunks of the files
+    split_size : bytes of messages after which the bag goes on in a new file; None: one file. A file gets larger by its
+        head, its summary and a chunk
+    """
+
+    compression: Compression = "zstd"
+    split_size: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check them, wherever they came from."""
+        if self.compression not in COMPRESSIONS:
+            raise InputError(f"compression: {self.compression!r}: expected one of {', '.join(COMPRESSIONS)}")
+        if self.split_size is not None and self.split_size <= 0:
+            raise InputError(f"split size: {self.split_size} bytes: expected more than 0")
+
+
+DEFAULT = Storage()
