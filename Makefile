@@ -11,7 +11,7 @@ RUNS := runs
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 LOCAL := --no-index --no-deps --no-build-isolation
 
-.PHONY: help setup demo test test-fast stress lint format bench docs colcon lock clean
+.PHONY: help setup demo test test-fast stress lint format bench calibrate docs colcon lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -62,6 +62,9 @@ bench: setup ## Measure speed side by side with the bare middleware, and with ot
 	$(BIN)/python benchmarks/precision.py
 	$(BIN)/python benchmarks/moments.py
 	$(BIN)/python benchmarks/leaders.py
+
+calibrate: setup ## Measure error rates and power of the verdict into docs/statistics.md: some 10 minutes on two CPUs
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --write
 
 docs: setup ## Build the documentation into site/
 	$(BIN)/mkdocs build --strict --quiet

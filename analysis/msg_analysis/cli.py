@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 import msg_analysis
-from msg_analysis import cli_theory
+from msg_analysis import cli_compare, cli_theory
 from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, print_json, result_console
 from msg_analysis.errors import InputError
@@ -84,40 +83,6 @@ def simulate(
         raise InputError(f"{directory}: exists already: remove it, or choose another name with --out")
     write_trajectory(simulate_experiment(loaded), directory, storage(compression, split_size))
     click.echo(directory)
-
-
-@main.command(
-    epilog=examples("msg-analysis compare line_ring_twin", "msg-analysis compare line_ring_twin --report report.html")
-)
-@click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@_json
-@click.option("--report", type=click.Path(dir_okay=False, path_type=Path), help="Write a report (HTML) as well.")
-@click.pass_context
-def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, report: Path | None) -> None:
-    """Compare what the run in BAG did with what theory predicts.
-
-    Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
-    """
-    from msg_analysis.bags.reader import read_bag
-    from msg_analysis.inference.compare import compare as compare_trajectory
-
-    if len(bags) > 1:
-        raise InputError(f"{len(bags)} bags: one bag at a time: call compare for each")
-    if report and not report.parent.is_dir():
-        raise InputError(f"{report}: no such directory {report.parent}: create it")
-    trajectory = read_bag(bags[0])
-    comparison = compare_trajectory(trajectory)
-    if report:
-        from msg_analysis.report.html import write_report
-
-        write_report(comparison, trajectory, report)
-    if as_json:
-        print_json(comparison.to_json())
-    else:
-        from msg_analysis.report.text import print_comparison
-
-        print_comparison(comparison.to_json(), result_console())
-    context.exit(comparison.exit_code)
 
 
 @main.command(
@@ -231,6 +196,8 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
         print_salvage(document, result_console())
 
 
+main.add_command(cli_compare.compare)
+main.add_command(cli_compare.tabulate)
 main.add_command(cli_theory.transient)
 main.add_command(cli_theory.facts)
 

@@ -171,7 +171,7 @@ def test_the_exit_code_is_the_verdict(
         def to_json(self) -> dict[str, Any]:
             return {"verdict": verdict, "z": math.nan, "interval": (math.inf, 1.0)}
 
-    monkeypatch.setattr(compare, "compare", lambda _: Comparison())
+    monkeypatch.setattr(compare, "compare", lambda _, level: Comparison())
     result = call("compare", bag, "--json")
     assert result.exit_code == code
     assert json.loads(result.stdout) == {"verdict": verdict, "z": None, "interval": [None, 1.0]}
@@ -185,14 +185,6 @@ def test_compare_writes_a_report(bag: Path, tmp_path: Path) -> None:
     nowhere = call("compare", bag, "--report", tmp_path / "nowhere/report.html")
     assert nowhere.exit_code == 2
     assert "no such directory" in nowhere.stderr
-
-
-def test_compare_takes_one_bag(bag: Path, tmp_path: Path) -> None:
-    several = call("compare", bag, bag)
-    assert several.exit_code == 2
-    assert "one bag at a time" in several.stderr
-    assert call("compare", tmp_path / "nope").exit_code == 2
-    assert call("compare").exit_code == 2
 
 
 def test_info_of_an_experiment() -> None:

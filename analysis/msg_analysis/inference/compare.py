@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from msg_analysis.inference.air import LossTest, broadcast_p, loss_test
+from msg_analysis.inference.air import LossTest, loss_test
 from msg_analysis.inference.batch import batch_interval
+from msg_analysis.inference.blame import Accused, Cause, find_causes
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates
-from msg_analysis.inference.events import order_events
-from msg_analysis.inference.innovations import InnovationTests, innovation_tests
-from msg_analysis.inference.laws import Laws, measure_laws
-from msg_analysis.inference.martingale import TimeMeans, time_means
+from msg_analysis.inference.evidence import Evidence
+from msg_analysis.inference.given_path import GivenPath
+from msg_analysis.inference.innovations import InnovationTests
+from msg_analysis.inference.laws import Laws
+from msg_analysis.inference.martingale import TimeMeans
 from msg_analysis.inference.measurement import Measurement
 from msg_analysis.inference.multiplicity import holm
 from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.order import Order, order_of_nodes
 from msg_analysis.inference.switching import SwitchingTest, switching_test
-from msg_analysis.inference.timing import Timing, measure_timing
+from msg_analysis.inference.timing import Timing
 from msg_analysis.model.sequential import step_law
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.pool import Pool
 
 Verdict = Literal["agrees", "disagrees", "incomplete", "unpredicted"]
 
@@ -63,6 +70,10 @@ class Comparison:
     transient : steps at the start that are left out of the measured errors; None with a prediction, which knows them
     timing, laws : in real time: how time was kept, and which laws the log supports; None in lockstep. The errors and
         the covariance are then held against the first of the laws that there is
+    given : errors given the path of the graphs; None where they are not had
+    order : which agents are more certain than which; None where that is not known
+    blame : what is wrong, where the verdict is "disagrees"
+    pool : the runs, where they are several; ``trajectory`` has then no data, but the account of what is missing
     """
 
     trajectory: Trajectory
@@ -83,6 +94,10 @@ class Comparison:
     transient: int | None = None
     timing: Timing | None = None
     laws: Laws | None = None
+    given: GivenPath | None = None
+    order: Order | None = None
+    blame: Sequence[Cause] = ()
+    pool: Pool | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -101,6 +116,15 @@ class Comparison:
         """0 agrees or unpredicted, 1 disagrees, 3 incomplete."""
         return EXIT_CODES[self.verdict]
 
+    @property
+    def _law(self) -> str:
+        """That the errors are held against."""
+        if self.laws:
+            return self.laws.measured_against
+        tested = any(test.name == "system error" for test in self.tests)
+        real_time = self.trajectory.record.experiment.run.pace == "realtime"
+        return "pattern" if self.pool and real_time and tested else step_law(self.trajectory.record.experiment)
+
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis compare --json``; every number is finite or None."""
         record, covariance, switching = self.trajectory.record, self.covariance, self.switching
@@ -108,14 +132,17 @@ class Comparison:
             "verdict": self.verdict,
             "unpredicted": self.unpredicted,
             "transient": self.transient,
-            "run": str(record.run),
+            "run": None if self.pool else str(record.run),
             "experiment": record.experiment.name,
-            "seed": record.experiment.run.seed,
+            "leaders": (np.flatnonzero(record.experiment.leader_gains) + 1).tolist(),
+            "seed": None if self.pool else record.experiment.run.seed,
             "level": self.level,
             "completeness": asdict(self.trajectory.completeness) | {"stretch": self.trajectory.stretch},
             "steps": self.steps,
             "simulated_time": self.steps * record.experiment.step_length,
-            "law": self.laws.measured_against if self.laws else step_law(record.experiment),
+            "law": self._law,
+            "bags": self.pool.to_json() if self.pool else None,
+            "homogeneity": {key: getattr(self.pool, key, None) for key in ("chi2", "dof", "p")},
             "system_error": self.system_error.to_json(),
             "node_errors": [estimate.to_json() for estimate in self.node_errors],
             "covariance": {
@@ -136,6 +163,9 @@ class Comparison:
             "broadcast": {"p": self.p_broadcast},
             "timing": self.timing.to_json() if self.timing else None,
             "laws": self.laws.to_json() if self.laws else None,
+            "given_path": self.given.to_json() if self.given else None,
+            "order": self.order.to_json() if self.order else None,
+            "blame": [cause.to_json() for cause in self.blame],
             "continuous": {"system_error": self.continuous_error},
             "batch_means": {"interval": self.batch or (None, None)},
             "tests": [asdict(test) for test in self.tests],
@@ -168,53 +198,91 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     if unpredicted:
         return _measured(trajectory, level, unpredicted)
     prediction = predict(trajectory.record.experiment)
-    continuous = prediction.continuous.system_error if prediction.continuous else None
     if trajectory.prefix < MIN_STEPS and not trajectory.completeness.complete:
-        return _without_numbers(trajectory, level, prediction, continuous)
+        return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
     observation = Observation.of(trajectory, prediction)
     if observation.steps < MIN_STEPS and not trajectory.completeness.complete:
-        return _without_numbers(trajectory, level, prediction, continuous)
-    laws, timing, position = None, None, None
-    if observation.timers:
-        timing, order = measure_timing(observation), order_events(observation)
-        position = order.position
-        means, laws = measure_laws(observation, order, timing, level)
-    else:
-        means = time_means(observation)
+        return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
+    return judge(trajectory, prediction, Evidence.of(observation, level), level)
+
+
+def judge(
+    trajectory: Trajectory,
+    prediction: Prediction,
+    evidence: Evidence,
+    level: float,
+    more: Sequence[tuple[str, float | None]] = (),
+) -> Comparison:
+    """The verdict on what a run, or several, add up to.
+
+    Parameters
+    ----------
+    trajectory : of the run; of several runs, one that has the account of what is missing
+    prediction : of their experiment
+    evidence : of all of them
+    level : chance of a false "disagrees"
+    more : names and p-values of further tests of the same law
+    """
+    means = evidence.means
     system_error, node_errors = estimates(means, prediction.system)
     covariance = covariance_test(means, prediction.system)
-    innovations = innovation_tests(observation, position)
-    switching = switching_test(observation.modes, prediction.step.transition)
-    loss, p_broadcast = loss_test(observation), broadcast_p(observation)
+    innovations = evidence.innovations.tests()
+    switching = evidence.transitions.test(prediction.step.transition)
+    loss = evidence.loss.test() if evidence.loss else None
+    p_broadcast = evidence.broadcast.p_value() if evidence.broadcast else None
     errors = [("system error", system_error.p)]
     errors += [(f"error of agent {i}", node.p) for i, node in enumerate(node_errors, start=1)]
     errors += [("covariance", covariance.p)]
-    family = errors if laws is None or laws.measured_against == "pattern" else []
+    family = errors if evidence.decisive else []
     family += [
         ("innovations: covariance", innovations.p_covariance),
         ("innovations: whiteness", innovations.p_whiteness),
         ("innovations: gains", innovations.p_gain),
+        ("innovations: common gain", innovations.p_common_gain),
         ("switching", switching.p),
         ("loss", loss.p if loss else None),
         ("broadcast", p_broadcast),
+        *more,
     ]
+    tests = _judge(family, level)
+    rejected = [test.name for test in tests if test.rejected]
+    blame: list[Cause] = []
+    if rejected and trajectory.completeness.complete:
+        blame = find_causes(_accused(prediction, evidence), level, rejected)
     return Comparison(
         trajectory=trajectory,
         level=level,
-        steps=observation.steps,
+        steps=evidence.steps,
         system_error=system_error,
         node_errors=node_errors,
         covariance=covariance,
         innovations=innovations,
         switching=switching,
-        continuous_error=continuous,
+        continuous_error=prediction.continuous.system_error if prediction.continuous else None,
         batch=batch_interval(means.system_series),
-        tests=_judge(family, level),
+        tests=tests,
         running=_running(means, prediction.step.dt),
         loss=loss,
         p_broadcast=p_broadcast,
-        timing=timing,
-        laws=laws,
+        timing=evidence.timing,
+        laws=evidence.laws,
+        given=evidence.given,
+        order=order_of_nodes(means, level),
+        blame=blame,
+    )
+
+
+def _accused(prediction: Prediction, evidence: Evidence) -> Accused:
+    experiment = prediction.experiment
+    return Accused(
+        names=[graph.name for graph in experiment.graph_list],
+        chain=experiment.chain,
+        dt=experiment.step_length,
+        reference=experiment.reference,
+        innovations=evidence.innovations,
+        transitions=evidence.transitions,
+        loss=evidence.loss,
+        broadcast=evidence.broadcast,
     )
 
 
@@ -253,21 +321,19 @@ def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Compari
     )
 
 
-def _without_numbers(
-    trajectory: Trajectory, level: float, prediction: Prediction, continuous: float | None
-) -> Comparison:
+def without_numbers(trajectory: Trajectory, level: float, prediction: Prediction, steps: int) -> Comparison:
     """Too little came: only what was expected."""
     predicted = prediction.emulated
     return Comparison(
         trajectory=trajectory,
         level=level,
-        steps=max(trajectory.prefix, 0),
+        steps=steps,
         system_error=Estimate(predicted=predicted.system_error),
         node_errors=[Estimate(predicted=float(error)) for error in predicted.node_errors],
         covariance=CovarianceTest(predicted=predicted.covariance),
         innovations=InnovationTests(None, None, None),
         switching=None,
-        continuous_error=continuous,
+        continuous_error=prediction.continuous.system_error if prediction.continuous else None,
         batch=None,
         tests=[],
         running={key: np.empty(0) for key in ("time", "system_error", "standard_error")},

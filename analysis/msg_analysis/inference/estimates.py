@@ -71,11 +71,11 @@ def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Esti
     combinations = np.vstack([means.trace, means.nodes])
     measured, predicted = combinations @ means.measured, combinations @ means.predicted
     errors = np.sqrt(np.einsum("aq,qr,ar->a", combinations, means.covariance, combinations).clip(0.0))
-    found = [_estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
+    found = [estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
     if not len(means.nodes):
         both = (np.diag(system.lifted(matrix)) for matrix in (means.second_moments, means.expected_moments))
         return found[0], [Estimate(float(m), float(p)) for m, p in zip(*both, strict=True)]
-    tested = [i for i, estimate in enumerate(found) if i > 0 and estimate.p is not None]
+    tested = [i for i, entry in enumerate(found) if i > 0 and entry.p is not None]
     adjusted = dict(zip(tested, holm(np.array([found[i].p for i in tested], dtype=float)), strict=True))
     nodes = [
         Estimate(e.measured, e.predicted, e.standard_error, e.z, e.p, float(adjusted[i]) if i in adjusted else None)
@@ -85,7 +85,15 @@ def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Esti
     return found[0], nodes
 
 
-def _estimate(measured: float, predicted: float, error: float, scale: float) -> Estimate:
+def estimate(measured: float, predicted: float, error: float, scale: float) -> Estimate:
+    """A measured error beside its prediction.
+
+    Parameters
+    ----------
+    measured, predicted : the error
+    error : standard error of the measured one
+    scale : of all errors: a standard error that is nothing but rounding next to it counts as none
+    """
     if error <= 1e-12 * scale or error == 0.0:  # without noise: nothing but rounding
         return Estimate(float(measured), float(predicted), float(error))
     z = float((measured - predicted) / error)

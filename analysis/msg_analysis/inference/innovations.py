@@ -21,11 +21,11 @@ from msg_analysis.inference.reception import (
     Reception,
     full_reception_noise,
 )
+from msg_analysis.inference.regression import MAX_REGRESSORS, StateRegression
 from msg_analysis.model.step import StepModel
 from msg_analysis.types import FloatArray, IntArray
 
 LAGS = 10
-MAX_REGRESSORS = 400
 ROUNDING = 1e-9
 """Relative size of what counts as rounding in such directions."""
 
@@ -39,29 +39,13 @@ class InnovationTests:
     p_covariance : covariance of the innovations against N_g; 0 if anything moves where there is no noise
     p_whiteness : correlation in time (lags 1..10) and between replicas
     p_gain : regression on what the agents heard: wrong gains, references, offsets
+    p_common_gain : the same for one factor of all gains: messages that are ignored
     """
 
     p_covariance: float | None
     p_whiteness: float | None
     p_gain: float | None
-
-
-@dataclass(slots=True, eq=False)
-class _Sums:
-    """Sums over the steps and replicas of each graph.
-
-    Attributes
-    ----------
-    samples : (n,)
-    noise : (n, m, m) sum of e e^T
-    quiet : largest |e| in directions without noise
-    largest : largest |x|
-    """
-
-    samples: IntArray
-    noise: FloatArray
-    quiet: float = 0.0
-    largest: float = 0.0
+    p_common_gain: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +62,139 @@ class _Directions:
     quiet: FloatArray
 
 
+class InnovationSums:
+    """What the innovations of runs of one experiment add up to: enough for the tests, and for what is wrong.
+
+    Attributes
+    ----------
+    noises : (n, m, m) what their covariance should be
+    samples : (n,) number of innovations, replicas counted, of each graph
+    scatter : (n, m, m) sum of e e^T
+    still : (n, m) steps in which no replica of an agent changed
+    quiet : largest |e| in directions without noise
+    largest : largest |x|
+    replicas : of a run
+    terms : what the innovations were regressed on
+    score, covariance : (K,), (K, K) of that regression
+    gram : (K, K) see ``StateRegression.gram``; None where it cannot be had
+    """
+
+    def __init__(self, observation: Observation, position: IntArray | None = None) -> None:
+        step, noise = observation.step, observation.prediction.experiment.noise
+        n, m = step.modes, step.agents
+        self.noises: FloatArray = full_reception_noise(observation) if noise.on_air else step.noise
+        self.replicas = observation.replicas
+        self.samples, self.scatter = np.zeros(n, np.int64), np.zeros((n, m, m))
+        self.still = np.zeros((n, m), np.int64)
+        self.quiet = self.largest = 0.0
+        self._directions = [_directions(matrix) for matrix in self.noises]
+        # Graphs may differ in the number of noisy directions; the strongest ones that all have are iid N(0, I) in
+        # any case.
+        self._whiteness = Whiteness(min(len(d.whitener) for d in self._directions))
+        varies = step.loss > 0.0 and noise.link > 0.0
+        if observation.timers:
+            varies = bool((step.noise_gain != step.noise_gain[0]).any())
+        self._equalizer = Equalizer(step, self.noises) if varies else None
+        regression: StateRegression | HeardRegression = (
+            HeardRegression(observation, MAX_REGRESSORS, position if _correlated(step) else None)
+            if noise.on_air or observation.timers
+            else StateRegression(observation, MAX_REGRESSORS)
+        )
+        self._add(observation, regression)
+        self.terms = regression.terms
+        self.score, self.covariance = regression.statistic()
+        self.gram = regression.gram()
+
+    @property
+    def steps(self) -> IntArray:
+        """(n,) of each graph."""
+        return self.samples // self.replicas
+
+    def merge(self, other: InnovationSums) -> None:
+        """Take what another run of the same experiment adds up to."""
+        self.samples += other.samples
+        self.scatter += other.scatter
+        self.still += other.still
+        self.quiet, self.largest = max(self.quiet, other.quiet), max(self.largest, other.largest)
+        self._whiteness.merge(other._whiteness)
+        if self._equalizer and other._equalizer:
+            self._equalizer.merge(other._equalizer)
+        self.score += other.score
+        self.covariance += other.covariance
+        self.gram = None if self.gram is None or other.gram is None else self.gram + other.gram
+
+    def tests(self) -> InnovationTests:
+        """The tests of all of them."""
+        # What NO_NOISE hides may be there: ten standard deviations of it.
+        hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
+        p_whiteness = self._whiteness.p_value()
+        if self._equalizer and not self._equalizer.possible:
+            p_covariance, p_whiteness = self._equalizer.p_size(), None
+        else:
+            p_covariance = self._covariance_p()
+        if self.quiet > max(ROUNDING * self.largest, hidden):
+            p_covariance = 0.0
+        chi2, dof = quadratic_form(self.score, self.covariance)
+        p_gain = float(stats.chi2.sf(chi2, dof)) if dof else None
+        return InnovationTests(p_covariance, p_whiteness, p_gain, self._common_gain_p() if dof else None)
+
+    def _common_gain_p(self) -> float | None:
+        """One direction of the regression: every message counts for less, or for more, than it should."""
+        agents = np.array([term.agent for term in self.terms])
+        size = np.diagonal(self.noises, axis1=1, axis2=2).mean(axis=0)[agents]
+        weights = np.array([term.weight if term.kind in ("link", "pull") else 0.0 for term in self.terms])
+        weights = np.divide(weights, size, out=np.zeros_like(weights), where=size > NO_NOISE * size.max(initial=0.0))
+        variance = float(weights @ self.covariance @ weights)
+        if variance <= 0.0:
+            return None
+        return float(2.0 * stats.norm.sf(abs(float(weights @ self.score)) / np.sqrt(variance)))
+
+    def _add(self, observation: Observation, regression: StateRegression | HeardRegression) -> None:
+        """One pass over the run."""
+        m = observation.step.agents
+        for first, last in observation.blocks(max(observation.states[0].size, regression.numbers_per_step)):
+            modes = observation.modes[first:last]
+            if isinstance(regression, HeardRegression):
+                reception = Reception.of(observation, first, last)
+                e = innovations(observation, first, last, reception)
+                regression.add(reception, e, first)
+                if self._equalizer:
+                    e = self._equalizer.equalize(e, reception)
+                    self.quiet = max(self.quiet, self._equalizer.quiet)
+            else:
+                e = innovations(observation, first, last)
+                regression.add(modes, observation.states[first:last], e)
+            states = observation.states[first : last + 1]
+            self.largest = max(self.largest, float(np.abs(states[:-1]).max()))
+            unmoved = (states[1:] == states[:-1]).all(axis=2)
+            white = np.empty((last - first, self._whiteness.rank, observation.replicas))
+            for mode, direction in enumerate(self._directions):
+                at = np.flatnonzero(modes == mode)
+                if not at.size:
+                    continue
+                flat = e[at].transpose(1, 0, 2).reshape(m, -1)
+                self.samples[mode] += flat.shape[1]
+                self.scatter[mode] += flat @ flat.T
+                self.still[mode] += unmoved[at].sum(axis=0)
+                self.quiet = max(self.quiet, float(np.abs(direction.quiet.T @ flat).max(initial=0.0)))
+                white[at] = direction.whitener[: self._whiteness.rank] @ e[at]
+            self._whiteness.add(white)
+
+    def _covariance_p(self) -> float | None:
+        """Of all steps together when the noise is the same in every graph, else per graph and added up."""
+        modes = range(len(self.noises))
+        groups = [list(modes)] if (self.noises == self.noises[0]).all() else [[g] for g in modes]
+        statistic, dof = 0.0, 0.0
+        for group in groups:
+            whitener = self._directions[group[0]].whitener
+            samples = int(self.samples[group].sum())
+            if len(whitener) and samples:
+                scatter = whitener @ self.scatter[group].sum(axis=0) @ whitener.T
+                part = covariance_statistic(scatter, samples)
+                statistic, dof = statistic + part[0], dof + part[1]
+        return float(stats.chi2.sf(statistic, dof)) if dof else None
+
+
 def innovation_tests(observation: Observation, position: IntArray | None = None) -> InnovationTests:
     """Test the innovations of a run.
 
@@ -85,29 +202,7 @@ def innovation_tests(observation: Observation, position: IntArray | None = None)
     ----------
     position : (N, m) in real time, when the states were made (``events.Order.position``)
     """
-    step, noise = observation.step, observation.prediction.experiment.noise
-    noises = full_reception_noise(observation) if noise.on_air else step.noise
-    directions = [_directions(noise) for noise in noises]
-    regression: _StateRegression | HeardRegression = (
-        HeardRegression(observation, MAX_REGRESSORS, position if _correlated(step) else None)
-        if noise.on_air or observation.timers
-        else _StateRegression(observation)
-    )
-    varies = step.loss > 0.0 and noise.link > 0.0
-    if observation.timers:
-        varies = bool((step.noise_gain != step.noise_gain[0]).any())
-    equalizer = Equalizer(step, noises) if varies else None
-    sums, p_whiteness = _pass(observation, directions, regression, equalizer)
-    # What NO_NOISE hides may be there: ten standard deviations of it.
-    hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in noises))
-    if sums.quiet > max(ROUNDING * sums.largest, hidden):
-        p_covariance: float | None = 0.0
-    elif equalizer and not equalizer.possible:
-        p_covariance = equalizer.p_size()
-    else:
-        p_covariance = _covariance_p(noises, directions, sums)
-    chi2, dof = quadratic_form(*regression.statistic())
-    return InnovationTests(p_covariance, p_whiteness, float(stats.chi2.sf(chi2, dof)) if dof else None)
+    return InnovationSums(observation, position).tests()
 
 
 def innovations(observation: Observation, first: int, last: int, reception: Reception | None = None) -> FloatArray:
@@ -136,46 +231,7 @@ def _directions(noise: FloatArray) -> _Directions:
     return _Directions((vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:])
 
 
-def _pass(
-    observation: Observation,
-    directions: list[_Directions],
-    regression: _StateRegression | HeardRegression,
-    equalizer: Equalizer | None,
-) -> tuple[_Sums, float | None]:
-    """One pass over the run: the sums of each graph, the regression, and the whiteness test."""
-    n, m = observation.step.modes, observation.step.agents
-    sums = _Sums(np.zeros(n, np.int64), np.zeros((n, m, m)))
-    # Graphs may differ in the number of noisy directions; the strongest ones that all have are iid N(0, I) in
-    # any case.
-    whitened = _Whiteness(min(len(d.whitener) for d in directions))
-    for first, last in observation.blocks(max(observation.states[0].size, regression.numbers_per_step)):
-        modes = observation.modes[first:last]
-        if isinstance(regression, HeardRegression):
-            reception = Reception.of(observation, first, last)
-            e = innovations(observation, first, last, reception)
-            regression.add(reception, e, first)
-            if equalizer:
-                e = equalizer.equalize(e, reception)
-                sums.quiet = max(sums.quiet, equalizer.quiet)
-        else:
-            e = innovations(observation, first, last)
-            regression.add(modes, observation.states[first:last], e)
-        sums.largest = max(sums.largest, float(np.abs(observation.states[first:last]).max()))
-        white = np.empty((last - first, whitened.rank, observation.replicas))
-        for mode, direction in enumerate(directions):
-            at = np.flatnonzero(modes == mode)
-            if not at.size:
-                continue
-            flat = e[at].transpose(1, 0, 2).reshape(m, -1)
-            sums.samples[mode] += flat.shape[1]
-            sums.noise[mode] += flat @ flat.T
-            sums.quiet = max(sums.quiet, float(np.abs(direction.quiet.T @ flat).max(initial=0.0)))
-            white[at] = direction.whitener[: whitened.rank] @ e[at]
-        whitened.add(white)
-    return sums, None if equalizer and not equalizer.possible else whitened.p_value()
-
-
-class _Whiteness:
+class Whiteness:
     """Portmanteau test of iid N(0, I) vectors: lags 1..LAGS, and lag 0 between replicas."""
 
     def __init__(self, rank: int) -> None:
@@ -205,6 +261,14 @@ class _Whiteness:
             self._counts[lag - 1] += len(late) * self._replicas
         self._tail = joined[-LAGS:]
 
+    def merge(self, other: Whiteness) -> None:
+        """Take what another run adds up to; nothing is said of pairs of steps of different runs."""
+        self._products += other._products
+        self._counts += other._counts
+        self._squares += other._squares
+        self._pairs += other._pairs
+        self._steps += other._steps
+
     def p_value(self) -> float | None:
         """None without noise. Each coordinate is divided by its own size: that is another test's matter."""
         size = self._squares / (self._steps * self._replicas)
@@ -218,103 +282,6 @@ class _Whiteness:
             chi2 += float((self._pairs**2 / size**2).sum() / pairs)
             dof += self.rank
         return float(stats.chi2.sf(chi2, dof))
-
-
-def _covariance_p(noises: FloatArray, directions: list[_Directions], sums: _Sums) -> float | None:
-    """Of all steps together when the noise is the same in every graph, else per graph and added up."""
-    modes = range(len(noises))
-    groups = [list(modes)] if (noises == noises[0]).all() else [[g] for g in modes]
-    statistic, dof = 0.0, 0.0
-    for group in groups:
-        whitener = directions[group[0]].whitener
-        samples = int(sums.samples[group].sum())
-        if len(whitener) and samples:
-            scatter = whitener @ sums.noise[group].sum(axis=0) @ whitener.T
-            part = covariance_statistic(scatter, samples)
-            statistic, dof = statistic + part[0], dof + part[1]
-    return float(stats.chi2.sf(statistic, dof)) if dof else None
-
-
-class _StateRegression:
-    """Score test: the innovations of row i do not depend on what row i of W_g uses.
-
-    The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a
-    phi_b given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated
-    noise too. All regressors are linear in z, the deviations of the agents and a constant 1.
-    """
-
-    def __init__(self, observation: Observation) -> None:
-        self._step = step = observation.step
-        self._centred = observation.prediction.experiment.problem == "consensus"
-        size = step.agents + 1
-        self._scores = np.zeros((step.modes, step.agents, size))  # sum of e z^T
-        self._inputs = np.zeros((step.modes, size, size))  # sum of z z^T
-
-    @property
-    def numbers_per_step(self) -> int:
-        """Size of the largest temporary array."""
-        return 0
-
-    def add(self, modes: IntArray, states: FloatArray, innovations: FloatArray) -> None:
-        """Take a block of steps: graphs (b,), states and innovations (b, m, R)."""
-        m = self._step.agents
-        z = np.ones((len(modes), m + 1, states.shape[2]))
-        z[:, :m] = states - (states.mean(axis=1, keepdims=True) if self._centred else self._step.reference)
-        for mode in range(self._step.modes):
-            at = np.flatnonzero(modes == mode)
-            flat_e = innovations[at].transpose(1, 0, 2).reshape(m, -1)
-            flat_z = z[at].transpose(1, 0, 2).reshape(m + 1, -1)
-            self._scores[mode] += flat_e @ flat_z.T
-            self._inputs[mode] += flat_z @ flat_z.T
-
-    def statistic(self) -> tuple[FloatArray, FloatArray]:
-        """U (K,) and Cov (K, K)."""
-        rows, inputs = _regressors(self._step)
-        score = np.einsum("gac,gac->a", self._scores[:, rows], inputs)
-        covariance = np.zeros((len(rows), len(rows)))
-        for mode in range(self._step.modes):
-            products = inputs[mode] @ self._inputs[mode] @ inputs[mode].T
-            covariance += self._step.noise[mode][np.ix_(rows, rows)] * products
-        return score, covariance
-
-
-def _regressors(step: StepModel) -> tuple[IntArray, FloatArray]:
-    """What the innovations are regressed on: phi_a(k) = inputs[g, a] . z(k) for row rows[a].
-
-    rows : (K,), inputs : (n, K, m + 1).
-
-    One for every graph and difference x_j - x_i that row i uses, every graph and leader (x_i - reference),
-    and every agent (1, which finds a wrong reference or offset). When these are more than MAX_REGRESSORS: the
-    whole pull (W_g x - x)_i of a row instead of each of its terms; when that is still too many, without
-    telling graphs apart.
-    """
-    n, m = step.modes, step.agents
-    rows: list[int] = list(range(m))
-    parts: list[tuple[int | None, FloatArray]] = [(None, np.eye(m + 1)[m]) for _ in range(m)]
-    pulls = np.zeros((n, m, m + 1))
-    pulls[:, :, :m] = step.weights - np.eye(m)
-    terms = sum(int((step.weights[g] != 0.0).sum()) for g in range(n))
-    for mode in range(n):
-        for i in range(m):
-            if terms + m > MAX_REGRESSORS:
-                rows.append(i)
-                parts.append((mode, pulls[mode, i]))
-                continue
-            own = np.eye(m + 1)[i]
-            for j in step.inputs(mode, i):
-                if j != i:
-                    rows.append(i)
-                    parts.append((mode, np.eye(m + 1)[j] - own))
-            if abs(1.0 - step.weights[mode, i].sum()) > 1e-12:
-                rows.append(i)
-                parts.append((mode, own))
-    if len(rows) > MAX_REGRESSORS:
-        constants = np.broadcast_to(np.eye(m + 1)[m], (n, m, m + 1))
-        return np.tile(np.arange(m), 2), np.concatenate([constants, pulls], axis=1)
-    inputs = np.zeros((n, len(rows), m + 1))
-    for a, (mode_of, part) in enumerate(parts):
-        inputs[slice(None) if mode_of is None else mode_of, a] = part
-    return np.array(rows), inputs
 
 
 def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, int]:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy import stats
 
 from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.regression import Term
 from msg_analysis.model.step import StepModel, Wiring
 from msg_analysis.types import FloatArray, IntArray
 
@@ -215,6 +216,11 @@ class Equalizer:
             equal[at] = self._roots[mode][0] @ white
         return equal
 
+    def merge(self, other: Equalizer) -> None:
+        """Take what another one has of another run of the same experiment."""
+        self.possible &= other.possible
+        self.chi2, self.dof, self.quiet = self.chi2 + other.chi2, self.dof + other.dof, max(self.quiet, other.quiet)
+
     def p_size(self) -> float | None:
         """Two-sided p-value of the total size of all innovations; None without noise."""
         if not self.dof:
@@ -277,6 +283,7 @@ class HeardRegression:
             self._lead_place[mode, leaders] = np.arange(place, place + len(leaders))
             place += len(leaders)
         self._score, self._covariance = np.zeros(count), np.zeros((count, count))
+        self._gram = np.zeros((count, count))
 
     @property
     def numbers_per_step(self) -> int:
@@ -287,6 +294,25 @@ class HeardRegression:
     def statistic(self) -> tuple[FloatArray, FloatArray]:
         """Scores (K,) and their covariance (K, K)."""
         return self._score, self._covariance
+
+    def gram(self) -> FloatArray | None:
+        """See ``StateRegression.gram``; None where innovations are freed of what is known of them."""
+        return None if self._position is not None else self._gram
+
+    @property
+    def terms(self) -> list[Term]:
+        """What the regressors are; the weights are those of what came."""
+        step = self._step
+        found = [Term("constant", i) for i in range(step.agents)]
+        if not self._each:
+            graphs = range(step.modes) if len(self._score) > 2 * step.agents else [None]
+            return found + [Term("pull", i, graph) for graph in graphs for i in range(step.agents)]
+        for mode, (receiver, sender, _) in enumerate(self._links):
+            links = zip(receiver.tolist(), sender.tolist(), strict=True)
+            found += [Term("link", i, mode, j, float(step.nominal[mode, i, j])) for i, j in links]
+            leaders = np.flatnonzero(self._lead_place[mode] >= 0).tolist()
+            found += [Term("lead", i, mode, None, float(self._pull[mode, i])) for i in leaders]
+        return found
 
     def add(self, reception: Reception, innovations: FloatArray, first: int = 0) -> None:
         """Take a block of steps, from ``first`` on, with their innovations (b, m, R)."""
@@ -301,7 +327,9 @@ class HeardRegression:
             self._score[places] += np.einsum("kar,kar->a", e[:, rows], phi)
             block = np.ix_(places, places)
             flat = phi.transpose(1, 0, 2).reshape(len(rows), -1)
-            self._covariance[block] += process[np.ix_(rows, rows)] * (flat @ flat.T)
+            products = flat @ flat.T
+            self._covariance[block] += process[np.ix_(rows, rows)] * products
+            self._gram[block] += (rows[:, None] == rows) * products
             if reception.link_variance.any():
                 phi = phi * np.sqrt(reception.link_variance[at])[:, rows, None]
                 flat = phi.transpose(1, 0, 2).reshape(len(rows), -1)

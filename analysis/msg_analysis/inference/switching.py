@@ -34,6 +34,66 @@ class SwitchingTest:
     p: float | None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Transitions:
+    """What the paths of the graphs of runs of one experiment add up to.
+
+    Attributes
+    ----------
+    counts : (n, n) of all runs
+    paths : first graph and number of transitions of each run
+    """
+
+    counts: IntArray
+    paths: tuple[tuple[int, int], ...]
+
+    @classmethod
+    def of(cls, modes: IntArray, graphs: int) -> Transitions:
+        """Of one run with the graphs (N,), from 0."""
+        counts = np.zeros((graphs, graphs), dtype=np.int64)
+        np.add.at(counts, (modes[:-1], modes[1:]), 1)
+        return cls(counts, ((int(modes[0]), len(modes) - 1),) if len(modes) else ())
+
+    def merged(self, other: Transitions) -> Transitions:
+        """With those of other runs."""
+        return Transitions(self.counts + other.counts, self.paths + other.paths)
+
+    def test(self, transition: FloatArray) -> SwitchingTest:
+        """See ``switching_test``."""
+        counts = self.counts
+        visits = counts.sum(axis=1)
+        expected = visits[:, None] * transition
+        possible = (transition > 0.0) & (visits[:, None] > 0)
+        dof = int(possible.sum() - (visits > 0).sum())
+        if counts[transition == 0.0].any():
+            return SwitchingTest(counts, expected, 0.0)
+        if dof == 0:
+            return SwitchingTest(counts, expected, None)
+        # Judged by what the chain leads to expect, not by what happened: a choice made from the data is a bias.
+        usual = counts.sum() * stationary_law(transition)[:, None] * transition
+        if usual[transition > 0.0].min() >= MIN_EXPECTED:
+            chi2 = float(likelihood_ratio(counts, transition))
+            return SwitchingTest(counts, expected, float(stats.chi2.sf(chi2, dof)))
+        return SwitchingTest(counts, expected, self._simulated_p(transition))
+
+    def _simulated_p(self, transition: FloatArray) -> float:
+        counts = self.counts
+        jumps = max(1.0, float(counts.sum(axis=1) @ (1.0 - np.diag(transition))))
+        number = int(np.clip(MAX_JUMPS / jumps, 199, PATHS))
+        random = np.random.default_rng(SEED)
+        total = np.zeros((number, *counts.shape), dtype=np.int64)
+        for first, transitions in self.paths:
+            total += simulate_counts(transition, first, transitions, number, random)
+        drawn = likelihood_ratio(total, transition)
+        observed = float(likelihood_ratio(counts, transition))
+        # Ties (few jumps leave few possible values) count as at least as extreme.
+        above = int((drawn >= observed * (1 - 1e-12)).sum())
+        if above or drawn.std() == 0.0:
+            return (above + 1) / (number + 1)
+        shape = (drawn.mean() / drawn.std()) ** 2
+        return float(min(1 / (number + 1), stats.gamma.sf(observed, shape, scale=drawn.mean() / shape)))
+
+
 def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
     """Test a path of the graph against its chain.
 
@@ -47,23 +107,7 @@ def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
     modes : (N,) from 0
     transition : (n, n) P
     """
-    n = len(transition)
-    counts = np.zeros((n, n), dtype=np.int64)
-    np.add.at(counts, (modes[:-1], modes[1:]), 1)
-    visits = counts.sum(axis=1)
-    expected = visits[:, None] * transition
-    possible = (transition > 0.0) & (visits[:, None] > 0)
-    dof = int(possible.sum() - (visits > 0).sum())
-    if counts[transition == 0.0].any():
-        return SwitchingTest(counts, expected, 0.0)
-    if dof == 0:
-        return SwitchingTest(counts, expected, None)
-    # Judged by what the chain leads to expect, not by what happened: a choice made from the data is a bias.
-    usual = (len(modes) - 1) * stationary_law(transition)[:, None] * transition
-    if usual[transition > 0.0].min() >= MIN_EXPECTED:
-        chi2 = float(likelihood_ratio(counts, transition))
-        return SwitchingTest(counts, expected, float(stats.chi2.sf(chi2, dof)))
-    return SwitchingTest(counts, expected, _simulated_p(counts, transition, int(modes[0])))
+    return Transitions.of(modes, len(transition)).test(transition)
 
 
 def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
@@ -103,18 +147,3 @@ def simulate_counts(
         mode, left = after, left - held - 1
         mode, left, path = (a[left > 0] for a in (mode, left, path))
     return counts
-
-
-def _simulated_p(counts: IntArray, transition: FloatArray, first: int) -> float:
-    transitions = int(counts.sum())
-    jumps = max(1.0, float(counts.sum(axis=1) @ (1.0 - np.diag(transition))))
-    paths = int(np.clip(MAX_JUMPS / jumps, 199, PATHS))
-    random = np.random.default_rng(SEED)
-    drawn = likelihood_ratio(simulate_counts(transition, first, transitions, paths, random), transition)
-    observed = float(likelihood_ratio(counts, transition))
-    # Ties (few jumps leave few possible values) count as at least as extreme.
-    above = int((drawn >= observed * (1 - 1e-12)).sum())
-    if above or drawn.std() == 0.0:
-        return (above + 1) / (paths + 1)
-    shape = (drawn.mean() / drawn.std()) ** 2
-    return float(min(1 / (paths + 1), stats.gamma.sf(observed, shape, scale=drawn.mean() / shape)))

@@ -20,6 +20,7 @@ from msg_analysis.inference.compare import Comparison
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.report import figures
 from msg_analysis.report.text import LAWS, QUANTILES, SUPPORT, TIMES, timing_facts, verdict_line
+from msg_analysis.report.verdict_text import order_statements, sentence
 
 _HEADLINES = {
     "agrees": "The run agrees with the prediction.",
@@ -129,6 +130,8 @@ def render(
         laws=LAWS,
         support=SUPPORT,
         explanation=_explanation(document),
+        blame=[sentence(cause["words"]) for cause in document["blame"]],
+        order=_order(document),
         experiment=experiment,
         versions=trajectory.record.versions,
         pictures={name: _data_uri(svg) for name, svg in pictures.items()},
@@ -170,6 +173,14 @@ def _explanation(document: dict[str, Any]) -> str:
     named = ", ".join(f"{test['name']} (p {_p_value(test['p_adjusted'], '= ')})" for test in rejected[:6])
     more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
     return f"{len(rejected)} of {len(tests)} tests reject the predicted law: {named}{more}; {chance}."
+
+
+def _order(document: dict[str, Any]) -> list[str]:
+    """Which agents are more certain than which, in sentences."""
+    if document["order"] is None:
+        return []
+    names = [f"agent {i}" for i in range(1, len(document["node_errors"]) + 1)]
+    return order_statements(document["order"], names, "is more certain than")
 
 
 def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:

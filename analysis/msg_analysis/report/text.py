@@ -12,8 +12,18 @@ from rich.text import Text
 
 from msg_analysis.model.validation import amount
 from msg_analysis.model.words import percent
+from msg_analysis.report.tables import (
+    ROWS,
+    fact_table,
+    interval_text,
+    note_cut,
+    number_table,
+    number_text,
+    p_text,
+    z_text,
+)
+from msg_analysis.report.verdict_text import print_bags, print_blame, print_order
 
-_ROWS = 30
 _LAWS = {
     "continuous": "continuous time",
     "emulated": "steps of the run",
@@ -59,9 +69,9 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     }
     errors = number_table(console, "Mean-square error in the steady state", "", *laws)
     errors.add_row("system", *(number_text(law["system_error"]) for law in laws.values()), end_section=True)
-    for agent in range(min(document["agents"], _ROWS)):
+    for agent in range(min(document["agents"], ROWS)):
         errors.add_row(f"agent {agent + 1}", *(number_text(law["node_errors"][agent]) for law in laws.values()))
-    _note_cut(errors, document["agents"], "agents")
+    note_cut(errors, document["agents"], "agents")
     errors.add_section()
     errors.add_row("certainty", *(number_text(law["system_certainty"]) for law in laws.values()))
     console.print(errors)
@@ -96,15 +106,18 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
         console.print(Text(f"Unpredicted: {document['unpredicted']}."))
     if document.get("transient"):
         console.print(f"The first {document['transient']} steps, a transient, are left out of the errors.")
+    print_blame(document, console)
+    print_bags(document, console)
     _print_errors(document, console)
     _print_tests(document, console)
+    print_order(document, console)
     loss = document.get("loss") or {}
     if loss.get("lost") is not None:
         console.print(f"{loss['lost']} messages lost, {loss['expected']:.6g} expected")
     _print_timing(document, console)
     _print_strangers(document.get("strangers") or [], console)
     interval = document["batch_means"]["interval"]
-    console.print(f"95 % interval of batch means, free of the model: {_interval(interval)}", style="dim")
+    console.print(f"95 % interval of batch means, free of the model: {interval_text(interval)}", style="dim")
     continuous = document["continuous"]["system_error"]
     if continuous is not None and not document.get("laws"):
         console.print(f"System error in continuous time, for reference: {number_text(continuous)}", style="dim")
@@ -142,9 +155,9 @@ def _print_strangers(strangers: Sequence[dict[str, Any]], console: Console) -> N
     for heading in ("node", "topic", "reason"):
         table.add_column(heading, overflow="fold")
     table.add_column("number", justify="right")
-    for entry in strangers[:_ROWS]:
+    for entry in strangers[:ROWS]:
         table.add_row(*(Text(str(entry[key])) for key in ("node", "topic", "reason", "count")))
-    _note_cut(table, len(strangers), "kinds")
+    note_cut(table, len(strangers), "kinds")
     console.print(table)
 
 
@@ -158,17 +171,20 @@ def _print_errors(document: dict[str, Any], console: Console) -> None:
         table.add_row(
             label,
             measured,
-            _interval(entry.get("interval")),
+            interval_text(entry.get("interval")),
             predicted,
-            _z(entry.get("z")),
+            z_text(entry.get("z")),
             end_section=end_section,
         )
 
-    row("system", document["system_error"], end_section=True)
+    given = document.get("given_path")
+    row("system", document["system_error"], end_section=not given)
+    if given:
+        row("system, corrected for the path of the graphs", given["system_error"], end_section=True)
     nodes = document["node_errors"] or []
-    for agent, entry in enumerate(nodes[:_ROWS], start=1):
+    for agent, entry in enumerate(nodes[:ROWS], start=1):
         row(f"agent {agent}", entry)
-    _note_cut(table, len(nodes), "agents")
+    note_cut(table, len(nodes), "agents")
     console.print(table)
 
 
@@ -205,7 +221,7 @@ def _print_timing(document: dict[str, Any], console: Console) -> None:
     for key, title in LAWS.items():
         law = laws[key]
         error = law["system_error"]
-        table.add_row(title, number_text(error["predicted"]), _z(error["z"]), Text(SUPPORT[law["supported"]]))
+        table.add_row(title, number_text(error["predicted"]), z_text(error["z"]), Text(SUPPORT[law["supported"]]))
     console.print(table)
     console.print(Text(laws["why"]))
 
@@ -237,9 +253,9 @@ def _print_tests(document: dict[str, Any], console: Console) -> None:
     table = number_table(console, title, "test", "p", "p adjusted", "")
     # With many agents the table is cut: what rejects comes first.
     shown = [test for test in tests if test["rejected"]] + [test for test in tests if not test["rejected"]]
-    for test in shown[:_ROWS]:
-        table.add_row(Text(str(test["name"])), _p(test["p"]), _p(test["p_adjusted"]), _mark(test))
-    _note_cut(table, len(shown), "tests")
+    for test in shown[:ROWS]:
+        table.add_row(Text(str(test["name"])), p_text(test["p"]), p_text(test["p_adjusted"]), _mark(test))
+    note_cut(table, len(shown), "tests")
     console.print(table)
 
 
@@ -287,7 +303,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     switching = document["switching"]
     title = "Rates from graph to graph" if document["time"] == "continuous" else "Probabilities from graph to graph"
     names = [graph["name"] for graph in document["graphs"]]
-    if 1 < len(names) <= _ROWS:
+    if 1 < len(names) <= ROWS:
         chain = number_table(console, title, "from / to", *names)
         for name, row in zip(names, switching["matrix"], strict=True):
             chain.add_row(Text(name), *map(number_text, row))
@@ -328,10 +344,10 @@ def print_leaders(document: dict[str, Any], console: Console) -> None:
     title = f"{what}, {gain}, {law}"
     centrality = "joint centrality" if document["gain"] == "inf" else "certainty"
     table = number_table(console, title, "agents", "system error", centrality)
-    for entry in document["sets"][:_ROWS]:
+    for entry in document["sets"][:ROWS]:
         row = (_names(entry["agents"]), number_text(entry["system_error"]), number_text(entry["joint_centrality"]))
         table.add_row(*row)
-    _note_cut(table, len(document["sets"]), "sets")
+    note_cut(table, len(document["sets"]), "sets")
     console.print(table)
     facts = fact_table(console, f"Found by {_METHODS[document['method']]}")
     facts.add_row("system errors computed", str(document["evaluations"]))
@@ -346,53 +362,10 @@ def print_leaders(document: dict[str, Any], console: Console) -> None:
     console.print(facts)
 
 
-def number_table(console: Console, title: str, first: str, *numbers: str) -> Table:
-    """A table under its heading: one column of names, the others of numbers."""
-    console.print(Text(title, style="bold"))
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column(Text(first))
-    for number in numbers:
-        table.add_column(Text(number), justify="right")
-    return table
-
-
-def fact_table(console: Console, title: str) -> Table:
-    """A table of names and what they are, under its heading."""
-    console.print(Text(title, style="bold"))
-    table = Table(box=box.SIMPLE, show_header=False)
-    table.add_column(style="dim", no_wrap=True)
-    table.add_column(overflow="fold")
-    return table
-
-
-def _note_cut(table: Table, total: int, what: str) -> None:
-    if total > _ROWS:
-        table.caption = f"{total - _ROWS} more {what}: use --json"
-
-
-def number_text(value: float | None) -> str:
-    """Six digits; a dash for what is undefined."""
-    return "-" if value is None else f"{value:.6g}"
-
-
-def _z(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.2f}"
-
-
-def _p(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
-
-
 def _mark(test: dict[str, Any]) -> Text:
     if test["p"] is None:
         return Text("not done", style="dim")
     return Text("rejected", style="bold red") if test["rejected"] else Text("passed", style="green")
-
-
-def _interval(interval: Sequence[float | None] | None) -> str:
-    if not interval or None in interval:
-        return "-"
-    return f"{number_text(interval[0])} .. {number_text(interval[1])}"
 
 
 def _short(value: Any) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.report.text import fact_table, number_table, number_text
+from msg_analysis.report.tables import fact_table, number_table, number_text
 
 _ROWS = 40
 _LAWS = {"continuous": "continuous time", "emulated": "steps of the run", "discrete": "discrete time"}

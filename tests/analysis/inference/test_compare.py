@@ -67,7 +67,7 @@ CASES = {
 def test_calibration(case):
     """p-values of 60 true runs are uniform, intervals cover, verdicts agree.
 
-    Kolmogorov-Smirnov at 2e-4 for each of at most 11 tests, coverage and verdicts at 1e-4 by the binomial
+    Kolmogorov-Smirnov at 2e-4 for each of at most 12 tests, coverage and verdicts at 1e-4 by the binomial
     law: a right program fails a case with probability below 0.3 %.
     """
     experiment = golden(case if case in ("tracking", "discrete") else "line_ring", **CASES[case])
@@ -112,12 +112,12 @@ def simulate_air(experiment, seed):
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_calibration_with_noise_that_depends_on_the_graph(loss):
-    """60 runs; levels as in test_calibration, 10 or 11 tests."""
+    """60 runs; levels as in test_calibration, 11 or 12 tests."""
     noise = {"process": 0.2, "broadcast": 0.3, "link": 0.2, "loss": loss}
     air = changed(golden("air", duration=50, replicas=3, start="zero"), noise=noise)
     results = [compare(simulate_air(air, seed)) for seed in SEEDS]
     collected = [p_values(result) for result in results]
-    assert len(collected[0]) == (10 if loss == 0.0 else 11)
+    assert len(collected[0]) == (11 if loss == 0.0 else 12)
     for name in collected[0]:
         assert stats.kstest([p[name] for p in collected], "uniform").pvalue > 2e-4, name
     assert sum(r.verdict == "disagrees" for r in results) <= stats.binom.isf(1e-4, len(results), 0.01)
@@ -202,7 +202,7 @@ def test_document(short_run):
     assert np.sum(document["switching"]["counts"]) == 499
     assert document["continuous"]["system_error"] == pytest.approx(1.3594132029339856, rel=1e-8)
     assert len(document["batch_means"]["interval"]) == 2
-    assert [test["rejected"] for test in document["tests"]] == [False] * 11
+    assert [test["rejected"] for test in document["tests"]] == [False] * 12
 
 
 def test_many_agents_get_no_joint_test_but_all_numbers(short_run, monkeypatch):
@@ -242,7 +242,7 @@ def test_too_little_data_get_no_numbers(short_run, step):
     assert document["system_error"]["measured"] is None
     assert document["system_error"]["interval"] == [None, None]
     assert document["system_error"]["predicted"] > 0
-    assert document["innovations"] == {"p_covariance": None, "p_whiteness": None, "p_gain": None}
+    assert document["innovations"] == dict.fromkeys(("p_covariance", "p_whiteness", "p_gain", "p_common_gain"))
     assert document["switching"] == {"counts": None, "expected": None, "p": None}
     assert document["loss"] == {"lost": None, "expected": None, "p": None}
     assert document["broadcast"] == {"p": None}

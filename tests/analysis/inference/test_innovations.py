@@ -8,6 +8,7 @@ from scipy import stats
 from msg_analysis.inference import innovations as module
 from msg_analysis.inference.innovations import innovation_tests, innovations, quadratic_form
 from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.regression import regressors
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin import simulate
@@ -114,7 +115,8 @@ def test_blocks_change_nothing(observation, monkeypatch):
 def test_regressors_stay_few(observation, monkeypatch, limit, count):
     """Coarser regressors: 3 constants + 2 x 3 rows, then 3 constants + 3 rows."""
     monkeypatch.setattr(module, "MAX_REGRESSORS", limit)
-    rows, inputs = module._regressors(observation.step)
+    rows, inputs, terms = regressors(observation.step, limit)
+    assert len(terms) == count
     assert rows.shape == (count,)
     assert inputs.shape == (2, count, 4)
     assert 0.0 < innovation_tests(observation).p_gain < 1.0

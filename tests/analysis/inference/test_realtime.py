@@ -168,7 +168,7 @@ def test_regression_frees_innovations_of_those_made_before(late_timers):
 def test_calibration(late_timers, case):
     """p-values of 30 late runs of 400 steps are even, intervals cover, verdicts agree.
 
-    Kolmogorov-Smirnov at 2e-4 for each of 9 tests, coverage and verdicts at 1e-4 by the binomial law: a right program
+    Kolmogorov-Smirnov at 2e-4 for each of 10 tests, coverage and verdicts at 1e-4 by the binomial law: a right program
     fails a case with probability below 0.3 %.
     """
     late = lateness(late_timers)
@@ -176,7 +176,7 @@ def test_calibration(late_timers, case):
     results = [compare(run) for run in runs]
     collected = [{test.name: test.p for test in result.tests} for result in results]
     names = ["system error", *(f"error of agent {i}" for i in (1, 2, 3)), "covariance"]
-    names += [f"innovations: {what}" for what in ("covariance", "whiteness", "gains")]
+    names += [f"innovations: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]
     assert list(collected[0]) == [*names, "switching"]
     for name in collected[0]:
         assert stats.kstest([p[name] for p in collected], "uniform").pvalue > 2e-4, name
@@ -265,7 +265,8 @@ def test_clocks_that_disagree_leave_the_innovations(late_timers):
     result = compare(dataclasses.replace(trajectory, made=made))
     assert result.verdict == "agrees"
     tests = [test.name for test in result.tests]
-    assert tests == ["innovations: covariance", "innovations: whiteness", "innovations: gains", "switching"]
+    names = [f"innovations: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]
+    assert tests == [*names, "switching"]
     document = result.to_json()
     assert document["law"] == "sequential"
     assert document["laws"]["pattern"]["supported"] is None

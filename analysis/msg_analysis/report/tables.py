@@ -1,0 +1,60 @@
+"""Tables for a terminal: what all of them have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+ROWS = 30
+"""Most rows of a table; --json has them all."""
+
+
+def number_table(console: Console, title: str, first: str, *numbers: str) -> Table:
+    """A table under its heading: one column of names, the others of numbers."""
+    console.print(Text(title, style="bold"))
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column(Text(first))
+    for number in numbers:
+        table.add_column(Text(number), justify="right")
+    return table
+
+
+def fact_table(console: Console, title: str) -> Table:
+    """A table of names and what they are, under its heading."""
+    console.print(Text(title, style="bold"))
+    table = Table(box=box.SIMPLE, show_header=False)
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    return table
+
+
+def note_cut(table: Table, total: int, what: str) -> None:
+    """Say how many rows of the total are not shown."""
+    if total > ROWS:
+        table.caption = f"{total - ROWS} more {what}: use --json"
+
+
+def number_text(value: float | None) -> str:
+    """Six digits; a dash for what is undefined."""
+    return "-" if value is None else f"{value:.6g}"
+
+
+def z_text(value: float | None) -> str:
+    """With its sign."""
+    return "-" if value is None else f"{value:+.2f}"
+
+
+def p_text(value: float | None) -> str:
+    """Three digits."""
+    return "-" if value is None else f"{value:.3g}"
+
+
+def interval_text(interval: Sequence[float | None] | None) -> str:
+    """Low .. high."""
+    if not interval or None in interval:
+        return "-"
+    return f"{number_text(interval[0])} .. {number_text(interval[1])}"

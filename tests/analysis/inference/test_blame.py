@@ -1,0 +1,229 @@
+"""What is blamed for runs in which one thing is wrong, and selection against plain least squares."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import optimize, stats
+
+from msg_analysis.inference.compare import compare
+from msg_analysis.inference.rates import find_rates
+from msg_analysis.inference.selection import Candidate, select
+from msg_analysis.model.chain import MarkovChain
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.record import RunRecord
+from msg_analysis.twin import new_record, simulate
+
+PAIRS = {"line": [(1, 2), (2, 3), (3, 4)], "ring": [(1, 2), (2, 3), (3, 4), (4, 1)]}
+
+
+def graphs(gain=lambda sender, receiver, graph: 1.0):
+    """Arc by arc; arcs of gain 0 are left out."""
+    found = {}
+    for name, pairs in PAIRS.items():
+        both = [arc for i, j in pairs for arc in ((i, j), (j, i))]
+        found[name] = {"arcs": [[i, j, gain(i, j, name)] for i, j in both if gain(i, j, name) > 0]}
+    return found
+
+
+BASE = {
+    "name": "square",
+    "agents": 4,
+    "graphs": graphs(),
+    "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
+    "noise": {"process": 1.0},
+    "run": {"dt": 0.1, "duration": 100, "replicas": 32, "seed": 11},
+}
+LEADERS = {"agents": [1, 3], "gain": 1.0, "reference": 2.0}
+TRACKING = BASE | {"problem": "tracking", "leaders": LEADERS}
+AIR = BASE | {"noise": {"process": 1.0, "loss": 0.1, "broadcast": 0.2}}
+
+
+def run(truth, claimed):
+    """A run of one law that claims to be of another; losses that the claim does not know are not logged."""
+    true, claim = Experiment.parse(truth), Experiment.parse(claimed)
+    record = new_record(claim)
+    trajectory = simulate(true, record=RunRecord(record.run, true, record.start))
+    lost = trajectory.lost if claim.noise.loss else None
+    return dataclasses.replace(trajectory, record=record, lost=lost)
+
+
+def weaker(factor, *, sender=None, receiver=None, graph=None):
+    def gain(i, j, name):
+        hit = sender in (None, i) and receiver in (None, j) and graph in (None, name)
+        return factor if hit else 1.0
+
+    return graphs(gain)
+
+
+CASES = {
+    "noise of an agent": (BASE, {"noise": {"process": [1.0, 1.1, 1.0, 1.0]}}, ("noise", 2, None, None), 1.21),
+    "noise of all": (BASE, {"noise": {"process": 1.05}}, ("noise", None, None, None), 1.1025),
+    "noise under a graph": (
+        BASE,
+        {"noise": {"process": {"line": 1.0, "ring": 1.08}}},
+        ("noise", None, None, "ring"),
+        1.08**2,
+    ),
+    "one link": (BASE, {"graphs": weaker(0.7, sender=2, receiver=3)}, ("gain", None, (2, 3), None), 0.7),
+    "one link of a graph": (
+        BASE,
+        {"graphs": weaker(0.5, sender=1, receiver=2, graph="line")},
+        ("gain", None, (1, 2), "line"),
+        0.5,
+    ),
+    "what an agent hears": (BASE, {"graphs": weaker(0.7, receiver=3)}, ("gain", 3, None, None), 0.7),
+    "messages of an agent": (BASE, {"graphs": weaker(0.7, sender=2)}, ("ignored", 2, None, None), 0.3),
+    "messages ignored": (BASE, {"noise": {"process": 1.0, "loss": 0.1}}, ("ignored", None, None, None), 0.1),
+    "all gains too large": (BASE, {"graphs": weaker(1.2)}, ("gain", None, None, None), 1.2),
+    "a leader's gain": (
+        TRACKING,
+        {"leaders": LEADERS | {"agents": [1, 3], "gain": 1.3}},
+        ("gain", None, None, None),
+        1.3,
+    ),
+    "reference": (TRACKING, {"leaders": LEADERS | {"reference": 2.3}}, ("reference", None, None, None), 2.3),
+    "a rate": (
+        BASE,
+        {"switching": {"generator": [[-2.0, 2.0], [0.5, -0.5]]}},
+        ("switching", None, None, ["line", "ring"]),
+        2.0,
+    ),
+    "all rates": (
+        BASE,
+        {"switching": {"generator": [[-1.5, 1.5], [1.5, -1.5]]}},
+        ("switching", None, None, None),
+        3.0,
+    ),
+    "more loss": (AIR, {"noise": {"process": 1.0, "loss": 0.2, "broadcast": 0.2}}, ("loss", None, None, None), 0.2),
+    "broadcast noise": (
+        AIR,
+        {"noise": {"process": 1.0, "loss": 0.1, "broadcast": 0.21}},
+        ("broadcast", None, None, None),
+        1.05**2,
+    ),
+    "correlated noise": (
+        BASE,
+        {"noise": {"process": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0.2, 0.96**0.5, 0], [0, 0, 0, 1]]}},
+        ("correlation", None, (2, 3), None),
+        0.2,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_blame(case):
+    """Fixed seeds; every fault is six standard errors large, and is to be estimated within four of them."""
+    claimed, change, said, truth = CASES[case]
+    result = compare(run(claimed | change, claimed))
+    assert result.verdict == "disagrees"
+    first = result.blame[0]
+    assert (first.kind, first.agent, first.link, first.graph) == said, [cause.words for cause in result.blame]
+    low, high = first.interval
+    assert low < first.estimate < high
+    assert abs(first.estimate - truth) < 2.05 * (high - low) / 2
+    assert first.p < 0.01
+    assert result.to_json()["blame"][0]["words"] == first.words
+
+
+def test_a_frozen_agent_is_the_only_cause():
+    """What follows from it, in gains and noise, is not listed."""
+    still = {"graphs": weaker(0.0, receiver=3), "noise": {"process": [1.0, 1.0, 0.0, 1.0]}}
+    (cause,) = compare(run(BASE | still, BASE)).blame
+    assert (cause.kind, cause.agent, cause.estimate, cause.p) == ("frozen", 3, 1.0, 0.0)
+    assert cause.words == "agent 3 does not move in any of its steps, although it has noise"
+
+
+def test_an_agent_that_freezes_for_a_while():
+    trajectory = run(BASE, BASE)
+    trajectory.states[400:500, 1] = trajectory.states[400, 1]
+    first = compare(trajectory).blame[0]
+    assert (first.kind, first.agent) == ("frozen", 2)
+    assert first.estimate == pytest.approx(99 / 1000)
+
+
+def test_two_faults_are_both_found():
+    both = {"noise": {"process": [1.0, 1.1, 1.0, 1.0]}, "graphs": weaker(0.6, sender=2, receiver=3)}
+    causes = compare(run(BASE | both, BASE)).blame
+    assert {(cause.kind, cause.agent, cause.link) for cause in causes} == {("noise", 2, None), ("gain", None, (2, 3))}
+
+
+def test_copied_noise_is_named():
+    trajectory = run(BASE, BASE)
+    trajectory.states[:] = trajectory.states[:, :, :1]
+    trajectory.record.start[:] = trajectory.record.start[:, :1]
+    result = compare(trajectory)
+    assert result.verdict == "disagrees"
+    assert any("goes together" in cause.words or cause.kind != "unknown" for cause in result.blame)
+
+
+def test_a_forbidden_jump():
+    claimed = BASE | {
+        "graphs": graphs() | {"star": {"arcs": [[1, 2], [2, 1], [1, 3], [3, 1], [1, 4], [4, 1]]}},
+        "switching": {"generator": [[-0.5, 0.5, 0.0], [0.5, -1.0, 0.5], [0.0, 0.5, -0.5]]},
+    }
+    discrete = claimed | {
+        "time": "discrete",
+        "switching": {"transition": [[0.5, 0.5, 0.0], [0.3, 0.4, 0.3], [0.0, 0.5, 0.5]]},
+        "run": {"duration": 300, "replicas": 1, "seed": 2},
+    }
+    truth = discrete | {"switching": {"transition": [[0.5, 0.4, 0.1], [0.3, 0.4, 0.3], [0.0, 0.5, 0.5]]}}
+    causes = compare(run(truth, discrete)).blame
+    assert causes[0].graph == ["line", "star"]
+    assert "never" in causes[0].words
+
+
+def test_selection_is_generalised_least_squares():
+    random = np.random.default_rng(4)
+    design = random.standard_normal((300, 6))
+    true = np.array([0.0, 1.0, 0.0, 0.0, -0.8, 0.0])
+    y = design @ true + random.standard_normal(300)
+    score, information = design.T @ y, design.T @ design
+    singles = [Candidate("one", i, row) for i, row in enumerate(np.eye(6))]
+    found, change = select(score, information, [singles, [Candidate("all", None, np.ones(6))]], 2, 0.01)
+    assert sorted((one.part, one.what) for one in found) == [("one", 1), ("one", 4)]
+    both = design[:, [1, 4]]
+    fit, inverse = np.linalg.lstsq(both, y, rcond=None)[0], np.linalg.inv(both.T @ both)
+    estimates = {one.what: (one.estimate, one.standard_error) for one in found}
+    assert estimates[1] == pytest.approx((fit[0], inverse[0, 0] ** 0.5))
+    assert estimates[4] == pytest.approx((fit[1], inverse[1, 1] ** 0.5))
+    np.testing.assert_allclose(change[[1, 4]], fit)
+    assert not change[[0, 2, 3, 5]].any()
+
+
+def test_nothing_is_selected_where_nothing_is_wrong():
+    """1000 draws, level 0.05: binomial at 1e-4."""
+    random = np.random.default_rng(5)
+    root = random.standard_normal((6, 6))
+    singles = [Candidate("one", i, row) for i, row in enumerate(np.eye(6))]
+    classes = [singles, [Candidate("all", None, np.ones(6))]]
+    wrong = 0
+    for _ in range(1000):
+        wrong += bool(select(root @ random.standard_normal(6), root @ root.T, classes, 2, 0.05)[0])
+    assert wrong <= stats.binom.isf(1e-4, 1000, 0.05)
+
+
+def test_rates_are_the_likeliest():
+    """One probability of a discrete chain: its likelihood and interval in closed form, with scipy's root finder."""
+    counts = np.array([[700, 200], [150, 350]])
+    chain = MarkovChain("discrete", np.array([[0.9, 0.1], [0.3, 0.7]]))
+    (rate,) = find_rates(counts, chain, 1.0, 1, 0.01)
+    assert rate.jumps == ((0, 1),)
+    assert rate.factor * 0.1 == pytest.approx(200 / 900, rel=1e-5)
+
+    def less(p):
+        return 200 * np.log(200 / 900 / p) + 700 * np.log(700 / 900 / (1 - p)) - stats.chi2.ppf(0.95, 1) / 2
+
+    ends = [optimize.brentq(less, 1e-3, 200 / 900), optimize.brentq(less, 200 / 900, 0.9)]
+    assert np.multiply(rate.interval, 0.1) == pytest.approx(ends, rel=1e-4)
+
+
+def test_rates_in_continuous_time():
+    """Twice the rates: P = expm(2 Gamma dt), so factor 2, exactly where the counts are its expectation."""
+    chain = MarkovChain("continuous", np.array([[-1.0, 1.0], [3.0, -3.0]]))
+    faster = MarkovChain("continuous", 2 * chain.matrix).transition(0.1)
+    counts = np.rint(faster * [[300_000], [100_000]]).astype(int)
+    (rate,) = find_rates(counts, chain, 0.1, 1, 0.01)
+    assert len(rate.jumps) == 2
+    assert rate.origin is None
+    assert rate.factor == pytest.approx(2.0, rel=1e-3)
