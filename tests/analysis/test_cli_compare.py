@@ -88,14 +88,22 @@ def test_tabulate(results: list[Path], bags: list[Path]) -> None:
     saved: dict[str, Any] = json.loads(results[1].read_text(encoding="utf-8"))
     assert float(rows[1]["measured"]) == saved["system_error"]["measured"]
     assert float(rows[1]["low"]) == saved["system_error"]["interval"][0]
-    assert rows[1]["seed"] == "2"
+    assert rows[1]["seeds"] == "2"
     document = json.loads(call("tabulate", *results, "--format", "json").stdout)
     assert [row["verdict"] for row in document["results"]] == [row["verdict"] for row in rows]
+    (merged,) = document["merged"]
+    pooled = json.loads(call("compare", *bags[:2], "--json").stdout)["system_error"]
+    assert merged["files"] == [str(path) for path in results[:2]]
+    assert {key: merged[key] for key in ("measured", "standard_error", "predicted", "z", "p")} == pytest.approx(
+        {key: pooled[key] for key in ("measured", "standard_error", "predicted", "z", "p")}
+    )
     order = document["order"]
     assert {(pair["better"], pair["worse"], pair["predicted"]) for pair in order["distinctions"]} == {
         (1, 3, True),
         (2, 3, True),
     }
+    twice = json.loads(call("tabulate", results[0], results[0], "--format", "json").stdout)
+    assert twice["merged"] == []
     table = call("tabulate", *results)
     assert table.exit_code == 0
     assert "has a smaller system error than" in " ".join(table.stdout.split())

@@ -15,6 +15,7 @@ from msg_analysis.inference.blame import Accused, Cause, find_causes
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates
 from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.given_path import GivenPath
+from msg_analysis.inference.identity import law_identity
 from msg_analysis.inference.innovations import InnovationTests
 from msg_analysis.inference.laws import Laws
 from msg_analysis.inference.martingale import TimeMeans
@@ -134,6 +135,7 @@ class Comparison:
             "transient": self.transient,
             "run": None if self.pool else str(record.run),
             "experiment": record.experiment.name,
+            "experiment_identity": law_identity(record.experiment),
             "leaders": (np.flatnonzero(record.experiment.leader_gains) + 1).tolist(),
             "seed": None if self.pool else record.experiment.run.seed,
             "level": self.level,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,14 +14,12 @@ from msg_analysis.errors import InputError
 from msg_analysis.inference import compare
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.evidence import Evidence
+from msg_analysis.inference.identity import first_difference
 from msg_analysis.inference.observation import Observation
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.trajectory import Completeness, Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
-
-MAY_DIFFER = {"name", "run.seed", "run.duration", "run.processes", "run.speed"}
-"""Keys of an experiment that change nothing about its law."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,24 +150,13 @@ def _require_another(members: list[Member], name: str, record: RunRecord) -> Non
             )
     if not members:
         return
-    mine, first = _flat(record.experiment.to_document()), _flat(members[0].record.experiment.to_document())
-    for key in sorted((mine.keys() | first.keys()) - MAY_DIFFER):
-        if mine.get(key) != first.get(key):
-            raise InputError(
-                f"{name}: {key}: {_shown(mine.get(key))}, but {_shown(first.get(key))} in {members[0].name}: pool runs "
-                "of one experiment (seed and duration may differ), and put others beside each other with "
-                "`msg-analysis tabulate`"
-            )
-
-
-def _flat(document: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in document.items():
-        if isinstance(value, Mapping):
-            found |= _flat(value, f"{prefix}{key}.")
-        else:
-            found[f"{prefix}{key}"] = value
-    return found
+    differs = first_difference(record.experiment, members[0].record.experiment)
+    if differs:
+        key, mine, others = differs
+        raise InputError(
+            f"{name}: {key}: {_shown(mine)}, but {_shown(others)} in {members[0].name}: pool runs of one experiment "
+            "(seed and duration may differ), and put others beside each other with `msg-analysis tabulate`"
+        )
 
 
 def _shown(value: Any) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.text import Text
+from scipy import stats
 
 from msg_analysis.errors import InputError
 from msg_analysis.inference.order import Order, order_of
@@ -30,7 +31,7 @@ class Result:
     Attributes
     ----------
     file : where it came from
-    experiment, seed : of the run
+    experiment, seeds : of the run, or of all runs: "1 2"
     bags : number of runs it is about
     leaders : numbers of the leaders, "3" or "1 4"; empty without
     verdict : of the comparison
@@ -38,11 +39,12 @@ class Result:
     measured, standard_error, low, high, predicted, z : of the system error; low to high is the 95 % interval
     least_p : least adjusted p of the tests
     blame : what is wrong, in words; empty where nothing is
+    identity : the same for runs of the same law
     """
 
     file: str
     experiment: str
-    seed: int | None
+    seeds: str
     bags: int
     leaders: str
     verdict: str
@@ -55,6 +57,7 @@ class Result:
     z: float | None
     least_p: float | None
     blame: str
+    identity: str | None
 
 
 def read_result(path: Path) -> Result:
@@ -82,13 +85,13 @@ def read_result(path: Path) -> Result:
     interval = total.get("interval")
     if not isinstance(interval, list) or len(interval) != 2:
         raise InputError(f"{file}: system_error.interval: {interval!r}: {wanted}")
-    seed = document.get("seed")
+    seeds = [run.get("seed") for run in document.get("bags") or [document] if isinstance(run, dict)]
     tests = [_number(test, "p_adjusted", file) for test in document.get("tests") or []]
     blame = [str(cause.get("words")) for cause in document.get("blame") or []]
     return Result(
         file=str(path),
         experiment=_part(document, "experiment", str, file),
-        seed=seed if isinstance(seed, int) else None,
+        seeds=" ".join(str(seed) for seed in seeds if seed is not None),
         bags=len(document.get("bags") or [None]),
         leaders=" ".join(str(leader) for leader in document.get("leaders") or []),
         verdict=_part(document, "verdict", str, file),
@@ -101,6 +104,7 @@ def read_result(path: Path) -> Result:
         z=_number(total, "z", file),
         least_p=min((p for p in tests if p is not None), default=None),
         blame="; ".join(blame),
+        identity=document.get("experiment_identity"),
     )
 
 
@@ -118,6 +122,53 @@ def _number(document: Any, key: str, file: Path) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{file}: {key}: {value!r}: expected a number")
     return float(value)
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """Results of the same law, as one.
+
+    Attributes
+    ----------
+    experiment : name of the first
+    files : where they came from
+    simulated_time : of all
+    measured, standard_error, predicted, z, p : of the system error; every unit of time counts the same
+    """
+
+    experiment: str
+    files: tuple[str, ...]
+    simulated_time: float
+    measured: float
+    standard_error: float
+    predicted: float
+    z: float
+    p: float
+
+
+def merge_results(rows: Sequence[Result]) -> list[Merged]:
+    """System errors of results of the same law, as one; without those that have no number, or an earlier one's seed."""
+    groups: dict[str, list[Result]] = {}
+    for row in rows:
+        if row.identity is None or row.measured is None or row.predicted is None or not row.standard_error:
+            continue
+        group = groups.setdefault(row.identity, [])
+        if not any(set(row.seeds.split()) & set(other.seeds.split()) for other in group):
+            group.append(row)
+    found = []
+    for group in groups.values():
+        if len(group) < 2:
+            continue
+        time = np.array([row.simulated_time for row in group])
+        share = time / time.sum()
+        measured = float(share @ [row.measured for row in group])
+        predicted = float(share @ [row.predicted for row in group])
+        error = float(np.linalg.norm(share * [row.standard_error for row in group]))
+        z = (measured - predicted) / error
+        files = tuple(row.file for row in group)
+        p = float(2.0 * stats.norm.sf(abs(z)))
+        found.append(Merged(group[0].experiment, files, float(time.sum()), measured, error, predicted, z, p))
+    return found
 
 
 def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
@@ -138,9 +189,13 @@ def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
 
 
 def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
-    """The document: ``results`` and ``order``, whose numbers are places among them, from 1."""
+    """The document: ``results``, ``merged``, and ``order``, whose numbers are places among the results, from 1."""
     order = order_of_results(rows, level)
-    return {"results": [asdict(row) for row in rows], "order": order.to_json() if order else None}
+    return {
+        "results": [asdict(row) for row in rows],
+        "merged": [asdict(one) for one in merge_results(rows)],
+        "order": order.to_json() if order else None,
+    }
 
 
 def to_csv(rows: Sequence[Result]) -> str:
@@ -180,6 +235,14 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
     for row in rows:
         if row.blame:
             console.print(Text(f"{row.file}: {row.blame}."))
+    for one in merge_results(rows):
+        console.print(
+            Text(
+                f"{one.experiment}, {len(one.files)} results merged ({number_text(one.simulated_time)} units of time): "
+                f"{number_text(one.measured)} ± {number_text(one.standard_error)}, predicted "
+                f"{number_text(one.predicted)}, z {one.z:+.2f}, p {one.p:.3g}."
+            )
+        )
     order = order_of_results(rows, level)
     if order:
         for sentence in order_statements(
@@ -204,7 +267,7 @@ def _shown(rows: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
     ]
     body = []
     for row in rows:
-        seed = f"{row.bags} runs" if row.bags > 1 else str("-" if row.seed is None else row.seed)
+        seed = f"{row.bags} runs" if row.bags > 1 else row.seeds or "-"
         numbers = [row.simulated_time, row.measured, row.standard_error, row.predicted]
         shown = [number_text(value) for value in numbers]
         z = "-" if row.z is None else f"{row.z:+.2f}"
