@@ -9,7 +9,8 @@ from rich.table import Table
 from rich.text import Text
 
 from msg_analysis.model.validation import amount
-from msg_analysis.report.text import add_protocol, fact_table, gaps, number_text
+from msg_analysis.report.tables import fact_table, number_text
+from msg_analysis.report.text import add_protocol, gaps
 
 _TOPICS = 12  # listed; --json has all
 
