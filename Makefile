@@ -57,11 +57,12 @@ format: setup ## Rewrite the code in the house style
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-bench: setup ## Measure speed side by side with the bare middleware, and with other solvers
+bench: setup ## Measure speed side by side with the bare middleware, other solvers and other readers of bags
 	$(BIN)/python benchmarks/network.py
 	$(BIN)/python benchmarks/precision.py
 	$(BIN)/python benchmarks/moments.py
 	$(BIN)/python benchmarks/leaders.py
+	$(BIN)/python benchmarks/reading.py
 
 calibrate: setup ## Measure error rates and power of the verdict into docs/statistics.md: some 10 minutes on two CPUs
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --write

@@ -12,10 +12,12 @@ Two ways in: the message classes read and write anything that is valid; :class:`
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -182,6 +184,9 @@ def with_state(data: bytes, payload: bytes, size: int | None = None) -> bytes:
     return data[: len(data) - size - _LENGTH.size] + _LENGTH.pack(len(payload) // 8) + payload
 
 
+_NUMBERS = {order: {code: struct.Struct(order + code) for code in "iIQ"} for order in "<>"}
+
+
 class _Reader:
     """Takes fields off CDR bytes; checks every length before it makes anything of it."""
 
@@ -191,6 +196,7 @@ class _Reader:
             start = bytes(data[:HEADER_SIZE]).hex(" ") or "nothing"
             raise CdrError(f"{kind}: begins with {start}, expected a CDR header 00 01 00 00")
         self._data, self._order = data, "<" if data[1] else ">"
+        self._numbers = _NUMBERS[self._order]
         self._at = HEADER_SIZE
 
     def _take(self, size: int, alignment: int, what: str) -> int:
@@ -201,9 +207,9 @@ class _Reader:
         return start
 
     def number(self, code: str, what: str) -> int:
-        size = struct.calcsize(code)
-        start = self._take(size, size, what)
-        value: int = struct.unpack_from(self._order + code, self._data, start)[0]
+        form = self._numbers[code]
+        size = form.size
+        value: int = form.unpack_from(self._data, self._take(size, size, what))[0]
         return value
 
     def raw(self, size: int, what: str) -> bytes:
@@ -230,6 +236,10 @@ class _Reader:
 
     def stamp(self) -> int:
         return self.number("i", "header") * SECOND + self.number("I", "header")
+
+    def rest(self) -> bytes:
+        """What has not been read."""
+        return self._data[self._at :]
 
     def end(self) -> None:
         left = len(self._data) - self._at
@@ -373,13 +383,33 @@ class ActiveGraph:
         run, sequence = reader.raw(RUN_SIZE, "run"), reader.number("I", "sequence")
         mode, name = reader.number("I", "mode"), reader.string("name")
         first, last = reader.number("Q", "first_step"), reader.number("Q", "last_step")
-        source, target = reader.array("u4", "source"), reader.array("u4", "target")
-        weight = reader.array("f8", "weight")
-        reader.end()
-        if not len(source) == len(target) == len(weight):
-            raise CdrError(f"ActiveGraph: {len(source)} sources, {len(target)} targets and {len(weight)} weights")
-        arcs = tuple(zip(source.tolist(), target.tolist(), weight.tolist(), strict=True))
+        arcs, rest = None, reader.rest()
+        if len(rest) <= _MAX_KNOWN:
+            with contextlib.suppress(CdrError):  # which would count bytes from the wrong beginning
+                arcs = _known_arcs(data[:HEADER_SIZE] + bytes(8) + rest)
+        if arcs is None:
+            arcs = _read_arcs(reader)
         return cls(stamp, run, sequence, mode, name, first, last, arcs, frame_id)
+
+
+_MAX_KNOWN = 2**18  # bytes of the arcs of one graph
+
+
+def _read_arcs(reader: _Reader) -> tuple[tuple[int, int, float], ...]:
+    source, target = reader.array("u4", "source"), reader.array("u4", "target")
+    weight = reader.array("f8", "weight")
+    reader.end()
+    if not len(source) == len(target) == len(weight):
+        raise CdrError(f"ActiveGraph: {len(source)} sources, {len(target)} targets and {len(weight)} weights")
+    return tuple(zip(source.tolist(), target.tolist(), weight.tolist(), strict=True))
+
+
+@lru_cache(maxsize=32)
+def _known_arcs(data: bytes) -> tuple[tuple[int, int, float], ...]:
+    """The same graphs come again and again: their arcs, behind ``last_step``, are read and kept in memory once."""
+    reader = _Reader(data, "ActiveGraph")
+    reader.number("Q", "last_step")
+    return _read_arcs(reader)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,22 +12,15 @@ import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
+from msg_analysis.bags.chunks import LIMIT, MESSAGE_HEAD, RECORD, DamageError, gather, locate, unpack
 from msg_analysis.errors import BagError
-from msg_analysis.types import IntArray
+from msg_analysis.types import AnyArray, BoolArray, IntArray
 
 MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")  # opcode and length, before the content of every record
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time, before the data of a message
-_LIMIT = 2**30  # bytes of one record or chunk; recorders write megabytes, only damage claims more
-_LOOSE = 4096  # messages that are not in chunks are collected into batches of so many
+_LOOSE = 2**18  # messages that are not in chunks are collected into batches of so many bytes
 _ZSTD = ".zstd"  # suffix of rosbag2's compression mode `file`
-
-
-class _DamageError(Exception):
-    """A record whose content is not what its type wants."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,28 +29,46 @@ class Batch:
 
     Attributes
     ----------
-    data : bytes in which they are
-    table : (messages, 6) channel number, sequence, log time [ns], publish time [ns], and start and size of
-        the CDR bytes in ``data``
+    data : bytes in which they are; before the CDR bytes of each message there is the rest of its record
+    start, size : (messages,) where the CDR bytes begin in ``data``, and how many they are
+    head : (messages,) of type ``MESSAGE_HEAD``
     """
 
     data: bytes
-    table: IntArray
+    start: IntArray
+    size: IntArray
+    head: AnyArray
+
+    @classmethod
+    def of_contents(cls, data: bytes, start: IntArray, size: IntArray) -> Batch:
+        """From the places of the contents of their records.
+
+        Raises
+        ------
+        DamageError : too short for a message, or a time that no clock has
+        """
+        if (size < MESSAGE_HEAD.itemsize).any():
+            raise DamageError
+        head = gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+        if _no_time(head).any():
+            raise DamageError
+        return cls(data, start + MESSAGE_HEAD.itemsize, size - MESSAGE_HEAD.itemsize, head)
 
     @property
-    def channel(self) -> IntArray:
+    def channel(self) -> AnyArray:
         """(messages,) channel number."""
-        return self.table[:, 0]
+        return np.asarray(self.head["channel"])
 
     @property
-    def extent(self) -> IntArray:
-        """(messages, 2) start and size of the CDR bytes in ``data``."""
-        return self.table[:, 4:]
+    def table(self) -> IntArray:
+        """(messages, 6) channel number, sequence, log time [ns], publish time [ns], start and size."""
+        columns = [self.head[name].astype(np.int64) for name in MESSAGE_HEAD.names or ()]
+        return np.column_stack((*columns, self.start, self.size))
 
     def message(self, index: int) -> bytes:
         """CDR bytes of one message."""
-        start, size = self.extent[index].tolist()
-        return self.data[start : start + size]
+        start = int(self.start[index])
+        return self.data[start : start + int(self.size[index])]
 
 
 @dataclass(slots=True)
@@ -116,46 +126,51 @@ class McapFile:
         if start != MAGIC:
             raise BagError(f"{self.path}: is no MCAP file: expected a bag of ROS 2's mcap storage")
         self.whole_bytes = len(MAGIC)
-        loose: list[tuple[int, ...]] = []
-        pieces: list[bytes] = []
-        filled = 0
+        _keep_memory()
+        zstd = zstandard.ZstdDecompressor()
+        chunk: bytes | None = None
+        index: list[bytes] = []  # of the chunk
+        loose: list[bytes] = []
+        filled = 0  # bytes in either list
         for opcode, content in self._records(stream, size):
-            if opcode == Opcode.CHUNK:
-                if loose:
-                    yield _batch(b"".join(pieces), loose)
-                    loose, pieces, filled = [], [], 0
-                batch = self._chunk(content)
-                if batch is not None:
-                    yield batch
-            elif opcode == Opcode.MESSAGE:
-                if len(content) < _MESSAGE.size or max(head := _MESSAGE.unpack_from(content)) >= 2**63:
-                    continue  # damaged: no clock has such times
-                loose.append((*head, filled + _MESSAGE.size, len(content) - _MESSAGE.size))
-                pieces.append(content)
+            if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
                 filled += len(content)
-                if len(loose) == _LOOSE:
-                    yield _batch(b"".join(pieces), loose)
-                    loose, pieces, filled = [], [], 0
+                if filled <= LIMIT:
+                    index.append(content)
+                continue
+            if chunk is not None:
+                yield from self._chunk(chunk, index, zstd)
+                chunk, index, filled = None, [], 0
+            if loose and (opcode == Opcode.CHUNK or filled > _LOOSE):
+                yield _loose_batch(loose)
+                loose, filled = [], 0
+            if opcode == Opcode.CHUNK:
+                chunk = content
+            elif opcode == Opcode.MESSAGE:
+                loose.append(content)
+                filled += len(content)
             else:
-                with contextlib.suppress(_DamageError):
+                with contextlib.suppress(DamageError):
                     self._note(opcode, content)
+        if chunk is not None:
+            yield from self._chunk(chunk, index, zstd)
         if loose:
-            yield _batch(b"".join(pieces), loose)
+            yield _loose_batch(loose)
 
     def _records(self, stream: io.BufferedReader, size: int) -> Iterator[tuple[int, bytes]]:
         while True:
-            head = stream.read(_RECORD.size)
-            if len(head) < _RECORD.size:
+            head = stream.read(RECORD.size)
+            if len(head) < RECORD.size:
                 self.torn = f"ends after {self.whole_bytes} bytes without a footer"
                 return
-            opcode, length = _RECORD.unpack(head)
+            opcode, length = RECORD.unpack(head)
             content = b""
-            if length <= min(_LIMIT, size - self.whole_bytes):
+            if length <= min(LIMIT, size - self.whole_bytes):
                 content = stream.read(length)
             if len(content) < length:
                 self.torn = f"the record at byte {self.whole_bytes} is cut off or damaged"
                 return
-            self.whole_bytes += _RECORD.size + length
+            self.whole_bytes += RECORD.size + length
             if opcode == Opcode.FOOTER:
                 if stream.read(len(MAGIC)) != MAGIC:
                     self.torn = "the closing magic bytes are missing"
@@ -179,33 +194,55 @@ class McapFile:
             elif opcode == Opcode.ATTACHMENT:
                 self.attachments.append(Attachment.read(stream))
         except Exception as error:  # the library reports damage by whatever goes wrong in it
-            raise _DamageError from error
+            raise DamageError from error
 
-    def _chunk(self, content: bytes) -> Batch | None:
+    def _chunk(self, content: bytes, index: list[bytes], zstd: zstandard.ZstdDecompressor) -> Iterator[Batch]:
         try:
-            chunk = Chunk.read(ReadDataStream(io.BytesIO(content)))
-            if chunk.uncompressed_size > _LIMIT:
-                raise _DamageError
-            stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-            data = stream.read(length)
-            return _batch(data, list(self._walk(data)))
-        except Exception:  # the same
+            data = unpack(content, zstd)
+            places = locate(data, index)
+            if places is None:
+                walked = np.array(list(self._walk(data)), dtype=np.int64).reshape(-1, 2)
+                places = walked[:, 0], walked[:, 1]
+            batch = Batch.of_contents(data, *places)
+        except Exception:  # decompressors and the library report damage by whatever goes wrong in them
             self.damaged_chunks += 1
-            return None
+            return
+        yield batch
 
-    def _walk(self, data: bytes) -> Iterator[tuple[int, ...]]:
+    def _walk(self, data: bytes) -> Iterator[tuple[int, int]]:
         at, end = 0, len(data)
         while at < end:
-            opcode, length = _RECORD.unpack_from(data, at)
-            at += _RECORD.size
+            opcode, length = RECORD.unpack_from(data, at)
+            at += RECORD.size
             if length > end - at:
-                raise _DamageError
+                raise DamageError
             if opcode == Opcode.MESSAGE:
-                yield (*_MESSAGE.unpack_from(data, at), at + _MESSAGE.size, length - _MESSAGE.size)
+                yield at, length
             else:
                 self._note(opcode, data[at : at + length])
             at += length
 
 
-def _batch(data: bytes, table: list[tuple[int, ...]]) -> Batch:
-    return Batch(data, np.array(table, dtype=np.int64).reshape(-1, 6))
+def _keep_memory() -> None:
+    """Let the C library keep what is freed from chunk to chunk.
+
+    Blocks larger than any that was ever freed it takes from the system each time anew, and touching fresh pages takes
+    longer than all that is done with a chunk. Freeing one large block moves that threshold (mallopt(3),
+    M_MMAP_THRESHOLD).
+    """
+    np.empty(2**24, np.uint8)
+
+
+def _loose_batch(contents: list[bytes]) -> Batch:
+    """Messages that are not in a chunk; those that are damaged are left out one by one."""
+    size = np.array([len(content) for content in contents])
+    data, start = b"".join(contents), np.cumsum(size) - size
+    start, size = start[size >= MESSAGE_HEAD.itemsize], size[size >= MESSAGE_HEAD.itemsize]
+    timed = ~_no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
+    return Batch.of_contents(data, start[timed], size[timed])
+
+
+def _no_time(head: AnyArray) -> BoolArray:
+    """Which messages have a log or publish time of 2^63 ns or more, which no clock has."""
+    octets = head.view(np.uint8).reshape(len(head), MESSAGE_HEAD.itemsize)
+    return np.asarray((octets[:, 13] | octets[:, 21]) >= 128)  # the highest byte of either

@@ -11,21 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from msg_analysis.bags.cdr import ActiveGraph, CdrError, decode_string
+from msg_analysis.bags.collected import Collector
 from msg_analysis.bags.inventory import Inventory
 from msg_analysis.bags.mcapfile import Batch, McapFile
 from msg_analysis.bags.metadata import METADATA_FILE, read_metadata
 from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
-from msg_analysis.bags.states import StateColumns, States
 from msg_analysis.bags.writer import RECORD_NAME, recording_pid
 from msg_analysis.errors import BagError, InputError
-from msg_analysis.model.air import LOST
 from msg_analysis.model.record import RunRecord
-from msg_analysis.model.step import Wiring, build_model
 from msg_analysis.model.trajectory import Completeness, Trajectory
-from msg_analysis.types import BoolArray, IntArray
+from msg_analysis.types import IntArray
 
 # Topics are told by type and by the end of their name: the network may run in any namespace.
 _STATE, _TRUTH, _GRAPH, _EXPERIMENT = "state", "truth", "graph", "experiment"
+_NUMBERS = {None: 0, _STATE: 1, _TRUTH: 2, _GRAPH: 3, _EXPERIMENT: 4}
 _TOPICS = {
     AGENT_STATE.full_name: re.compile(r"(?:^|/)agent_\d+/(state|truth)$"),
     ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
@@ -126,8 +125,8 @@ def _file_number(file: Path) -> tuple[int, str]:
 class _Contents:
     """What the files of a bag hold of our topics."""
 
-    states: StateColumns = field(default_factory=StateColumns)
-    truths: StateColumns = field(default_factory=StateColumns)
+    states: Collector = field(default_factory=Collector)
+    truths: Collector = field(default_factory=Collector)
     graphs: list[ActiveGraph] = field(default_factory=list)
     experiments: dict[str, None] = field(default_factory=dict)  # texts, each once, in order
     records: dict[str, None] = field(default_factory=dict)  # the same from the metadata of our own files
@@ -152,20 +151,40 @@ class _Contents:
         self.refused["damaged chunk"] += file.damaged_chunks
 
     def _add(self, batch: Batch, kinds: dict[int, str | None]) -> None:
-        for wanted, columns in ((_STATE, self.states), (_TRUTH, self.truths)):
-            states = np.isin(batch.channel, [number for number, kind in kinds.items() if kind == wanted])
-            if states.any():
-                columns.add(batch, np.flatnonzero(states))
-        others = np.isin(batch.channel, [n for n, kind in kinds.items() if kind in (_GRAPH, _EXPERIMENT)])
-        for index in np.flatnonzero(others).tolist():
+        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: none of ours
+        kind_of[list(kinds)] = [_NUMBERS[kind] for kind in kinds.values()]
+        kind = kind_of[batch.channel]
+        # First the records: states whose run is known are put in their places at once.
+        for index in np.flatnonzero(kind >= _NUMBERS[_GRAPH]).tolist():
             data = batch.message(index)
             try:
                 if kinds[int(batch.channel[index])] == _GRAPH:
                     self.graphs.append(ActiveGraph.decode(data))
                 else:
-                    self.experiments[decode_string(data)] = None
+                    self._learn(decode_string(data))
             except CdrError:
                 self.refused[_COMPRESSED if data.startswith(_ZSTD_FRAME) else "undecodable"] += 1
+        for name, collector in ((_STATE, self.states), (_TRUTH, self.truths)):
+            chosen = np.flatnonzero(kind == _NUMBERS[name])
+            if len(chosen):
+                collector.add(batch, chosen)
+
+    def _learn(self, text: str) -> None:
+        if text in self.experiments:
+            return
+        self.experiments[text] = None
+        try:
+            record = RunRecord.from_json(text, "topic experiment")
+        except InputError:
+            return  # only worth a word where there is no other record
+        for collector, width in zip((self.states, self.truths), _widths(record), strict=True):
+            collector.expect(record, width)
+
+
+def _widths(record: RunRecord) -> tuple[int, int]:
+    """Lengths of the states on the topics `state` and `truth`."""
+    experiment = record.experiment
+    return (experiment.run.replicas, experiment.width) if experiment.truth else (experiment.width, 0)
 
 
 def _choose(contents: _Contents, path: Path) -> RunRecord:
@@ -191,11 +210,12 @@ def _choose(contents: _Contents, path: Path) -> RunRecord:
             errors.append(error)
     if not records:
         raise errors[0]
-    counts = contents.states.runs()
-    with_states = [record for run, record in records.items() if counts.get(run)]
+    with_states = [record for run, record in records.items() if contents.states.count(run)]
     candidates = with_states or list(records.values())
     if len(candidates) > 1:
-        listed = "; ".join(f"{r.run} ({r.experiment.name}, {counts.get(r.run.bytes, 0)} states)" for r in candidates)
+        listed = "; ".join(
+            f"{r.run} ({r.experiment.name}, {contents.states.count(r.run.bytes)} states)" for r in candidates
+        )
         raise BagError(f"{path}: {len(candidates)} runs in one bag: {listed}: record each run into a bag of its own")
     return candidates[0]
 
@@ -203,13 +223,15 @@ def _choose(contents: _Contents, path: Path) -> RunRecord:
 def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
     experiment = record.experiment
     modes = _modes(contents, record.run.bytes, experiment.steps, len(experiment.graph_list))
-    published = None
+    published, widths = None, _widths(record)
     if experiment.truth:
-        published = _Collected(contents.states, record, experiment.run.replicas, contents.refused)
-        truth = _Collected(contents.truths, record, experiment.width, contents.refused)
+        published = contents.states.finish(record, widths[0])
+        truth = contents.truths.finish(record, widths[1])
     else:
-        truth = _Collected(contents.states, record, experiment.width, contents.refused)
+        truth = contents.states.finish(record, widths[0])
     parts = [truth] if published is None else [truth, published]
+    for part in parts:
+        contents.refused.update(part.refused)
     expected = len(parts) * (experiment.steps + 1) * experiment.agents
     received = sum(part.received for part in parts)
     completeness = Completeness(
@@ -232,121 +254,6 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
         used=truth.used,
         made=truth.made,
     )
-
-
-class _Collected:
-    """The states of a run that a bag holds on one kind of topic, each once, ordered by step.
-
-    Attributes
-    ----------
-    states : (N + 1, m, width); NaN where a state is missing
-    modes : (N + 1, m) from 0; -1 where missing
-    lost, used, made : see ``Trajectory``
-    received, duplicates, out_of_order : see ``Completeness``
-    """
-
-    def __init__(self, columns: StateColumns, record: RunRecord, width: int, refused: Counter[str]) -> None:
-        experiment = record.experiment
-        agents, steps = experiment.agents, experiment.steps
-        run = record.run.bytes
-        refused["undecodable"] += columns.undecodable
-        counts = columns.runs()
-        refused["other run"] += sum(counts.values()) - counts.get(run, 0)
-        realtime = experiment.run.pace == "realtime"
-        links = _Links(build_model(experiment), steps) if experiment.noise.loss or realtime else None
-        taken = columns.take(run, width, links.most if links else 0)
-        refused["wrong length"] += counts.get(run, 0) - len(taken.step)
-
-        good = np.ones(len(taken.step), dtype=np.bool_)
-        for reason, bad in (
-            ("unknown agent", (taken.agent < 1) | (taken.agent > agents)),
-            ("step out of range", taken.step > steps),
-            ("unknown mode", taken.mode > len(experiment.graph_list)),
-            ("not finite", ~np.isfinite(taken.state).all(axis=1)),
-            ("stamped before the start", realtime & (taken.stamp < 0)),
-        ):
-            refused[reason] += int((good & bad).sum())
-            good &= ~bad
-        index = np.flatnonzero(good)
-        if links:
-            fits = links.fit(taken, index, realtime=realtime)
-            refused["heard what it cannot have"] += int((~fits).sum())
-            index = index[fits]
-        cell = taken.step[index] * agents + taken.agent[index] - 1
-        cells, first, owner = np.unique(cell, return_index=True, return_inverse=True)
-        kept = index[first]  # of several copies, the first in the bag
-        again = np.delete(np.arange(len(cell)), first)
-        copy, original = index[again], kept[owner[again]]
-        differs = (taken.state[copy] != taken.state[original]).any(axis=1)
-        differs |= (taken.heard[copy] != taken.heard[original]).any(axis=1)
-        if realtime:
-            differs |= taken.stamp[copy] != taken.stamp[original]
-        refused["contradicts an earlier copy"] += int(differs.sum())
-        # One of them is forged, and nobody knows which: the state counts as missing.
-        certain = np.ones(len(cells), dtype=np.bool_)
-        certain[owner[again[differs]]] = False
-        cells, kept = cells[certain], kept[certain]
-
-        states = np.full(((steps + 1) * agents, width), np.nan)
-        states[cells] = taken.state[kept]
-        modes = np.full((steps + 1) * agents, -1, dtype=np.int64)
-        modes[cells] = taken.mode[kept] - 1
-        self.states, self.modes = states.reshape(steps + 1, agents, width), modes.reshape(steps + 1, agents)
-        self.lost: BoolArray | None = None
-        self.used: IntArray | None = None
-        self.made: IntArray | None = None
-        if links and realtime:
-            listed = np.arange(links.most) < taken.heard_count[kept, None]
-            used = np.full(((steps + 1) * agents, links.most), -1, dtype=np.int64)
-            used[cells] = np.where(listed & (taken.heard[kept] != LOST), taken.heard[kept].astype(np.int64), -1)
-            made = np.full((steps + 1) * agents, -1, dtype=np.int64)
-            made[cells] = taken.stamp[kept]
-            self.used, self.made = used.reshape(steps + 1, agents, links.most)[1:], made.reshape(steps + 1, agents)
-        elif links:
-            lost = np.zeros(((steps + 1) * agents, links.most), dtype=np.bool_)
-            lost[cells] = taken.heard[kept] == LOST
-            self.lost = lost.reshape(steps + 1, agents, links.most)[1:]
-        self.received, self.duplicates = len(cells), len(again)
-        self.out_of_order = _out_of_order(taken, kept)
-
-
-class _Links:
-    """What ``heard`` can be where it says something.
-
-    Attributes
-    ----------
-    most : largest number of neighbours
-    """
-
-    def __init__(self, model: Wiring, steps: int) -> None:
-        self._last = np.uint64(steps)
-        self.most = model.most_neighbours
-        self._neighbours = np.zeros((model.modes + 1, model.agents), dtype=np.int64)  # no graph led to step 0
-        for mode in range(model.modes):
-            self._neighbours[mode + 1] = [len(model.neighbours(mode, i)) for i in range(model.agents)]
-
-    def fit(self, states: States, index: IntArray, *, realtime: bool) -> BoolArray:
-        """Whether what they heard is, for each neighbour under their graph, a step that can be, or ``LOST``.
-
-        In lockstep that is the step before, and nothing at all says the same of all neighbours.
-        """
-        heard, count = states.heard[index], states.heard_count[index]
-        neighbours = self._neighbours[states.mode[index], states.agent[index] - 1]
-        if realtime:
-            possible = heard <= self._last
-        else:
-            possible = heard == (states.step[index].astype(np.uint64) - np.uint64(1))[:, None]
-        known = (heard == LOST) | possible | (np.arange(self.most) >= count[:, None])
-        fits = (count == neighbours) & known.all(axis=1)
-        return np.asarray(fits if realtime else fits | (count == 0))
-
-
-def _out_of_order(states: States, index: IntArray) -> int:
-    """How many of these states came after a later one of the same agent."""
-    agent, step = states.agent[index], states.step[index]
-    order = np.lexsort((states.position[index], agent))
-    height = (agent * (step.max(initial=0) + 1) + step)[order]  # rises from agent to agent
-    return int((height < np.maximum.accumulate(height)).sum())
 
 
 def _modes(contents: _Contents, run: bytes, steps: int, graphs: int) -> IntArray:

@@ -1,185 +1,180 @@
-"""State messages as columns: where they have the agents' own layout, a batch is one numpy record array."""
+"""State messages as columns: where they have the agents' own layout, a batch of them is decoded at once."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import struct
+from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.bags.cdr import LITTLE_ENDIAN, RUN_SIZE, SECOND, AgentState, CdrError
+from msg_analysis.bags.cdr import LITTLE_ENDIAN, SECOND, AgentState, CdrError
+from msg_analysis.bags.chunks import gather
 from msg_analysis.bags.mcapfile import Batch
-from msg_analysis.types import AnyArray, FloatArray, IntArray
+from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
-_FIXED_SIZE = 68  # bytes of an AgentState before its state, where frame_id and heard are empty
-_HEARD_COUNT = 56  # where the length of heard is
-
-
-def _layout(replicas: int, heard: int) -> np.dtype[np.void]:
-    """Of an AgentState with empty ``frame_id`` and so many steps in ``heard``; its own bytes, padding left out."""
-    longer = 8 * heard
-    fields = {
-        "header": ("V4", 0),
-        "seconds": ("<i4", 4),
-        "nanoseconds": ("<u4", 8),
-        "frame_id": ("V5", 12),
-        "run": (f"V{RUN_SIZE}", 17),
-        "agent": ("<u4", 36),
-        "step": ("<u8", 44),
-        "mode": ("<u4", 52),
-        "heard_count": ("<u4", _HEARD_COUNT),
-        "heard": (("<u8", (heard,)), 60),
-        "replicas": ("<u4", 60 + longer),
-        "state": (("<f8", (replicas,)), _FIXED_SIZE + longer),
+# An AgentState with empty frame_id, as far as all of them are alike; padding left out.
+_HEAD = np.dtype(
+    {
+        "names": [
+            *("encapsulation", "seconds", "nanoseconds", "frame_size", "frame_end", "run"),
+            *("agent", "step", "mode", "heard_count"),
+        ],
+        "formats": ["<u4", "<i4", "<u4", "<u4", "u1", ("<u8", (2,)), "<u4", "<u8", "<u4", "<u4"],
+        "offsets": [0, 4, 8, 12, 16, 17, 36, 44, 52, 56],
+        "itemsize": 60,
     }
-    return np.dtype(
-        {
-            "names": list(fields),
-            "formats": [kind for kind, _ in fields.values()],
-            "offsets": [offset for _, offset in fields.values()],
-            "itemsize": _FIXED_SIZE + longer + 8 * replicas,
-        }
-    )
+)
+_ENCAPSULATION = struct.unpack("<I", LITTLE_ENDIAN)[0]
+_FIXED_SIZE = 68  # of a message without its ``heard`` and ``state``: the head, the length of ``state``, padding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """States of one run with equally many replicas, in the order of the bag.
+    """States in the order of the bag, still in the bytes of their batch: what is asked for is taken out of them.
 
     Attributes
     ----------
+    data : bytes in which they are, in the agents' own layout
+    start : (messages,) where the CDR bytes of each begin
+    head : (messages,) their beginnings
+    replicas : (messages,) length of ``state``
     position : (messages,) place in the bag
-    agent, step, mode : (messages,) as sent: agents and modes from 1; clipped to the range of int64
-    state : (messages, replicas)
-    heard_count : (messages,) length of ``heard``
-    heard : (messages, D) its first D entries; 0 beyond its end
-    stamp : (messages,) [ns]
     """
 
+    data: bytes
+    start: IntArray
+    head: AnyArray
+    replicas: IntArray
     position: IntArray
-    agent: IntArray
-    step: IntArray
-    mode: IntArray
-    state: FloatArray
-    heard_count: IntArray
-    heard: AnyArray
-    stamp: IntArray
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def __getitem__(self, index: AnyArray) -> States:
+        """Some of them, by an array of indices or of bools."""
+        return States(self.data, self.start[index], self.head[index], self.replicas[index], self.position[index])
+
+    @property
+    def run(self) -> AnyArray:
+        """(messages, 2) run id as two numbers: see :func:`run_number`."""
+        return np.asarray(self.head["run"])
+
+    @property
+    def agent(self) -> IntArray:
+        """(messages,) as sent, from 1."""
+        return np.asarray(self.head["agent"].astype(np.int64))
+
+    @property
+    def step(self) -> IntArray:
+        """(messages,) clipped to the range of int64."""
+        return np.asarray(np.minimum(self.head["step"], np.uint64(2**63 - 1)).astype(np.int64))
+
+    @property
+    def mode(self) -> IntArray:
+        """(messages,) as sent, from 1; 0 at step 0."""
+        return np.asarray(self.head["mode"].astype(np.int64))
+
+    @property
+    def stamp(self) -> IntArray:
+        """(messages,) [ns]."""
+        return np.asarray(self.head["seconds"].astype(np.int64) * SECOND + self.head["nanoseconds"])
+
+    @property
+    def heard_count(self) -> IntArray:
+        """(messages,) length of ``heard``."""
+        return np.asarray(self.head["heard_count"].astype(np.int64))
+
+    def heard(self, most: int) -> AnyArray:
+        """(messages, most) the first entries of ``heard``, uint64; 0 beyond its end."""
+        out = np.zeros((len(self), most), np.uint64)
+        length = np.minimum(self.heard_count, most)
+        for size in np.unique(length[length > 0]).tolist():
+            alike = length == size
+            values = gather(self.data, self.start[alike] + _HEAD.itemsize, 8 * size).view("<u8")
+            out[alike, :size] = values.reshape(-1, size)
+        return out
+
+    def state(self, width: int) -> FloatArray:
+        """(messages, width) of states that all have this length."""
+        if not width:
+            return np.empty((len(self), 0))
+        values = gather(self.data, self.start + _FIXED_SIZE + 8 * self.heard_count, 8 * width).view("<f8")
+        return np.asarray(values.reshape(len(self), width), dtype=np.float64)
+
+    def alone(self) -> States:
+        """The same with bytes of their own, so that those of the batch can go."""
+        size = _FIXED_SIZE + 8 * (self.heard_count + self.replicas)
+        ranges = zip(self.start.tolist(), (self.start + size).tolist(), strict=True)
+        data = b"".join([self.data[first:end] for first, end in ranges])
+        return States(data, np.cumsum(size) - size, self.head, self.replicas, self.position)
 
 
-@dataclass(slots=True)
-class StateColumns:
-    """Collects the states of all runs that a bag holds.
+def run_number(run: bytes) -> tuple[int, int]:
+    """The 16 bytes of a run id as the two numbers by which :class:`States` tells runs apart."""
+    first, second = struct.unpack("<QQ", run)
+    return first, second
 
-    Attributes
+
+def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States, int]:
+    """Take the states out of a batch.
+
+    Parameters
     ----------
-    undecodable : messages that are no AgentState
+    batch : Batch
+        messages
+    chosen : IntArray
+        indices of those that are states
+    position : int
+        place in the bag of the first of them
+
+    Returns
+    -------
+    tuple[States, int]
+        the states; how many messages are no AgentState
     """
-
-    undecodable: int = 0
-    _columns: dict[tuple[bytes, int], list[States]] = field(default_factory=dict)
-    _position: int = 0
-
-    def add(self, batch: Batch, chosen: IntArray) -> None:
-        """Take the states out of a batch.
-
-        Parameters
-        ----------
-        batch : Batch
-            messages
-        chosen : IntArray
-            indices of those that are states
-        """
-        extent = batch.extent[chosen]
-        for size in np.unique(extent[:, 1]).tolist():
-            alike = np.flatnonzero(extent[:, 1] == size)
-            numbers, rest = divmod(size - _FIXED_SIZE, 8)
-            if numbers >= 0 and rest == 0:
-                alike = self._add_all_fixed(batch, chosen, alike, numbers)
-            for index in alike.tolist():
-                self._add_any(batch.message(int(chosen[index])), self._position + index)
-        self._position += len(chosen)
-
-    def _add_all_fixed(self, batch: Batch, chosen: IntArray, alike: IntArray, numbers: int) -> IntArray:
-        """Take the messages of fixed layouts with so many numbers in ``heard`` and ``state``; the others come back."""
-        at = batch.extent[chosen[alike], :1] + np.arange(_HEARD_COUNT, _HEARD_COUNT + 4)
-        counts = np.ascontiguousarray(np.frombuffer(batch.data, np.uint8)[at]).view("<u4")[:, 0]
-        others = [alike[counts > numbers]]
-        for heard in np.unique(counts[counts <= numbers]).tolist():
-            layout = _layout(numbers - heard, heard)
-            others.append(self._add_fixed(batch, chosen, alike[counts == heard], layout))
-        return np.sort(np.concatenate(others))
-
-    def _add_fixed(self, batch: Batch, chosen: IntArray, alike: IntArray, layout: np.dtype[np.void]) -> IntArray:
-        """Take the messages of the fixed layout; the indices of the others come back."""
-        start = batch.extent[chosen[alike], 0]
-        data = np.frombuffer(batch.data, np.uint8)
-        raw = np.lib.stride_tricks.sliding_window_view(data, layout.itemsize)[start]
-        table = np.ascontiguousarray(raw).view(layout)[:, 0]
-        fixed = (
-            (table["header"] == np.void(LITTLE_ENDIAN))
-            & (table["frame_id"] == np.void(b"\x01\x00\x00\x00\x00"))
-            & (table["replicas"] == table["state"].shape[1])
-        )
-        runs, owner = np.unique(table["run"][fixed], return_inverse=True)
-        position = self._position + alike[fixed]
-        table = table[fixed]
-        for number, run in enumerate(runs):
-            self._append(run.tobytes(), position[owner == number], table[owner == number])
-        return np.asarray(alike[~fixed])
-
-    def _append(self, run: bytes, position: IntArray, table: AnyArray) -> None:
-        agent, mode = table["agent"].astype(np.int64), table["mode"].astype(np.int64)
-        step = np.minimum(table["step"], np.uint64(2**63 - 1)).astype(np.int64)
-        count, heard = table["heard_count"].astype(np.int64), table["heard"].astype(np.uint64)
-        stamp = table["seconds"].astype(np.int64) * SECOND + table["nanoseconds"]
-        states = States(position, agent, step, mode, table["state"].astype(np.float64), count, heard, stamp)
-        self._columns.setdefault((run, states.state.shape[1]), []).append(states)
-
-    def _add_any(self, data: bytes, position: int) -> None:
+    start, size = batch.start[chosen], batch.size[chosen]
+    place = position + np.arange(len(chosen))
+    states, fixed = _fixed(batch.data, start, size, place)
+    if fixed.all():
+        return states, 0
+    data, pieces, end = batch.data, [], len(batch.data)
+    for index in np.flatnonzero(~fixed).tolist():
         try:
-            message = AgentState.decode(data)
+            piece = _in_own_layout(batch.message(int(chosen[index])))
         except CdrError:
-            self.undecodable += 1
-            return
-        table = np.zeros(1, _layout(len(message.state), len(message.heard)))
-        table["agent"], table["step"], table["mode"] = message.agent, message.step, message.mode
-        table["seconds"], table["nanoseconds"] = divmod(message.stamp, SECOND)
-        table["state"], table["heard"], table["heard_count"] = message.state, message.heard, len(message.heard)
-        self._append(message.run, np.array([position]), table)
+            continue
+        fixed[index], start[index], size[index] = True, end, len(piece)
+        pieces.append(piece)
+        end += len(piece)
+    states, _ = _fixed(b"".join((data, *pieces)), start[fixed], size[fixed], place[fixed])
+    return states, len(chosen) - len(states)
 
-    def runs(self) -> dict[bytes, int]:
-        """Number of states of each run."""
-        counts: dict[bytes, int] = {}
-        for (run, _), parts in self._columns.items():
-            counts[run] = counts.get(run, 0) + sum(len(part.step) for part in parts)
-        return counts
 
-    def take(self, run: bytes, replicas: int, most_heard: int = 0) -> States:
-        """The states of a run with so many replicas, in the order of the bag; they are gone from here
-        afterwards.
+def _fixed(data: bytes, start: IntArray, size: IntArray, position: IntArray) -> tuple[States, BoolArray]:
+    """The messages that have the agents' own layout, and which those are."""
+    fixed = size >= _FIXED_SIZE
+    long = start if fixed.all() else np.where(fixed, start, 0)
+    if len(data) < _FIXED_SIZE:
+        return States(data, start[:0], np.empty(0, _HEAD), start[:0], start[:0]), np.zeros(len(start), np.bool_)
+    head = gather(data, long, _HEAD.itemsize).view(_HEAD)
+    fixed &= (head["encapsulation"] == _ENCAPSULATION) & (head["frame_size"] == 1) & (head["frame_end"] == 0)
+    numbers, count = size - _FIXED_SIZE, head["heard_count"].astype(np.int64)
+    fixed &= numbers & 7 == 0
+    replicas = (numbers >> 3) - count
+    fixed &= replicas >= 0
+    behind = np.where(fixed, start + _HEAD.itemsize + 8 * count, 0)
+    fixed &= gather(data, behind, 4).view("<u4") == replicas
+    states = States(data, start, head, replicas, position)
+    return states if fixed.all() else states[fixed], fixed
 
-        Parameters
-        ----------
-        run : bytes
-            16 bytes of its id
-        replicas : int
-            length of a state
-        most_heard : int
-            how many entries of ``heard`` are wanted
-        """
-        none = np.empty(0, np.int64)
-        empty = States(none, none, none, none, np.empty((0, replicas)), none, np.empty((0, 0), np.uint64), none)
-        parts = self._columns.pop((run, replicas), []) or [empty]
-        position = np.concatenate([part.position for part in parts])
-        order = np.argsort(position, kind="stable")
-        names = ("agent", "step", "mode", "heard_count", "stamp")
-        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
-        agent, step, mode, heard_count, stamp = (column[order] for column in columns)
-        state = np.concatenate([part.state for part in parts])
-        heard = np.zeros((len(order), most_heard), np.uint64)
-        ends = np.cumsum([len(part.step) for part in parts]).tolist()
-        for part, end in zip(parts, ends, strict=True):
-            width = min(most_heard, part.heard.shape[1])
-            heard[end - len(part.step) : end, :width] = part.heard[:, :width]
-        if not np.array_equal(order, np.arange(len(order))):
-            state, heard = state[order], heard[order]
-        return States(position[order], agent, step, mode, state, heard_count, heard, stamp)
+
+def _in_own_layout(data: bytes) -> bytes:
+    """The same message as the agents would have written it; raises CdrError."""
+    message = AgentState.decode(data)
+    own = AgentState(
+        *(message.stamp, message.run, message.agent, message.step, message.mode, message.state, message.heard)
+    )
+    try:
+        return own.encode().ljust(_FIXED_SIZE + 8 * len(message.heard), b"\x00")  # nothing follows an empty state
+    except struct.error as error:
+        raise CdrError("AgentState.header: a time out of range") from error

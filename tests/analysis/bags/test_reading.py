@@ -1,0 +1,319 @@
+"""Whole chunks decoded at once, against rosbags, which takes message by message, and the rules applied one by one.
+
+No test here can raise a false alarm: nothing random is asserted.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+import tracemalloc
+import uuid
+import zlib
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, IndexType, Writer
+
+from msg_analysis.bags.cdr import ActiveGraph, AgentState, CdrError, encode_string
+from msg_analysis.bags.chunks import DamageError, locate, unpack
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.schemas import AGENT_STATE, STRING
+from msg_analysis.bags.store import write_trajectory
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.record import RunRecord
+from msg_analysis.model.trajectory import Trajectory
+
+STEPS, AGENTS, WIDTH, LOST = 5, 3, 2, 2**64 - 1
+NEIGHBOURS = ([0, 0, 0], [1, 2, 1], [2, 1, 1])  # how many: no graph, line, star
+KINDS = ("plain", "loss", "realtime")
+thorough = settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+
+
+def _record(kind: str) -> RunRecord:
+    document: dict[str, Any] = {
+        "name": kind,
+        "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 1}}},
+        "switching": {"generator": [[-5, 5], [5, -5]]},
+        "run": {"dt": 0.05, "duration": STEPS * 0.05, "replicas": WIDTH, "start": "zero"},
+    }
+    if kind == "loss":
+        document["noise"] = {"loss": 0.3}
+    if kind == "realtime":
+        document["run"]["pace"] = "realtime"
+    return RunRecord(uuid.UUID(int=7), Experiment.parse(document), np.zeros((AGENTS, WIDTH)))
+
+
+RECORDS = {kind: _record(kind) for kind in KINDS}
+
+
+@st.composite
+def _states(draw: st.DrawFn) -> AgentState:
+    """Mostly such as belong to the run, often of the same agent and step."""
+
+    def mostly(usual: st.SearchStrategy[Any], rare: st.SearchStrategy[Any]) -> Any:
+        return draw(rare) if draw(st.integers(0, 11)) == 0 else draw(usual)
+
+    agent, step = mostly(st.integers(1, 3), st.integers(0, 5)), mostly(st.integers(0, STEPS), st.just(2**64 - 1))
+    mode = mostly(st.integers(1, 2) if step else st.just(0), st.integers(0, 3))
+    near = st.sampled_from([(step - 1) % 2**64, LOST])
+    length = NEIGHBOURS[min(mode, 2)][min(max(agent, 1), 3) - 1]
+    heard = mostly(st.lists(near, min_size=length, max_size=length), st.lists(st.integers(0, LOST), max_size=4))
+    state = mostly(
+        st.lists(st.sampled_from([0.0, 1.0]), min_size=WIDTH, max_size=WIDTH),
+        st.lists(st.sampled_from([0.0, -0.0, 5e-324, np.nan, np.inf]), max_size=3),
+    )
+    return AgentState(
+        stamp=mostly(st.sampled_from([0, 1]), st.integers(-2, 10**15)),
+        run=mostly(st.just(RECORDS["plain"].run.bytes), st.sampled_from([bytes(16), bytes(15) + b"\x01"])),
+        agent=agent,
+        step=step,
+        mode=mode,
+        state=np.array(state, dtype=float),
+        heard=np.array(draw(st.sampled_from([[], heard, heard])), np.uint64),
+        frame_id=mostly(st.just(""), st.sampled_from(["m", "map"])),
+    )
+
+
+def _rules(messages: list[Any], kind: str) -> dict[str, Any]:
+    """What is to come out of messages in the order of the bag; None is one that cannot be decoded."""
+    first: dict[tuple[int, int], Any] = {}
+    contradicted: set[tuple[int, int]] = set()
+    refused: Counter[str] = Counter()
+    duplicates = 0
+    for place, message in enumerate(messages):
+        if message is None:
+            refused["undecodable"] += 1
+            continue
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        heard = [int(step) for step in message.heard]
+        expected = NEIGHBOURS[message.mode][message.agent - 1] if message.mode < 3 and 1 <= message.agent <= 3 else 0
+        possible = range(STEPS + 1) if kind == "realtime" else [message.step - 1]
+        silent = not heard and kind == "loss"
+        reasons = {
+            "other run": bytes(message.run) != RECORDS[kind].run.bytes,
+            "wrong length": len(message.state) != WIDTH,
+            "unknown agent": not 1 <= message.agent <= AGENTS,
+            "step out of range": message.step > STEPS,
+            "unknown mode": message.mode > 2,
+            "not finite": not np.isfinite(message.state).all(),
+            "stamped before the start": kind == "realtime" and stamp < 0,
+            "heard what it cannot have": kind != "plain"
+            and not silent
+            and (len(heard) != expected or any(step != LOST and step not in possible for step in heard)),
+        }
+        reason = next((reason for reason, holds in reasons.items() if holds), None)
+        if reason:
+            refused[reason] += 1
+            continue
+        cell = (message.step, message.agent - 1)
+        said = [message.state.tolist()]
+        said += [] if kind == "plain" else [[*heard, 0, 0][:2]]
+        said += [stamp] if kind == "realtime" else []
+        if cell not in first:
+            first[cell] = (place, message, said, heard, stamp)
+            continue
+        duplicates += 1
+        if said != first[cell][2]:
+            contradicted.add(cell)
+            refused["contradicts an earlier copy"] += 1
+    taken = {cell: entry for cell, entry in first.items() if cell not in contradicted}
+    shape = (STEPS + 1, AGENTS)
+    out: dict[str, Any] = {
+        "states": np.full((*shape, WIDTH), np.nan),
+        "agent_modes": np.full(shape, -1),
+        "used": np.full((*shape, 2), -1) if kind == "realtime" else None,
+        "made": np.full(shape, -1) if kind == "realtime" else None,
+        "lost": np.zeros((*shape, 2), bool) if kind == "loss" else None,
+    }
+    for cell, (_, message, _, heard, stamp) in taken.items():
+        out["states"][cell], out["agent_modes"][cell] = message.state, message.mode - 1
+        if kind == "realtime":
+            out["made"][cell] = stamp
+        for k, step in enumerate(heard if kind != "plain" else []):
+            out["used" if kind == "realtime" else "lost"][(*cell, k)] = (
+                step == LOST if kind == "loss" else -1 if step == LOST else step
+            )
+    for name in ("used", "lost"):
+        out[name] = None if out[name] is None else out[name][1:]
+    out["late"] = sum(
+        any(other[1] == cell[1] and other[0] > cell[0] and taken[other][0] < taken[cell][0] for other in taken)
+        for cell in taken
+    )
+    return out | {"received": len(taken), "duplicates": duplicates, "refused": dict(refused)}
+
+
+@thorough
+@given(data=st.data())
+def test_random_bags(tmp_path: Path, typestore: Any, data: st.DataObject) -> None:
+    kind = data.draw(st.sampled_from(KINDS))
+    states = data.draw(st.lists(_states(), min_size=1, max_size=40))
+    states += [states[i] for i in data.draw(st.lists(st.integers(0, len(states) - 1), max_size=9))]
+    raw = []
+    for state in states:
+        form = data.draw(st.sampled_from(["own"] * 9 + ["big", "padded", "cut"]))
+        encoded = state.encode()
+        if form == "big":
+            message = typestore.deserialize_cdr(encoded, AGENT_STATE.full_name)
+            encoded = bytes(typestore.serialize_cdr(message, AGENT_STATE.full_name, little_endian=False))
+        raw.append({"padded": encoded + bytes(3), "cut": encoded[:-9]}.get(form, encoded))
+    path = tmp_path / "x.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(
+            stream,
+            chunk_size=data.draw(st.sampled_from([64, 400, 2**20])),
+            compression=data.draw(st.sampled_from(CompressionType)),
+            index_types=data.draw(st.sampled_from([IndexType.NONE, IndexType.ALL])),
+            use_chunking=data.draw(st.booleans()),
+            enable_crcs=data.draw(st.booleans()),
+        )
+        writer.start("ros2", "test")
+        schema = {t: writer.register_schema(t.full_name, "ros2msg", t.schema.encode()) for t in (AGENT_STATE, STRING)}
+        channels = [writer.register_channel(f"/agent_{i}/state", "cdr", schema[AGENT_STATE]) for i in (1, 2, 3)]
+        experiment = writer.register_channel("/experiment", "cdr", schema[STRING])
+        when = data.draw(st.integers(0, len(raw)))
+        for i, encoded in enumerate([*raw, b""]):
+            if i == when:
+                writer.add_message(experiment, 0, encode_string(RECORDS[kind].to_json()), 0)
+            if i < len(raw):
+                writer.add_message(channels[i % 3], i, encoded, i)
+        writer.finish()
+
+    with path.open("rb") as stream:
+        records = list(StreamReader(stream).records)
+    stored = [record.data for record in records if isinstance(record, Message) and record.channel_id != experiment]
+    assert stored == raw
+    decoded = [
+        None if len(encoded) < len(state.encode()) else typestore.deserialize_cdr(encoded, AGENT_STATE.full_name)
+        for encoded, state in zip(stored, states, strict=True)
+    ]
+    expected, found = _rules(decoded, kind), read_bag(path)
+    for name in ("states", "agent_modes", "used", "made", "lost"):
+        values = getattr(found, name)
+        assert (values is None) == (expected[name] is None)
+        if values is not None:
+            np.testing.assert_array_equal(values, expected[name], name)
+    count = found.completeness
+    assert (count.received, count.duplicates, count.out_of_order) == tuple(
+        expected[name] for name in ("received", "duplicates", "late")
+    )
+    assert count.refused == expected["refused"]
+
+
+def test_memory_is_that_of_the_result(tmp_path: Path, make_run: Callable[..., Trajectory]) -> None:
+    """20 MB of states: nothing beside the result grows with their length, and little with their number."""
+    run = make_run(steps=10_000, replicas=64)
+    write_trajectory(run, tmp_path / "bag")
+    tracemalloc.start()
+    try:
+        found = read_bag(tmp_path / "bag")
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    np.testing.assert_array_equal(found.states, run.states)
+    assert found.agent_modes is not None
+    result = found.states.nbytes + found.agent_modes.nbytes + found.modes.nbytes
+    assert peak - result < 0.5 * result
+
+
+def _chunk(records: bytes, name: bytes = b"", packed: bytes | None = None, **wrong: int) -> bytes:
+    """Content of a chunk record, by hand."""
+    packed = records if packed is None else packed
+    size, crc = wrong.get("size", len(records)), wrong.get("crc", zlib.crc32(records))
+    head = struct.pack("<QQQII", 0, 0, size, crc, len(name)) + name
+    return head + struct.pack("<Q", wrong.get("packed_size", len(packed))) + packed
+
+
+def test_unpack() -> None:
+    records = bytes(range(256)) * 40
+    zstd = zstandard.ZstdDecompressor()
+    whole = zstandard.ZstdCompressor().compress(records)
+    sizeless = zstandard.ZstdCompressor(write_content_size=False).compress(records)
+    for name, packed in ((b"", records), (b"zstd", whole), (b"zstd", sizeless), (b"lz4", lz4.frame.compress(records))):
+        assert unpack(_chunk(records, name, packed), zstd) == records
+        assert unpack(_chunk(records, name, packed, crc=0), zstd) == records
+        for wrong in ({"crc": 1}, {"size": len(records) - 1}, {"size": len(records) + 1}, {"size": 2**40}):
+            with pytest.raises((DamageError, zstandard.ZstdError)):
+                unpack(_chunk(records, name, packed, **wrong), zstd)
+        with pytest.raises(DamageError):
+            unpack(_chunk(records, name, packed, packed_size=len(packed) + 1), zstd)
+    with pytest.raises(DamageError):
+        unpack(_chunk(records, b"snappy"), zstd)
+    for length in range(44):
+        with pytest.raises((DamageError, struct.error)):
+            unpack(_chunk(records)[:length], zstd)
+
+
+def test_chunks_that_claim_too_much_are_not_unpacked() -> None:
+    bomb = bytes(10**7)
+    with pytest.raises(DamageError):
+        unpack(_chunk(b"", b"zstd", zstandard.ZstdCompressor().compress(bomb), size=1000), zstandard.ZstdDecompressor())
+    with pytest.raises(DamageError):
+        unpack(_chunk(b"", b"lz4", lz4.frame.compress(bomb), size=1000), zstandard.ZstdDecompressor())
+
+
+def _records(*contents: bytes, opcode: int = 5) -> bytes:
+    return b"".join(struct.pack("<BQ", opcode, len(content)) + content for content in contents)
+
+
+def _index(*places: int, claimed: int | None = None) -> bytes:
+    entries = b"".join(struct.pack("<QQ", 3, place) for place in places)
+    return struct.pack("<HI", 1, len(entries) if claimed is None else claimed) + entries
+
+
+def test_locate_believes_no_index_that_the_records_do_not_bear_out() -> None:
+    """The second message looks as if messages began in it."""
+    inner = _records(bytes(22), bytes(30))
+    data = _records(bytes(40), inner, b"x" * 25)
+    true = [0, 49, 49 + 9 + len(inner)]
+
+    def found(*index: bytes) -> list[list[int]] | None:
+        places = locate(data, index)
+        return None if places is None else [column.tolist() for column in places]
+
+    expected = [[place + 9 for place in true], [40, len(inner), 25]]
+    assert found(_index(*true)) == expected
+    assert found(_index(true[2], true[0]), _index(true[1])) == expected  # each channel has one, in whatever order
+    assert found(_index(*true), _index()) == expected
+    for wrong in (true[:2], true[1:], [0, *true], [true[0], true[2]], [0, 58, true[2]], [2**64 - 1, *true], [1]):
+        assert found(_index(*wrong)) is None, wrong
+    assert found() is None
+    assert found(_index()) is None
+    assert found(_index(*true, claimed=32)) is None
+    assert found(_index(*true)[:-1]) is None
+    assert found(b"") is None
+    assert locate(data + _records(b"channel", opcode=4), [_index(*true)]) is None
+    assert locate(_records(b"channel", opcode=4), [_index(0)]) is None
+    assert locate(data[:-1], [_index(*true)]) is None
+    assert locate(b"", [_index(0)]) is None
+    assert locate(b"\x05", [_index(0)]) is None
+
+
+def test_the_same_arcs_again_and_arcs_that_are_wrong() -> None:
+    """Arcs are read once: at another alignment, in another byte order or after damage they are others."""
+    rng = random.Random(1)
+    for _ in range(200):
+        arcs = tuple((rng.randrange(9), rng.randrange(9), rng.choice([0.5, 2.0])) for _ in range(rng.randrange(3)))
+        graph = ActiveGraph(5, bytes(16), 0, 1, "x" * rng.randrange(9), 0, 9, arcs, "y" * rng.randrange(9))
+        data = graph.encode()
+        assert ActiveGraph.decode(data).arcs == arcs
+        if arcs:
+            with pytest.raises(CdrError, match=f"the message has {len(data) - 1}"):
+                ActiveGraph.decode(data[:-1])
+            with pytest.raises(CdrError, match="too many"):
+                ActiveGraph.decode(data + bytes(8))
