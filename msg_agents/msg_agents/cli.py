@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import msg_agents
+from msg_agents import cli_replay
 from msg_agents.environment import DISCOVERY_TIMEOUT, RESTARTS
+from msg_agents.ros_command import RosCommand
 from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, result_console
 
@@ -223,17 +225,6 @@ def prepare(experiment: Path) -> None:
     click.echo(new_record(what).to_json())
 
 
-class _RosCommand(click.Command):
-    """Takes arguments for ROS 2 as any ROS node does: ``--ros-args ... [--]``. rclpy finds them by itself."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        while "--ros-args" in args:
-            start = args.index("--ros-args")
-            end = args.index("--", start) + 1 if "--" in args[start:] else len(args)
-            args = args[:start] + args[end:]
-        return super().parse_args(ctx, args)
-
-
 def _node_options(command: Callable[..., None]) -> Callable[..., None]:
     """What the commands of single nodes have in common."""
     for option in (
@@ -268,7 +259,7 @@ _checkpoint = click.option(
 )
 
 
-@main.command(cls=_RosCommand, epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
+@main.command(cls=RosCommand, epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
 @_node_options
 @click.option(
     "--agent",
@@ -311,7 +302,7 @@ def agent(
     _run_nodes(nodes, record, **options)
 
 
-@main.command(cls=_RosCommand, epilog=examples("msg-agents switcher run.json --await recorder"))
+@main.command(cls=RosCommand, epilog=examples("msg-agents switcher run.json --await recorder"))
 @_node_options
 @_await
 @_checkpoint
@@ -342,7 +333,7 @@ def switcher(
     _run_nodes(nodes, record, **options)
 
 
-@main.command(cls=_RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
+@main.command(cls=RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
 @_node_options
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Directory of the bag; must not exist.")
 @storage_options
@@ -412,3 +403,7 @@ def _load_record(path: Path) -> RunRecord:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}): expected a run record from msg-agents prepare") from error
     return RunRecord.from_json(text, str(path))
+
+
+main.add_command(cli_replay.play)
+main.add_command(cli_replay.live)

@@ -7,17 +7,15 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from msg_agents_interfaces.msg import Progress as ProgressMsg
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy
 from rclpy.task import Future
 from rclpy.time_source import CLOCK_TOPIC
 
-from msg_agents.errors import RCLError
 from msg_agents.health import Health
 from msg_agents.network import RECORDER, SWITCHER
 from msg_agents.qos import LATCHED
+from msg_agents.quiet import QuietNode
 from msg_agents.synchronizer import Refusal
 from msg_analysis.bags.cdr import AgentState, CdrError, Progress, StepClock
 from msg_analysis.errors import InputError
@@ -74,7 +72,7 @@ def why_not(data: bytes, record: RunRecord, agent: int, length: int) -> str:
     return WRONG_LENGTH if len(message.state) != length else OTHER_LAYOUT
 
 
-class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
+class NetworkNode(QuietNode):
     """A node of a run.
 
     Parameters
@@ -84,13 +82,7 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
     """
 
     def __init__(self, name: str, *, record: RunRecord) -> None:
-        # Each node would bring eight services and /rosout: with many nodes they cost more than the network.
-        super().__init__(
-            name,
-            start_parameter_services=False,
-            enable_rosout=False,
-            parameter_overrides=[Parameter("start_type_description_service", value=False)],
-        )
+        super().__init__(name)
         self.record = record
         self.run = record.run.bytes
         self._step_clock = StepClock(record.experiment.step_length)
@@ -110,21 +102,6 @@ class NetworkNode(Node):  # type: ignore[misc]  # rclpy has no type hints that m
         self.refused[topic, reason] += 1
         if self.refused[topic, reason] == 1:
             self.get_logger().warning(f"refused a message on {topic}: {reason} (further ones are only counted)")
-
-    def publish(self, publisher: Publisher, data: bytes) -> None:
-        """Publish serialized bytes, again and again until they go through.
-
-        A reader that does not keep up blocks a reliable keep-all writer; after 100 ms the middleware gives up and
-        raises, and the message has not been written.
-        """
-        while True:
-            try:
-                # What Publisher.publish comes down to for bytes, without taking hold of the handle each time.
-                publisher.handle.publish_raw(data)
-                return
-            except RCLError:
-                if not self.context.ok():
-                    raise
 
     def health(self) -> Health:
         """How this node is, asked about once a second."""

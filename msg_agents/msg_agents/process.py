@@ -15,6 +15,7 @@ from pathlib import Path
 
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
 
 from msg_agents.errors import RCLError
 from msg_agents.health import Reporter
@@ -139,11 +140,11 @@ def run_nodes(
             node.finish(complete=complete)
         if reporter:
             reporter.keep_account()
-        _leave(nodes, complete=complete)
+        leave(nodes, complete=complete)
     return complete
 
 
-def _leave(nodes: Sequence[NetworkNode], *, complete: bool) -> None:
+def leave(nodes: Sequence[Node], *, complete: bool) -> None:
     """Take the nodes off the network, so that nobody waits for them, and see to it that the process ends.
 
     When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the

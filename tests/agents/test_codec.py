@@ -23,7 +23,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header, String
 
 from msg_analysis.bags import cdr
-from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING, MessageType
+from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType
 
 U32, U64 = st.integers(0, 2**32 - 1), st.integers(0, 2**64 - 1)
 NANOSECOND = st.integers(0, (2**31 - 1) * 10**9 + 999_999_999)
@@ -172,7 +172,7 @@ def test_special_numbers_survive() -> None:
     assert bits(deserialize_message(message.encode(), interfaces.AgentState).state) == bits(state)
 
 
-@pytest.mark.parametrize("kind", [AGENT_STATE, ACTIVE_GRAPH, PROGRESS, STRING], ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", [AGENT_STATE, ACTIVE_GRAPH, ESTIMATE, PROGRESS, STRING], ids=lambda kind: kind.name)
 def test_schema_and_hash_are_those_of_the_installed_package(kind: MessageType) -> None:
     share = Path(sys.prefix) / "share"
     if not (share / kind.package / "msg" / f"{kind.name}.json").exists():

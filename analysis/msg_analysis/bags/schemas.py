@@ -62,6 +62,9 @@ ACTIVE_GRAPH = MessageType(
 PROGRESS = MessageType(
     _INTERFACES, "Progress", "RIHS01_075d0eb0154f1de34225d33cb0aa303f408a92a2011e46c0487e20ae63394fe6"
 )
+ESTIMATE = MessageType(
+    _INTERFACES, "Estimate", "RIHS01_115be21e1cecad98ff8eecdcae1ab03d2a324db256d5b58f8060f94cb918c9df"
+)
 STRING = MessageType("std_msgs", "String", "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18")
 
 

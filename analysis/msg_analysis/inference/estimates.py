@@ -71,10 +71,21 @@ def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Esti
     combinations = np.vstack([means.trace, means.nodes])
     measured, predicted = combinations @ means.measured, combinations @ means.predicted
     errors = np.sqrt(np.einsum("aq,qr,ar->a", combinations, means.covariance, combinations).clip(0.0))
-    found = [estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
+    found, nodes = beside(measured, predicted, errors)
     if not len(means.nodes):
         both = (np.diag(system.lifted(matrix)) for matrix in (means.second_moments, means.expected_moments))
-        return found[0], [Estimate(float(m), float(p)) for m, p in zip(*both, strict=True)]
+        return found, [Estimate(float(m), float(p)) for m, p in zip(*both, strict=True)]
+    return found, nodes
+
+
+def beside(measured: FloatArray, predicted: FloatArray, errors: FloatArray) -> tuple[Estimate, list[Estimate]]:
+    """What was measured beside what is expected of it.
+
+    Parameters
+    ----------
+    measured, predicted, errors : (1 + nodes,) first of the system, then of the nodes; errors are standard errors
+    """
+    found = [estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
     tested = [i for i, entry in enumerate(found) if i > 0 and entry.p is not None]
     adjusted = dict(zip(tested, holm(np.array([found[i].p for i in tested], dtype=float)), strict=True))
     nodes = [

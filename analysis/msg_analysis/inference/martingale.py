@@ -74,7 +74,7 @@ class TimeMeans:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Value:
+class Value:
     """What the next step may do to the values f of q forms, given one graph g and a = (s, 1).
 
     Attributes
@@ -124,19 +124,26 @@ class _Value:
 
     def variances(self, combination: FloatArray, a: FloatArray, replicas: int) -> FloatArray:
         """(b,): Var(D_k | now) of one combination (q,) of the forms in every step, a being (b, p + 1)."""
-        total = np.zeros(len(a))
-        linear = np.zeros(a.shape[1])
-        for probability, surprise, form in zip(self.probability, self.surprises, self.forms, strict=True):
-            total += probability * (a @ (combination @ surprise)) ** 2
+        return np.asarray(self.jump_variances(combination, a) + a @ self.spread_variance(combination) / replicas)
+
+    def jump_variances(self, combination: FloatArray, a: FloatArray) -> FloatArray:
+        """(b,): the part of ``variances`` that the next graph is to blame for."""
+        parts = [(a @ (combination @ surprise)) ** 2 for surprise in self.surprises]
+        return np.asarray(self.probability @ np.array(parts))
+
+    def spread_variance(self, combination: FloatArray) -> FloatArray:
+        """(p + 1,): as a function of a, the part that the noise is to blame for, with one replica."""
+        linear = np.zeros(self.surprises.shape[2])
+        for probability, form in zip(self.probability, self.forms, strict=True):
             matrix = np.tensordot(combination, form, axes=1)
             seen = matrix @ self.noise @ matrix
             linear[:-1] += 4.0 * probability * symmetric.pack(self.weights.T @ seen @ self.weights)
             linear[-1] += 2.0 * probability * np.trace(seen @ self.noise)
-        return np.asarray(total + a @ linear / replicas)
+        return linear
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _SharedValue:
+class SharedValue:
     """The same where replicas share lost messages; b = (s, 1) is that of the next state, before the jump.
 
     Attributes
@@ -198,7 +205,7 @@ def time_means(observation: Observation) -> TimeMeans:
     joint = p <= MAX_JOINT
     forms, nodes, trace = forms_of(system, "joint" if joint else "nodes")
 
-    values = _values(observation.prediction, forms)
+    values = values_of(observation.prediction, forms)
     totals = np.zeros((system.modes, p + 1))
     covariance = np.zeros((len(forms), len(forms)))
     series, variances = np.empty(steps), np.empty(steps)
@@ -209,7 +216,7 @@ def time_means(observation: Observation) -> TimeMeans:
         for mode, value in enumerate(values):
             at = np.flatnonzero(observation.modes[first:last] == mode)
             totals[mode] += a[at].sum(axis=0)
-            if isinstance(value, _Value):
+            if isinstance(value, Value):
                 covariance += value.jumps(a[at])
                 variances[first + at] = value.variances(trace, a[at], observation.replicas)
             else:
@@ -218,7 +225,7 @@ def time_means(observation: Observation) -> TimeMeans:
                 covariance += increments.T @ increments + value.jumps(b)
                 variances[first + at] = (increments @ trace) ** 2 + value.jump_variances(trace, b)
     for value, total in zip(values, totals, strict=True):
-        if isinstance(value, _Value):
+        if isinstance(value, Value):
             covariance += value.spread(total) / observation.replicas
     seen = totals.sum(axis=0)[:p] / steps
     expected = expected_mean(observation)
@@ -237,14 +244,14 @@ def time_means(observation: Observation) -> TimeMeans:
     )
 
 
-def _values(prediction: Prediction, forms: FloatArray) -> list[_Value | _SharedValue]:
+def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedValue]:
     """One for each graph."""
     system = prediction.system
     dual = prediction.solver.dual(symmetric.unpack(forms, system.dimension))
     _, kappa = mode_potential(system, dual)
     packed = np.moveaxis(symmetric.pack(dual), 1, 0)
     here = np.concatenate([packed, kappa.T[:, :, None]], axis=2)  # f(y, j) = here[j] @ (s, 1)
-    values: list[_Value | _SharedValue] = []
+    values: list[Value | SharedValue] = []
     for mode, step in enumerate(system.matrices):
         before = step.T @ dual @ step  # (q, n, d, d): the adjoint of what this graph's step does
         if system.loss_variance is not None:
@@ -254,10 +261,10 @@ def _values(prediction: Prediction, forms: FloatArray) -> list[_Value | _SharedV
         law = system.chain[mode]
         expected = np.tensordot(law, ahead, axes=1)
         if system.loss_variance is None:
-            values.append(_Value(law, ahead - expected, np.moveaxis(dual, 1, 0), step, system.noise[mode]))
+            values.append(Value(law, ahead - expected, np.moveaxis(dual, 1, 0), step, system.noise[mode]))
         else:
             reached = np.tensordot(law, here, axes=1)
-            values.append(_SharedValue(law, here - reached, reached, expected))
+            values.append(SharedValue(law, here - reached, reached, expected))
     return values
 
 
@@ -282,7 +289,10 @@ def forms_of(
 
 def moments(observation: Observation, first: int, last: int, states: FloatArray) -> FloatArray:
     """(last - first, p): packed y y^T of the states first..last-1 of (N + 1, m, R), averaged over the replicas."""
-    system = observation.prediction.system
-    states = states[first:last] - observation.step.reference
-    y = np.einsum("kmr,md->krd", states, system.lift, optimize=True)
-    return symmetric.pack(y.transpose(0, 2, 1) @ y / observation.replicas)
+    return packed_moments(states[first:last] - observation.step.reference, observation.prediction.system)
+
+
+def packed_moments(deviations: FloatArray, system: JumpSystem) -> FloatArray:
+    """(b, p): packed y y^T of what the agents are off in some steps, (b, m, R), averaged over the replicas."""
+    y = np.einsum("kmr,md->krd", deviations, system.lift, optimize=True)
+    return symmetric.pack(y.transpose(0, 2, 1) @ y / deviations.shape[2])

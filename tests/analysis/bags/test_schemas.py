@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 import msg_analysis.bags
-from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING, MessageType, network_topics
+from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType, network_topics
 
 DEFINITIONS = Path(msg_analysis.bags.__file__).parent / "definitions"
 INTERFACES = Path(__file__).parents[3] / "ros_ws" / "src" / "msg_agents_interfaces"
-TYPES = [AGENT_STATE, ACTIVE_GRAPH, PROGRESS, STRING]
+TYPES = [AGENT_STATE, ACTIVE_GRAPH, ESTIMATE, PROGRESS, STRING]
 
 
 @pytest.mark.parametrize("package", ["msg_agents_interfaces", "std_msgs", "builtin_interfaces"])

@@ -1,0 +1,304 @@
+"""The messages of a bag, of any topics and types, in the order of time: what a player publishes.
+
+Within a topic that is the order of the file; a message whose log time is before that of its predecessor on the topic
+comes right after it. Across topics it is the order of log times, and of the file where these are equal. Recorders write
+messages as they come, so a bag is only nearly in that order, and what is read has to be held until nothing earlier can
+follow. How early messages behind some point of a file can be is known from an outline of the file, taken before.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from bisect import bisect_right
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema, Statistics
+
+from msg_analysis.bags.mcapfile import MAGIC, McapFile
+from msg_analysis.bags.reader import bag_files
+from msg_analysis.errors import BagError
+
+MOST_HELD = 256 * 2**20
+"""Bytes of messages held to be put in order; if a bag is so far out of order that this does not do, order gives way."""
+_RECORD = struct.Struct("<BQ")
+_TIMES = struct.Struct("<QQ")  # of the first and the last message of a chunk, at its beginning
+_EMPTY_INDEX = 6  # bytes of a message index without entries
+_LATCHED = ("transient_local", 1)  # in words, and as older rosbag2 wrote it
+
+
+@dataclass(slots=True)
+class BagTopic:
+    """A topic of a bag.
+
+    Attributes
+    ----------
+    name : absolute
+    type_name : of its messages, such as ``std_msgs/msg/String``
+    encoding : of its messages; ``cdr`` in ROS 2
+    type_hash : of its type's description; empty where the bag does not say
+    latched : whether a publisher of it kept its messages for those who come late
+    messages : how many there are
+    """
+
+    name: str
+    type_name: str
+    encoding: str
+    type_hash: str
+    latched: bool
+    messages: int = 0
+
+
+@dataclass(slots=True)
+class _Outline:
+    """What is known of a file before it is played.
+
+    Attributes
+    ----------
+    lows : (end of a piece of the file [bytes], earliest log time in it [ns]), in the order of the file
+    start, end : log times of the earliest and the latest message [ns]; None without messages
+    """
+
+    path: Path
+    channels: dict[int, Channel] = field(default_factory=dict)
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    lows: list[tuple[int, int]] = field(default_factory=list)
+    start: int | None = None
+    end: int | None = None
+    damage: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message of a bag: when it is its turn [ns of log time], its topic, its bytes."""
+
+    time: int
+    topic: str
+    data: bytes
+
+
+class Playback:
+    """A bag that is read in the order of time, as often as wanted, a piece at a time.
+
+    Parameters
+    ----------
+    path : the directory of a bag, or one of its .mcap files; whole or torn
+
+    Attributes
+    ----------
+    topics : by name; those of which there are messages
+    start, end : log times of the earliest and the latest message [ns]
+    damage : what is wrong with its files, a line each; damaged chunks may show only while they are read
+
+    Raises
+    ------
+    BagError : no bag, or without messages
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._outlines = [_quick_outline(file) or _outline(file) for file in bag_files(Path(path))]
+        starts = [outline.start for outline in self._outlines if outline.start is not None]
+        ends = [outline.end for outline in self._outlines if outline.end is not None]
+        if not starts:
+            raise BagError(f"{path}: has no messages: there is nothing to play")
+        self.start, self.end = min(starts), max(ends)
+        self.damage = [f"{outline.path}: {outline.damage}" for outline in self._outlines if outline.damage]
+        self.topics: dict[str, BagTopic] = {}
+        for outline in self._outlines:
+            for number, channel in outline.channels.items():
+                self._add(channel, outline.schemas.get(channel.schema_id), outline.counts.get(number, 0))
+
+    def _add(self, channel: Channel, schema: Schema | None, messages: int) -> None:
+        if not messages:
+            return
+        latched = _latched(channel.metadata.get("offered_qos_profiles", ""))
+        topic = self.topics.setdefault(
+            channel.topic,
+            BagTopic(
+                channel.topic,
+                schema.name if schema else "",
+                channel.message_encoding,
+                channel.metadata.get("topic_type_hash", ""),
+                latched,
+            ),
+        )
+        topic.latched |= latched
+        topic.messages += messages
+        if schema is not None and schema.name != topic.type_name:
+            raise BagError(
+                f"topic {channel.topic}: its messages are {topic.type_name} and {schema.name}: expected one type "
+                "of each topic"
+            )
+
+    def messages(self, topics: Collection[str], until: int = 2**63) -> Iterator[Message]:
+        """The messages of some topics.
+
+        Parameters
+        ----------
+        topics : names
+        until : time [ns] of the last ones that are wanted; what is behind them in the bag is not read
+        """
+        newest: dict[str, int] = {}
+        pending: list[tuple[int, int, str, bytes]] = []  # time, position in the bag, topic, data
+        position = held = 0
+        for outline, later in zip(self._outlines, self._starts_after(), strict=True):
+            lows = _Lows(outline.lows, later)
+            file = McapFile(outline.path)
+            names: dict[int, str | None] = {}
+            for batch in file.batches():
+                for number, channel in file.channels.items():
+                    if number not in names:
+                        names[number] = channel.topic if channel.topic in topics else None
+                for number, _, time, _, start, size in batch.table.tolist():
+                    topic = names.get(number)
+                    if topic is None:
+                        continue
+                    newest[topic] = time = max(time, newest.get(topic, 0))
+                    pending.append((time, position, topic, batch.data[start : start + size]))
+                    position += 1
+                    held += size
+                pending.sort()
+                low = lows.behind(file.whole_bytes)
+                ready = bisect_right(pending, min(low, until), key=lambda entry: entry[0])
+                if held > MOST_HELD:
+                    ready = max(ready, len(pending) // 2)
+                for time, _, topic, data in pending[:ready]:
+                    held -= len(data)
+                    yield Message(time, topic, data)
+                del pending[:ready]
+                if low > until:
+                    return
+            self._note(outline, file)
+        for time, _, topic, data in pending:
+            if time <= until:
+                yield Message(time, topic, data)
+
+    def _note(self, outline: _Outline, file: McapFile) -> None:
+        if file.damaged_chunks and outline.damage is None:
+            outline.damage = f"damaged chunks that are left out: {file.damaged_chunks}"
+            self.damage.append(f"{outline.path}: {outline.damage}")
+
+    def _starts_after(self) -> list[int]:
+        """For each file, the earliest time in those behind it."""
+        starts, least = [], 2**63
+        for outline in reversed(self._outlines):
+            starts.append(least)
+            least = min(least, 2**63 if outline.start is None else outline.start)
+        return starts[::-1]
+
+
+class _Lows:
+    """How early messages behind some point of a file can be."""
+
+    def __init__(self, lows: list[tuple[int, int]], later: int) -> None:
+        self._ends = [end for end, _ in lows]
+        self._from = [later]  # each piece on
+        for _, low in reversed(lows):
+            self._from.append(min(self._from[-1], low))
+        self._from.reverse()
+        self._next = 0
+
+    def behind(self, offset: int) -> int:
+        """After a piece that ends here; called once for every piece that was read, in order."""
+        while self._next < len(self._ends) and self._ends[self._next] < offset:
+            self._next += 1  # not read: damaged
+        if self._next < len(self._ends) and self._ends[self._next] == offset:
+            self._next += 1  # else without messages
+        return self._from[self._next]
+
+
+def _latched(profiles: str) -> bool:
+    """Whether one of the offered profiles, in rosbag2's words, is transient-local."""
+    try:
+        listed: Any = yaml.safe_load(profiles)
+    except yaml.YAMLError:
+        return False
+    if not isinstance(listed, list):
+        return False
+    return any(isinstance(profile, dict) and profile.get("durability") in _LATCHED for profile in listed)
+
+
+def _quick_outline(path: Path) -> _Outline | None:
+    """From the heads of the records and the summary, without unpacking chunks; None where these do not do.
+
+    They do for a file that was ended well and has all of its messages in chunks, as most have.
+    """
+    outline = _Outline(path)
+    statistics: Statistics | None = None
+    silent = None  # end of a chunk that claims no time, or 0: which of the two its index tells
+    with path.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            return None
+        while len(head := stream.read(_RECORD.size)) == _RECORD.size:
+            opcode, length = _RECORD.unpack(head)
+            end = stream.tell() + length
+            if opcode == Opcode.CHUNK:
+                times = stream.read(_TIMES.size)
+                if len(times) < _TIMES.size:
+                    return None
+                first, last = _TIMES.unpack(times)
+                silent = end if first == last == 0 else None
+                if silent is None:
+                    outline.lows.append((end, first))
+            elif opcode == Opcode.MESSAGE_INDEX and silent is not None and length > _EMPTY_INDEX:
+                outline.lows.append((silent, 0))
+                silent = None
+            elif opcode == Opcode.MESSAGE:
+                return None
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
+                content = ReadDataStream(io.BytesIO(stream.read(length)))
+                try:
+                    if opcode == Opcode.SCHEMA:
+                        schema = Schema.read(content)
+                        outline.schemas[schema.id] = schema
+                    elif opcode == Opcode.CHANNEL:
+                        channel = Channel.read(content)
+                        outline.channels[channel.id] = channel
+                    else:
+                        statistics = Statistics.read(content)
+                except Exception:  # the library reports damage by whatever goes wrong in it
+                    return None
+            elif opcode == Opcode.FOOTER:
+                break
+            stream.seek(end)
+        else:
+            return None
+    if statistics is None or not statistics.message_count:
+        return None
+    outline.counts = dict(statistics.channel_message_counts)
+    outline.start, outline.end = statistics.message_start_time, statistics.message_end_time
+    whole = outline.counts.keys() <= outline.channels.keys() and statistics.chunk_count >= len(outline.lows)
+    return outline if whole else None
+
+
+def _outline(path: Path) -> _Outline:
+    """By reading all of a file.
+
+    Raises
+    ------
+    BagError : not an MCAP file, empty, or one that cannot be read
+    """
+    outline, file = _Outline(path), McapFile(path)
+    for batch in file.batches():
+        if not len(batch.table):
+            continue
+        times = batch.table[:, 2]
+        first, last = int(times.min()), int(times.max())
+        outline.lows.append((file.whole_bytes, first))
+        outline.start = first if outline.start is None else min(outline.start, first)
+        outline.end = last if outline.end is None else max(outline.end, last)
+        for number in batch.channel.tolist():
+            outline.counts[number] = outline.counts.get(number, 0) + 1
+    outline.channels, outline.schemas = file.channels, file.schemas
+    notes = [file.torn] if file.torn else []
+    if file.damaged_chunks:
+        notes.append(f"damaged chunks that are left out: {file.damaged_chunks}")
+    outline.damage = "; ".join(notes) or None
+    return outline

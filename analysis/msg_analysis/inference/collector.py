@@ -1,0 +1,141 @@
+"""States that come one by one, while a network runs, put together to whole steps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.types import FloatArray, IntArray
+
+SPREAD = 64
+"""Steps that neighbours can be apart in lockstep."""
+MOST_WAITING = 20_000
+"""Steps that are kept while states of them are missing, at most."""
+
+LATE, AGAIN, OUT_OF_RANGE = "too late", "received again", "step out of range"
+CONTRADICTION = "contradicts an earlier copy"
+NOT_FINITE, DISAGREEMENT = "not finite", "agents used different graphs"
+
+
+@dataclass(slots=True)
+class _Row:
+    """What has come of one step."""
+
+    payloads: list[bytes | None]
+    left: int
+    mode: int
+    usable: bool = True
+    used: bool = False
+    states: bytes | None = None
+
+
+class StepCollector:
+    """Puts states that come one by one, in any order, together to whole steps.
+
+    Parameters
+    ----------
+    agents : their number m
+    modes : number of graphs
+    last : last step of the run
+    lockstep : whether all agents make a step with the same graph; then a step is ready only with the one after it,
+        which says which graph that was. Otherwise the graph is not asked for
+
+    Attributes
+    ----------
+    refused : states, or steps, that do not count, by reason
+    newest : largest step that anything came of; -1: none
+    whole : largest step that came whole; -1: none
+    """
+
+    def __init__(self, agents: int, modes: int, last: int, *, lockstep: bool) -> None:
+        self._agents, self._modes, self._last, self._lockstep = agents, modes, last, lockstep
+        self._window = min(SPREAD * (agents + 1), MOST_WAITING)
+        self._rows: dict[int, _Row] = {}
+        self._low = 0  # steps before it are gone
+        self._ready: list[tuple[int, int, bytes, bytes]] = []  # step, mode, states, those after it
+        self.refused: Counter[str] = Counter()
+        self.newest = self.whole = -1
+
+    def add(self, agent: int, step: int, mode: int, payload: bytes) -> None:
+        """Take one state.
+
+        Parameters
+        ----------
+        agent : index from 0
+        step : k
+        mode : graph of the step that led there, from 1; 0 at step 0
+        payload : its numbers
+        """
+        row = self._rows.get(step)
+        if row is None:
+            if not self._low <= step <= self._last:
+                self.refused[LATE if step < self._low else OUT_OF_RANGE] += 1
+                return
+            if step > self.newest:
+                self.newest = step
+                self._forget(step - self._window)
+            row = self._rows[step] = _Row([None] * self._agents, self._agents, mode)
+        before = row.payloads[agent]
+        if before is not None:
+            self.refused[AGAIN] += 1
+            if before != payload and row.usable:
+                row.usable = False  # nobody knows which of them is forged
+                self.refused[CONTRADICTION] += 1
+            return
+        row.payloads[agent] = payload
+        row.left -= 1
+        if mode != row.mode and self._lockstep and row.usable:
+            row.usable = False
+            self.refused[DISAGREEMENT] += 1
+        if not row.left:
+            self._complete(step, row)
+
+    def take(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        """Steps that have become ready since the last time.
+
+        Returns
+        -------
+        steps : (b,) k
+        modes : (b,) graph of the step k -> k+1, from 0; 0 if it is not asked for
+        states : (b, m, width) x(k)
+        after : (b, m, width) x(k+1); x(k) if the graph is not asked for
+        """
+        ready, self._ready = self._ready, []
+        steps = np.array([entry[0] for entry in ready], dtype=np.int64)
+        modes = np.array([entry[1] - 1 for entry in ready], dtype=np.int64)
+        shape = len(ready), self._agents, -1 if ready else 0
+        states = np.frombuffer(b"".join([entry[2] for entry in ready]), "<f8").reshape(shape)
+        after = np.frombuffer(b"".join([entry[3] for entry in ready]), "<f8").reshape(shape)
+        good = np.isfinite(states).all(axis=(1, 2)) & np.isfinite(after).all(axis=(1, 2))
+        self.refused[NOT_FINITE] += int((~good).sum())
+        return steps[good], modes[good], states[good], after[good]
+
+    def _complete(self, step: int, row: _Row) -> None:
+        row.states = b"".join(payload for payload in row.payloads if payload is not None)
+        self.whole = max(self.whole, step)
+        if self._lockstep:
+            self._pair(step - 1)
+            self._pair(step)
+        elif row.usable:
+            self._ready.append((step, 1, row.states, row.states))
+            row.used = True
+        while (first := self._rows.get(self._low)) is not None and first.used:
+            del self._rows[self._low]
+            self._low += 1
+
+    def _pair(self, step: int) -> None:
+        """A step is ready, if it is there with the one after it."""
+        here, after = self._rows.get(step), self._rows.get(step + 1)
+        if here is None or after is None or here.states is None or after.states is None or here.used:
+            return
+        if here.usable and after.usable and 1 <= after.mode <= self._modes:
+            self._ready.append((step, after.mode, here.states, after.states))
+        here.used = True
+
+    def _forget(self, low: int) -> None:
+        if low > self._low:
+            for step in [step for step in self._rows if step < low] if self._rows else ():
+                del self._rows[step]
+            self._low = low

@@ -1,0 +1,260 @@
+"""Commands of ``msg-agents`` about running and recorded networks: ``play`` and ``live``."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from msg_agents.ros_command import RosCommand
+from msg_analysis.console import examples, print_json, result_console
+
+if TYPE_CHECKING:
+    from msg_agents.player import Played
+
+INCOMPLETE = 3
+_domain = click.option("--domain", type=click.IntRange(0, 232), help="Instead of the environment's ROS_DOMAIN_ID.")
+
+
+def _positive(_: click.Context, __: click.Parameter, value: float | None) -> float | None:
+    if value is not None and not 0 < value < math.inf:
+        raise click.BadParameter(f"{value}: expected a positive number")
+    return value
+
+
+def _rate(_: click.Context, __: click.Parameter, value: str) -> float:
+    try:
+        rate = math.inf if value == "max" else float(value)
+    except ValueError:
+        rate = math.nan
+    if not rate > 0 or (math.isinf(rate) and value != "max"):
+        raise click.BadParameter(f"{value}: expected a positive number, or max")
+    return rate
+
+
+@click.command(
+    cls=RosCommand,
+    epilog=examples(
+        "msg-agents play runs/line_ring_20260114_083441",
+        "msg-agents play BAG --rate max --await recorder",
+        "msg-agents play BAG --topics '/agent_*/state' --remap /agent_1/state:=/lab/one --start-offset 10 --clock 100",
+    ),
+)
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option(
+    "-r",
+    "--rate",
+    callback=_rate,
+    metavar="RATE",
+    default="1",
+    show_default=True,
+    help="Seconds of the bag per second; of a network's bag, units of simulated time. max: as fast as readers take it.",
+)
+@click.option(
+    "--start-offset",
+    type=click.FloatRange(0, 1e9),
+    default=0.0,
+    metavar="SECONDS",
+    help="Seconds of the bag to leave out at the start.",
+)
+@click.option("--duration", type=float, callback=_positive, help="Seconds of the bag to play; otherwise all.")
+@click.option("-l", "--loop", is_flag=True, help="Begin again at the end.")
+@click.option("--paused", is_flag=True, help="Stand at first; the space bar starts it.")
+@click.option(
+    "--clock",
+    type=float,
+    callback=_positive,
+    metavar="HZ",
+    help="Publish the time of the bag on /clock so often a second.",
+)
+@click.option("--topics", multiple=True, help="Only this topic; or a pattern such as '/agent_*/state'. Repeatable.")
+@click.option("-x", "--exclude", multiple=True, help="Not this topic, or pattern. Repeatable.")
+@click.option(
+    "-m", "--remap", "remaps", multiple=True, metavar="OLD:=NEW", help="Another name for a topic. Repeatable."
+)
+@click.option(
+    "--wait-for-subscribers",
+    "subscribers",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Begin when every topic has N readers (latched topics, whose readers miss nothing, are not waited for).",
+)
+@click.option("--await", "readers", multiple=True, metavar="NODE", help="Begin when NODE reads them. Repeatable.")
+@click.option(
+    "--wait-timeout",
+    type=float,
+    callback=_positive,
+    default=30.0,
+    show_default=True,
+    help="Seconds to wait for readers.",
+)
+@_domain
+def play(
+    bag: Path,
+    *,
+    rate: float,
+    start_offset: float,
+    duration: float | None,
+    loop: bool,
+    paused: bool,
+    clock: float | None,
+    topics: tuple[str, ...],
+    exclude: tuple[str, ...],
+    remaps: tuple[str, ...],
+    subscribers: int | None,
+    readers: tuple[str, ...],
+    wait_timeout: float,
+    domain: int | None,
+) -> None:
+    """Publish the messages of BAG again, a bag of ROS 2 with MCAP storage, in the order in which they were recorded.
+
+    No message is lost: readers that do not keep up hold the player back.
+
+    On a terminal, space pauses and goes on, s or the right arrow plays one message, up and down change the rate.
+    """
+    from msg_agents.player import PlayOptions
+    from msg_agents.player import play as play_bag
+
+    _enter(domain)
+    options = PlayOptions(
+        rate=rate,
+        start_offset=start_offset,
+        duration=duration,
+        loop=loop,
+        paused=paused,
+        clock=clock,
+        topics=topics,
+        exclude=exclude,
+        remaps=remaps,
+        subscribers=subscribers or 0,
+        readers=readers,
+        wait_timeout=wait_timeout,
+    )
+    with _play_bar(bag.name) as bar:
+        try:
+            played = play_bag(bag, options, on_progress=bar.update, on_note=bar.note)
+        except (KeyboardInterrupt, SystemExit):
+            bar.note(f"stopped at {bar.played.now:g} s of the bag after {bar.played.messages} messages")
+            raise
+    held = f"; held back by readers for {played.held_back:.1f} s" if played.held_back >= 0.1 else ""
+    click.echo(f"{played.messages} messages played in {played.seconds:.1f} s{held}", err=True)
+
+
+class _play_bar:  # noqa: N801  used like a function
+    """Notes on stderr and, on a terminal, a bar: time of the bag, rate."""
+
+    def __init__(self, name: str) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        from msg_agents.player import Played
+
+        self.played: Played = Played()
+        self._console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[state]}"),
+            console=self._console,
+            disable=not self._console.is_terminal,
+            transient=True,
+        )
+        self._task = self._progress.add_task(name, total=None, state="looking for readers")
+
+    def __enter__(self) -> _play_bar:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def update(self, played: Played) -> None:
+        self.played = played
+        pace = "as fast as it goes" if math.isinf(played.rate) else f"x {played.rate:.3g}"
+        state = f"{played.now:.1f}/{played.length:.1f} s  {'paused' if played.paused else pace}"
+        self._progress.update(self._task, completed=played.now, total=played.length, state=state)
+
+    def note(self, line: str) -> None:
+        from rich.text import Text
+
+        self._console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
+
+
+def _enter(domain: int | None) -> None:
+    """Choose the domain, and see to it that signals end the process in order."""
+    if domain is not None:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+
+    def end(number: int, _: object) -> None:
+        sys.exit(128 + number)
+
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, end)
+
+
+@click.command(
+    cls=RosCommand,
+    epilog=examples(
+        "msg-agents live --domain 42",
+        "msg-agents live --reliable --json    # then, elsewhere: msg-agents play BAG --rate max --await live",
+    ),
+)
+@click.option(
+    "--reliable",
+    is_flag=True,
+    help="Miss no state, and hold the network back where that takes too long. By default it never waits.",
+)
+@click.option("--timeout", type=float, callback=_positive, help="Seconds to wait for a network; by default for ever.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, at the end, and nothing else.")
+@_domain
+def live(*, reliable: bool, timeout: float | None, as_json: bool, domain: int | None) -> None:
+    """Watch a network, running or played: its errors up to now beside their prediction.
+
+    It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). The numbers are those of `msg-analysis
+    compare`, on the topic `estimate` too, but they are no verdict.
+    """
+    from rich.console import Console
+    from rich.text import Text
+
+    from msg_agents.live import Watched, watch
+    from msg_analysis.report.live import live_document, live_line, live_table
+
+    _enter(domain)
+    notes = Console(stderr=True)
+
+    def note(line: str) -> None:
+        notes.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
+
+    console = result_console()
+    if as_json or not console.is_terminal:
+
+        def show(watched: Watched, rate: float) -> None:
+            if not as_json:
+                click.echo(live_line(watched.report, watched.record, rate))
+
+        found = watch(reliable=reliable, timeout=timeout, on_report=show, on_note=note)
+    else:
+        from rich.live import Live
+
+        with Live(console=console, auto_refresh=False) as screen:
+            found = watch(
+                reliable=reliable,
+                timeout=timeout,
+                on_report=lambda watched, rate: screen.update(
+                    live_table(watched.report, watched.record, rate), refresh=True
+                ),
+                on_note=note,
+            )
+    if found is None:
+        note("no network was seen")
+        sys.exit(INCOMPLETE)
+    if as_json:
+        print_json(live_document(found.report, found.record))
+    elif found.report.note and not console.is_terminal:
+        note(found.report.note)
+    sys.exit(0 if found.finished else INCOMPLETE)

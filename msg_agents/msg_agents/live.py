@@ -1,0 +1,261 @@
+"""The live node: the errors of a running or replayed network beside their prediction."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import rclpy
+from builtin_interfaces.msg import Time
+from msg_agents_interfaces.msg import AgentState as AgentStateMsg
+from msg_agents_interfaces.msg import Estimate as EstimateMsg
+from msg_agents_interfaces.msg import Progress as ProgressMsg
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from std_msgs.msg import Header, String
+
+from msg_agents.checkpoint import longest_heard
+from msg_agents.node import (
+    END_TOPIC,
+    EXPERIMENT_TOPIC,
+    OTHER_RUN,
+    UNDECODABLE,
+    state_topic,
+    truth_topic,
+    why_not,
+)
+from msg_agents.process import SPIN_SLICE, leave, make_executor
+from msg_agents.qos import LATCHED, NEWEST, STREAM
+from msg_agents.quiet import QuietNode
+from msg_agents.timers import every
+from msg_analysis.bags.cdr import SECOND, CdrError, Progress, StateFrame, StepClock, decode_string
+from msg_analysis.errors import InputError
+from msg_analysis.inference.online import LiveEstimate, LiveReport
+from msg_analysis.model.record import RunRecord
+
+ESTIMATE_TOPIC = "estimate"
+PERIOD = 1.0  # s between two estimates
+PATIENCE = 1.0  # s after which it is said that nobody is there
+LISTEN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""How states are read by default: a writer never waits for such a reader, which misses what it is too slow for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """What has been seen of a network.
+
+    Attributes
+    ----------
+    record : of the run
+    report : the numbers
+    finished : whether the run was followed to its last step
+    """
+
+    record: RunRecord
+    report: LiveReport
+    finished: bool
+
+
+class Live(QuietNode):
+    """Reads the states of the first network that it hears of, and publishes its running estimates.
+
+    Parameters
+    ----------
+    reliable : whether to miss no state, and so hold the network back where this node does not keep up
+    on_report : told of every estimate, with the number of steps per second
+    on_note : told what somebody should know
+
+    Attributes
+    ----------
+    record : of the run, once it is known; None before
+    done : set when the run is over; True if its last step has been seen
+    """
+
+    def __init__(
+        self,
+        *,
+        reliable: bool,
+        on_report: Callable[[Watched, float], None],
+        on_note: Callable[[str], None],
+    ) -> None:
+        super().__init__("live")
+        self._qos = STREAM if reliable else LISTEN
+        self._on_report, self._on_note = on_report, on_note
+        self.record: RunRecord | None = None
+        self.known, self.done = Future(), Future()
+        self._refused: Counter[str] = Counter()
+        self._others: set[str] = set()
+        self._ended = False
+        self._topics: list[str] = []
+        self._estimate: LiveEstimate | None = None
+        self._before = (-1, time.monotonic())  # newest step, and when that was
+        self._writer = self.create_publisher(EstimateMsg, ESTIMATE_TOPIC, NEWEST)
+        self.create_subscription(String, EXPERIMENT_TOPIC, self._receive_experiment, LATCHED, raw=True)
+        self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LATCHED, raw=True)
+
+    def follow(self) -> None:
+        """Read the states of the run that has been found.
+
+        Raises
+        ------
+        InputError : there is no prediction for it (too large, unbounded)
+        """
+        assert self.record is not None
+        record, experiment = self.record, self.record.experiment
+        topic, width = state_topic, experiment.run.replicas
+        if experiment.truth:
+            topic, width = truth_topic, experiment.width
+        frame = StateFrame(record.run.bytes, width, longest_heard(record))
+        # Before the prediction, which takes its time: what comes meanwhile waits in the middleware.
+        for agent in range(experiment.agents):
+            name = self.resolve_topic_name(topic(agent))
+            self._topics.append(name)
+            self.create_subscription(AgentStateMsg, name, self._receiver(agent, frame), self._qos, raw=True)
+        self._clock_of_steps = StepClock(experiment.step_length)
+        self._estimate = LiveEstimate(record)
+        every(self, PERIOD, self._report)
+
+    def watched(self) -> Watched | None:
+        """What has been seen up to now; None: no network."""
+        if self.record is None or self._estimate is None:
+            return None
+        report = self._estimate.report()
+        for reason, count in self._refused.items():
+            report.refused[reason] = report.refused.get(reason, 0) + count
+        last = self.record.experiment.steps
+        return Watched(self.record, report, self._estimate.steps.newest >= last)
+
+    def _receiver(self, agent: int, frame: StateFrame) -> Callable[[bytes], None]:
+        """The callback for the states of an agent (index from 0): this is the hot path."""
+        unwrap, refused = frame.unwrap, self._refused
+
+        def receive(data: bytes) -> None:
+            found = unwrap(data)
+            if found is None or found[0] != agent + 1:
+                assert self.record is not None
+                refused[why_not(data, self.record, agent, frame.replicas)] += 1
+            elif self._estimate is not None:
+                self._estimate.add(agent, found[1], found[2], found[3])
+
+        return receive
+
+    def _receive_experiment(self, data: bytes) -> None:
+        try:
+            record = RunRecord.from_json(decode_string(data), f"topic {self.resolve_topic_name(EXPERIMENT_TOPIC)}")
+        except (CdrError, InputError) as error:
+            self._refused[UNDECODABLE] += 1
+            self._on_note(str(error))
+            return
+        if self.record is None:
+            self.record = record
+            self.known.set_result(None)
+        elif record.run != self.record.run and str(record.run) not in self._others:
+            self._others.add(str(record.run))
+            self._refused[OTHER_RUN] += 1
+            self._on_note(f"another run is there too, {record.run}: only {self.record.run} is watched")
+
+    def _receive_end(self, data: bytes) -> None:
+        try:
+            run = Progress.decode(data).run
+        except CdrError:
+            return
+        self._ended |= self.record is not None and run == self.record.run.bytes
+
+    def _report(self) -> None:
+        watched = self.watched()
+        assert watched is not None
+        newest, now = watched.report.newest, time.monotonic()
+        before, then = self._before
+        self._before = newest, now
+        self._writer.publish(self._message(watched))
+        self._on_report(watched, (newest - before) / max(now - then, 1e-9) if before >= 0 else 0.0)
+        last = watched.record.experiment.steps
+        assert self._estimate is not None
+        # All is there; or nothing comes any more, because the run is over or whoever published it has gone.
+        quiet = newest == before and newest >= 0
+        over = self._estimate.steps.whole >= last or (quiet and (self._ended or not self._anybody()))
+        if over and not self.done.done():
+            self.done.set_result(None)
+
+    def _anybody(self) -> bool:
+        return any(self.count_publishers(topic) for topic in self._topics)
+
+    def _message(self, watched: Watched) -> EstimateMsg:
+        report = watched.report
+        seconds, nanoseconds = divmod(self._clock_of_steps.nanoseconds(max(report.last, 0)), SECOND)
+        message = EstimateMsg(
+            header=Header(stamp=Time(sec=seconds, nanosec=nanoseconds)),
+            run=list(watched.record.run.bytes),
+            first_step=max(report.first, 0),
+            last_step=max(report.last, 0),
+            steps=report.steps,
+            node_errors=[_number(node.measured) for node in report.nodes],
+            node_predicted=[_number(node.predicted) for node in report.nodes],
+            node_standard_errors=[_number(node.standard_error) for node in report.nodes],
+        )
+        message.system_error = _number(report.system.measured)
+        message.system_predicted = _number(report.system.predicted)
+        message.system_standard_error = _number(report.system.standard_error)
+        return message
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def watch(
+    *,
+    reliable: bool = False,
+    timeout: float | None = None,
+    on_report: Callable[[Watched, float], None] = lambda *_: None,
+    on_note: Callable[[str], None] = lambda _: None,
+) -> Watched | None:
+    """Watch a network in this process until it is over, or until Ctrl-C or another signal.
+
+    Parameters
+    ----------
+    reliable, on_report, on_note : see ``Live``
+    timeout : s to wait for a network; None: for ever
+
+    Returns
+    -------
+    What was seen; None: no network
+
+    Raises
+    ------
+    InputError : no network came in time, or there is no prediction for it
+    """
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    nodes: list[Live] = []
+    try:
+        nodes = [node := Live(reliable=reliable, on_report=on_report, on_note=on_note)]
+        executor = make_executor()
+        executor.add_node(node)
+        began, noted = time.monotonic(), False
+        while not node.known.done():
+            executor.spin_until_future_complete(node.known, timeout_sec=SPIN_SLICE)
+            waited = time.monotonic() - began
+            if timeout is not None and waited > timeout and not node.known.done():
+                raise InputError(f"after {timeout:g} s {_nobody()}: is one running there, or being played?")
+            if waited > PATIENCE and not noted and not node.known.done():
+                noted = True
+                on_note(f"{_nobody()} yet: waiting for one")
+        node.follow()
+        while not node.done.done():
+            executor.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
+    except (KeyboardInterrupt, SystemExit):
+        pass
+    finally:
+        watched = nodes[0].watched() if nodes else None
+        leave(nodes, complete=False)
+    return watched
+
+
+def _nobody() -> str:
+    domain, reach = os.environ.get("ROS_DOMAIN_ID", "0"), os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    return f"no network in ROS_DOMAIN_ID {domain}, within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}"

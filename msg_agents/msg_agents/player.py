@@ -1,0 +1,399 @@
+"""The player: publishes the messages of a bag again."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import os
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from builtin_interfaces.msg import Time
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+from rclpy.time_source import CLOCK_TOPIC
+from rosgraph_msgs.msg import Clock
+
+from msg_agents.keyboard import Keyboard
+from msg_agents.playclock import SECOND, PlayClock
+from msg_agents.process import leave
+from msg_agents.qos import LATCHED, STREAM
+from msg_agents.quiet import QuietNode
+from msg_agents.selection import parse_remaps, select_topics
+from msg_analysis.bags.playback import BagTopic, Message, Playback
+from msg_analysis.errors import InputError
+
+POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
+SETTLED = 0.8  # s in which nobody new is found: then those who are there already have been
+SETTLE_LIMIT = 5.0  # s for which to look for more
+LOOK = 0.05  # s between two looks at the keyboard
+SHOW = 0.2  # s between two reports of progress
+ACK_SLICE = 0.2  # s
+PATIENCE = 5.0  # s in which readers acknowledge the end; the middleware may ask for that no sooner than after 3 s
+BLOCKED = 0.05  # s that one message takes to publish, from which on it is a reader who holds the player back
+RATE_STEP = 1.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlayOptions:
+    """How a bag is played.
+
+    Attributes
+    ----------
+    rate : seconds of the bag per second; inf: as fast as the readers take it
+    start_offset, duration : s of the bag left out at the beginning, and played (None: all of the rest)
+    loop : whether to begin again at the end
+    paused : whether to stand at first
+    clock : Hz at which ``/clock`` is published; None: not
+    topics, exclude : see ``select_topics``
+    remaps : see ``parse_remaps``
+    subscribers : how many readers every topic must have before it begins
+    readers : names of nodes that must read every topic before it begins
+    wait_timeout : s to wait for them
+    """
+
+    rate: float = 1.0
+    start_offset: float = 0.0
+    duration: float | None = None
+    loop: bool = False
+    paused: bool = False
+    clock: float | None = None
+    topics: Sequence[str] = ()
+    exclude: Sequence[str] = ()
+    remaps: Sequence[str] = ()
+    subscribers: int = 0
+    readers: Sequence[str] = ()
+    wait_timeout: float = 30.0
+
+
+@dataclass(slots=True)
+class Played:
+    """What has been played so far.
+
+    Attributes
+    ----------
+    messages : published
+    seconds : of the wall, since the first
+    held_back : s of them in which readers did not take what was published
+    now : time of the bag, s from its start
+    length : s of the bag, all of it
+    rate : at which it is played
+    paused : whether it stands
+    """
+
+    messages: int = 0
+    seconds: float = 0.0
+    held_back: float = 0.0
+    now: float = 0.0
+    length: float = 0.0
+    rate: float = 1.0
+    paused: bool = False
+
+
+class Player(QuietNode):
+    """Publishes the messages of a bag: the same bytes, in the same order on each topic, and none is lost.
+
+    All topics are reliable and keep-all, whatever they were recorded with: any reader gets them then, and one that does
+    not keep up holds the player back. Those recorded as latched are latched. In this node nothing is ever received, so
+    nothing spins.
+
+    Parameters
+    ----------
+    bag : to be played
+    options : how
+    keyboard : for pause, step and rate
+    on_progress : told a few times a second how far it is
+    on_note : told what somebody should know
+    """
+
+    def __init__(
+        self,
+        *,
+        bag: Playback,
+        options: PlayOptions,
+        keyboard: Keyboard,
+        on_progress: Callable[[Played], None],
+        on_note: Callable[[str], None],
+    ) -> None:
+        super().__init__("player")
+        self._bag, self._options, self._keyboard = bag, options, keyboard
+        self._on_progress, self._on_note = on_progress, on_note
+        self._first = bag.start + round(options.start_offset * SECOND)
+        self._last = bag.end
+        if options.duration is not None:
+            self._last = min(self._last, self._first + round(options.duration * SECOND))
+        if self._first > bag.end:
+            length = (bag.end - bag.start) / SECOND
+            raise InputError(f"--start-offset: {options.start_offset:g} s: the bag is only {length:g} s long")
+        chosen = select_topics(bag.topics, options.topics, options.exclude)
+        if options.clock is not None and CLOCK_TOPIC in chosen:
+            chosen.remove(CLOCK_TOPIC)
+            on_note(f"{CLOCK_TOPIC} of the bag is not played: --clock publishes its own")
+        types = self._types([bag.topics[name] for name in chosen])
+        names = parse_remaps(options.remaps, chosen)
+        self._latched = {name for name in types if bag.topics[name].latched}
+        self._writers: dict[str, Publisher] = {}
+        for name, kind in types.items():
+            try:
+                qos = LATCHED if name in self._latched else STREAM
+                self._writers[name] = self.create_publisher(kind, names[name], qos)
+            except InvalidTopicNameException as error:
+                raise InputError(f"--remap: {name}:={names[name]}: {error}") from error
+        self._check_types()
+        self._ticker = self.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock else None
+        self._time = PlayClock(self._first, options.rate, paused=options.paused)
+        self._steps = 0  # messages to be played one by one
+        self._began = self._shown = self._looked = self._ticked = 0.0
+        self.played = Played(length=(bag.end - bag.start) / SECOND)
+
+    def play(self) -> None:
+        """Play the bag, once or for ever.
+
+        Raises
+        ------
+        InputError : readers that were to be waited for did not come
+        """
+        early = self._publish_early()
+        self._find_readers()
+        self._time.jump(self._first)
+        self._began = time.monotonic()
+        skip = early
+        while True:
+            self._play_once(skip)
+            skip = 0
+            if not self._options.loop:
+                break
+            self._time.jump(self._first)
+        self._wait_until_taken()
+
+    def _publish_early(self) -> int:
+        """Publish what a latched topic holds at the start, before anything else; how many messages these are.
+
+        Whoever needs it to know what else to read (which run it is, for example) can then get ready in time.
+        """
+        count = 0
+        if self._latched:
+            for message in self._bag.messages(self._latched, self._first):
+                self.publish(self._writers[message.topic], message.data)
+                count += 1
+        self.played.messages += count
+        return count
+
+    def _play_once(self, early: int) -> None:
+        """Play the bag, without so many messages of latched topics at the beginning, which have been published."""
+        for message in self._bag.messages(self._writers.keys(), self._last):
+            latched = message.topic in self._latched
+            if latched and early:
+                early -= 1
+                continue
+            if message.time < self._first and not latched:
+                continue
+            self._wait_for(message)
+            before = time.monotonic()
+            self.publish(self._writers[message.topic], message.data)
+            took = time.monotonic() - before
+            if took > BLOCKED:
+                self._time.hold(took)
+                self.played.held_back += took
+            self.played.messages += 1
+
+    def _wait_for(self, message: Message) -> None:
+        """Until it is its turn, see to everything else."""
+        while True:
+            now = time.monotonic()
+            wait = self._time.until(message.time)
+            if wait <= 0 and now < self._looked + LOOK and (self._ticker is None or now < self._next_tick()):
+                return
+            self._look_around(now, message.time)
+            wait = self._time.until(message.time)
+            if self._steps and wait > 0:
+                self._steps -= 1
+                self._time.jump(message.time)
+                return
+            if wait <= 0:
+                return
+            soonest = min(wait, LOOK) if self._ticker is None else min(wait, LOOK, self._next_tick() - now)
+            self._press(self._keyboard.wait(soonest), message.time)
+
+    def _look_around(self, now: float, next_time: int) -> None:
+        self._looked = now
+        self._press(self._keyboard.wait(0.0), next_time)
+        here = self._time.now(next_time)
+        if self._ticker is not None and now >= self._next_tick():
+            self._ticked = now
+            seconds, nanoseconds = divmod(here, SECOND)
+            self._ticker.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+        if now >= self._shown + SHOW:
+            self._shown = now
+            self._report(here)
+
+    def _next_tick(self) -> float:
+        """When ``/clock`` is to be published again."""
+        return self._ticked + 1.0 / (self._options.clock or math.inf)
+
+    def _press(self, keys: Iterable[str], next_time: int) -> None:
+        for key in keys:
+            if key == "space":
+                self._time.pause(not self._time.paused, next_time)
+            elif key == "step":
+                self._time.pause(True, next_time)
+                self._steps += 1
+            else:
+                self._time.change_rate(RATE_STEP if key == "up" else 1 / RATE_STEP, next_time)
+
+    def _report(self, here: int) -> None:
+        played = self.played
+        played.seconds = time.monotonic() - self._began
+        played.now = (here - self._bag.start) / SECOND
+        played.rate, played.paused = self._time.rate, self._time.paused
+        self._on_progress(played)
+
+    def _types(self, topics: Iterable[BagTopic]) -> dict[str, Any]:
+        """Message classes of the topics that can be played, by name; the others are noted."""
+        found, unplayable = {}, []
+        for topic in topics:
+            if topic.encoding != "cdr":
+                unplayable.append(
+                    f"{topic.name} (its messages are {topic.encoding or 'of no known encoding'}, not cdr)"
+                )
+                continue
+            try:
+                found[topic.name] = message_class(topic.type_name)
+            except (ImportError, AttributeError, ValueError):
+                unplayable.append(f"{topic.name} (the type {topic.type_name or '?'} is not installed here)")
+        if unplayable and (self._options.topics or not found):
+            raise InputError(f"cannot be played: {', '.join(unplayable)}: install it, or leave it out with --exclude")
+        for line in unplayable:
+            self._on_note(f"not played: {line}")
+        return found
+
+    def _check_types(self) -> None:
+        """The bytes mean something else under another definition of a type of that name."""
+        for name, publisher in self._writers.items():
+            recorded = self._bag.topics[name].type_hash
+            ours = {
+                str(info.topic_type_hash)
+                for info in self.get_publishers_info_by_topic(publisher.topic_name)
+                if info.node_name == self.get_name()
+            }
+            if recorded and ours and recorded not in ours:
+                raise InputError(
+                    f"topic {name}: was recorded with another definition of {self._bag.topics[name].type_name} than is "
+                    f"installed here ({recorded}, here {ours.pop()}): install that version, or leave it out with "
+                    "--exclude"
+                )
+
+    def _find_readers(self) -> None:
+        """Wait for those who are asked for, and in any case until those who are there have been found.
+
+        Latched topics need not be waited for: who reads them gets all of them.
+        """
+        names = self._writers.keys() - self._latched or self._writers.keys()
+        began = changed = time.monotonic()
+        counts: list[int] = []
+        while True:
+            now, missing = time.monotonic(), self._missing(sorted(names))
+            before, counts = counts, [each.get_subscription_count() for each in self._writers.values()]
+            if counts != before:
+                changed = now
+            if not missing and (now > changed + SETTLED or now > began + SETTLE_LIMIT):
+                break
+            if missing and now > began + self._options.wait_timeout:
+                raise InputError(
+                    f"after {self._options.wait_timeout:g} s {'; '.join(missing)}. Are they running, in the same "
+                    f"ROS_DOMAIN_ID ({os.environ.get('ROS_DOMAIN_ID', '0')}) and within ROS_AUTOMATIC_DISCOVERY_RANGE "
+                    f"({os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')})?"
+                )
+            self._press(self._keyboard.wait(POLL), self._first)
+        others = [each.topic_name for each in self._writers.values() if self.count_publishers(each.topic_name) > 1]
+        if others:
+            self._on_note(f"somebody else publishes too: {', '.join(others)}")
+
+    def _missing(self, names: Iterable[str]) -> list[str]:
+        """What is missing to begin, in words."""
+        few, without = [], dict[str, list[str]]()
+        for name in names:
+            publisher = self._writers[name]
+            count = publisher.get_subscription_count()
+            if count < self._options.subscribers:
+                few.append(f"{publisher.topic_name} ({count})")
+            if self._options.readers:
+                infos = self.get_subscriptions_info_by_topic(publisher.topic_name)
+                here = {info.node_name for info in infos}
+                here |= {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos}
+                for reader in self._options.readers:
+                    if reader not in here or count < 1:
+                        without.setdefault(reader, []).append(publisher.topic_name)
+        lines = [f"fewer than {self._options.subscribers} read {', '.join(few)}"] if few else []
+        return lines + [f"{reader} did not read {', '.join(topics)}" for reader, topics in without.items()]
+
+    def _wait_until_taken(self) -> None:
+        """Until all readers have acknowledged everything: what they have not would go with this process."""
+        self._report(self._last)
+        waiting = list(self._writers.values())
+        began, noted = time.monotonic(), False
+        while waiting:
+            each_waits = Duration(seconds=ACK_SLICE / len(waiting))
+            waiting = [writer for writer in waiting if not writer.wait_for_all_acked(each_waits)]
+            if waiting and not noted and time.monotonic() > began + PATIENCE:
+                noted = True
+                names = ", ".join(writer.topic_name for writer in waiting)
+                self._on_note(f"waiting until the readers of {names} have taken all")
+
+
+def message_class(type_name: str) -> Any:
+    """Class of a message type, ``package/msg/Name``.
+
+    Raises
+    ------
+    ImportError, AttributeError, ValueError : there is none of this name here
+    """
+    package, kind, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), name)
+
+
+def play(
+    path: Path,
+    options: PlayOptions,
+    *,
+    on_progress: Callable[[Played], None] = lambda _: None,
+    on_note: Callable[[str], None] = lambda _: None,
+) -> Played:
+    """Play a bag in this process; what has been played comes back, also when that was interrupted.
+
+    Parameters
+    ----------
+    path : of the bag, or of one of its files
+    options : how
+    on_progress : told a few times a second how far it is
+    on_note : told what somebody should know
+
+    Raises
+    ------
+    BagError, InputError : no bag, or it cannot be played like that
+    KeyboardInterrupt, SystemExit : by Ctrl-C or another signal
+    """
+    bag = Playback(path)
+    for line in bag.damage:
+        on_note(line)
+    known = len(bag.damage)
+    # Python's own handlers: this process only sleeps and publishes, and can end anywhere.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    nodes: list[Player] = []
+    complete = False
+    try:
+        with Keyboard() as keyboard:
+            nodes = [Player(bag=bag, options=options, keyboard=keyboard, on_progress=on_progress, on_note=on_note)]
+            nodes[0].play()
+            complete = True
+    finally:
+        for line in bag.damage[known:]:
+            on_note(line)
+        leave(nodes, complete=complete)
+    return nodes[0].played

@@ -1,0 +1,191 @@
+"""The order in which the messages of a bag are played, against sorting all of them, and against MCAP's own reader."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from msg_analysis.bags import playback
+from msg_analysis.bags.playback import Playback
+from msg_analysis.errors import BagError
+
+QOS = "- history: keep_all\n  reliability: reliable\n  durability: {}\n"
+
+
+def write(path: Path, messages: list[tuple[str, int]], *, qos: str = "", **options: Any) -> None:
+    """A file with these messages: topic and log time; their data are their numbers."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **({"chunk_size": 200, "compression": CompressionType.ZSTD} | options))
+        writer.start(profile="ros2")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channels: dict[str, int] = {}
+        for number, (topic, time) in enumerate(messages):
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos})
+            writer.add_message(channels[topic], time, number.to_bytes(20, "little"), time)
+        writer.finish()
+
+
+def played(path: Path, *topics: str, until: int = 2**63) -> list[tuple[str, int, int]]:
+    bag = Playback(path)
+    found = bag.messages(topics or list(bag.topics), until)
+    return [(message.topic, message.time, int.from_bytes(message.data, "little")) for message in found]
+
+
+def expected(messages: list[tuple[str, int]]) -> list[tuple[str, int, int]]:
+    """By sorting everything at once."""
+    newest: dict[str, int] = {}
+    order = []
+    for number, (topic, time) in enumerate(messages):
+        newest[topic] = max(time, newest.get(topic, 0))
+        order.append((newest[topic], number, topic))
+    return [(topic, time, number) for time, number, topic in sorted(order)]
+
+
+def disorder(seed: int, spread: int, count: int = 400) -> list[tuple[str, int]]:
+    """Times that rise, but for some disorder, and a topic that is far ahead of the others."""
+    rng = random.Random(seed)
+    messages = [(rng.choice(["/a", "/b", "/c"]), 1000 + 10 * i + rng.randrange(spread)) for i in range(count)]
+    for i in range(0, count, 50):
+        messages.insert(i, ("/ahead", 1500 + 20 * i))
+    return messages
+
+
+@pytest.mark.parametrize("spread", [1, 60, 2000])
+@pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"use_statistics": False}, {"index_types": 0}])
+def test_order(tmp_path: Path, spread: int, options: dict[str, Any]) -> None:
+    """In chunks, loose, and without a summary that could be relied on."""
+    if options == {"index_types": 0}:
+        from mcap.writer import IndexType
+
+        options = {"index_types": IndexType.NONE}
+    for seed in range(5):
+        messages = disorder(seed, spread)
+        write(tmp_path / f"{seed}.mcap", messages, **options)
+        assert played(tmp_path / f"{seed}.mcap") == expected(messages)
+
+
+def test_where_topics_are_in_order_it_is_that_of_mcaps_reader(tmp_path: Path) -> None:
+    messages = disorder(1, 10)
+    write(tmp_path / "bag.mcap", messages)
+    with (tmp_path / "bag.mcap").open("rb") as stream:
+        theirs = [
+            (channel.topic, message.log_time, int.from_bytes(message.data, "little"))
+            for _, channel, message in make_reader(stream).iter_messages(log_time_order=True)
+        ]
+    ours = played(tmp_path / "bag.mcap")
+    assert [entry[:2] for entry in ours] == [entry[:2] for entry in theirs]
+    assert sorted(ours) == sorted(theirs)
+
+
+def test_several_files_overlap(tmp_path: Path) -> None:
+    messages = disorder(3, 500)
+    write(tmp_path / "bag_0.mcap", messages[:150])
+    write(tmp_path / "bag_1.mcap", messages[150:200], use_chunking=False)
+    write(tmp_path / "bag_2.mcap", messages[200:])
+    found = [(topic, time) for topic, time, _ in played(tmp_path)]
+    assert found == [(topic, time) for topic, time, _ in expected(messages)]
+
+
+def test_time_0_is_a_time(tmp_path: Path) -> None:
+    """Chunks whose messages are all of time 0 look like empty ones."""
+    messages = [("/a", 5), *[("/b", 0)] * 30, ("/a", 6), *[("/c", 0)] * 30]
+    write(tmp_path / "bag.mcap", messages)
+    assert played(tmp_path / "bag.mcap") == expected(messages)
+
+
+def test_selection_and_end(tmp_path: Path) -> None:
+    messages = disorder(4, 60)
+    write(tmp_path / "bag.mcap", messages)
+    some = [entry for entry in expected(messages) if entry[0] == "/b" and entry[1] <= 2000]
+    assert played(tmp_path / "bag.mcap", "/b", until=2000) == some
+
+
+def test_a_bag_far_out_of_order_does_not_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last message is the earliest: the order gives way, and nothing is lost."""
+    monkeypatch.setattr(playback, "MOST_HELD", 1000)
+    messages = [("/a", 1000 + i) for i in range(300)] + [("/b", 1)]
+    write(tmp_path / "bag.mcap", messages)
+    found = played(tmp_path / "bag.mcap")
+    assert sorted(found) == sorted(expected(messages))
+    assert found[0][0] == "/a"
+    assert [entry for entry in found if entry[0] == "/a"] == [entry for entry in expected(messages) if entry[0] == "/a"]
+
+
+def test_what_is_known_of_a_bag(tmp_path: Path) -> None:
+    messages = [("/a", 7), ("/b", 3), ("/a", 9)]
+    write(tmp_path / "bag.mcap", messages, qos=QOS.format("transient_local"))
+    bag = Playback(tmp_path / "bag.mcap")
+    assert (bag.start, bag.end, bag.damage) == (3, 9, [])
+    assert {name: (topic.messages, topic.latched) for name, topic in bag.topics.items()} == {
+        "/a": (2, True),
+        "/b": (1, True),
+    }
+    assert bag.topics["/a"].type_name == "std_msgs/msg/String"
+    assert bag.topics["/a"].encoding == "cdr"
+
+
+@pytest.mark.parametrize(
+    ("qos", "latched"),
+    [
+        ("", False),
+        (QOS.format("volatile"), False),
+        (QOS.format(1), True),
+        (QOS.format(2), False),
+        ("[", False),
+        ("3", False),
+    ],
+)
+def test_latched_in_words_and_numbers(tmp_path: Path, qos: str, latched: bool) -> None:
+    write(tmp_path / "bag.mcap", [("/a", 1)], qos=qos)
+    assert Playback(tmp_path / "bag.mcap").topics["/a"].latched is latched
+
+
+def test_torn_and_damaged(tmp_path: Path) -> None:
+    """Cut off: what is whole is played. A flipped byte in a chunk: the other chunks are."""
+    messages = disorder(5, 1)
+    file = tmp_path / "bag.mcap"
+    write(file, messages, compression=CompressionType.NONE)
+    whole = file.read_bytes()
+    order = expected(messages)
+    for part in (0.1, 0.3, 0.5):
+        file.write_bytes(whole[: int(part * len(whole))])
+        bag = Playback(file)
+        assert "bag.mcap: " in bag.damage[0]
+        found = played(file)
+        assert 0 < len(found) < len(order)
+        numbers = {number for _, _, number in found}
+        assert numbers == set(range(len(numbers)))
+        assert found == [entry for entry in order if entry[2] in numbers]
+    at = whole.index((100).to_bytes(20, "little"))
+    file.write_bytes(whole[:at] + b"\xff" + whole[at + 1 :])
+    bag = Playback(file)
+    found = [int.from_bytes(message.data, "little") for message in bag.messages(list(bag.topics))]
+    assert bag.damage == [f"{file}: damaged chunks that are left out: 1"]
+    assert 100 not in found
+    assert len(messages) - 10 < len(found) < len(messages)
+
+
+def test_nothing_to_play(tmp_path: Path) -> None:
+    write(tmp_path / "bag.mcap", [])
+    with pytest.raises(BagError, match=r"bag\.mcap: has no messages: there is nothing to play"):
+        Playback(tmp_path / "bag.mcap")
+    with pytest.raises(BagError, match="not found"):
+        Playback(tmp_path / "none")
+
+
+def test_two_types_on_a_topic(tmp_path: Path) -> None:
+    with (tmp_path / "bag.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for name in ("one/msg/A", "two/msg/B"):
+            schema = writer.register_schema(name, "ros2msg", b"")
+            writer.add_message(writer.register_channel("/a", "cdr", schema), 1, b"", 1)
+        writer.finish()
+    with pytest.raises(BagError, match="topic /a: its messages are one/msg/A and two/msg/B"):
+        Playback(tmp_path / "bag.mcap")

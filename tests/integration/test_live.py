@@ -1,0 +1,130 @@
+"""A network that is watched, running or played, by a process of its own."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from msg_agents.domain import free_domain
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.store import write_trajectory
+from msg_analysis.inference.compare import compare
+from msg_analysis.twin import simulate
+
+LISTENER = """
+import json
+import rclpy
+from msg_agents_interfaces.msg import Estimate
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+rclpy.init()
+node = rclpy.create_node("listener")
+found = []
+qos = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+node.create_subscription(Estimate, "estimate", found.append, qos)
+while not found or found[-1].steps < 300:
+    rclpy.spin_once(node, timeout_sec=1.0)
+last = found[-1]
+system = [last.system_error, last.system_predicted, last.system_standard_error]
+stamp = [last.header.stamp.sec, last.header.stamp.nanosec]
+print(json.dumps([bytes(last.run).hex(), last.first_step, last.last_step, *system, list(last.node_errors), *stamp]))
+"""
+
+
+@pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    with free_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        yield number
+
+
+def ended(process: subprocess.Popen[str], code: int = 0) -> tuple[str, str]:
+    stdout, stderr = process.communicate(timeout=90)
+    assert process.returncode == code, stdout + stderr
+    assert "Traceback" not in stderr
+    return stdout, stderr
+
+
+def test_a_replay_gives_the_numbers_of_the_comparison(network: Any, domain: int) -> None:
+    """To 1e-9, on stdout and on the topic; the same with the bag's own numbers taken from elsewhere."""
+    trajectory = simulate(network.experiment(noise={"process": 1.0, "loss": 0.05}))
+    bag = network.directory / "bag"
+    write_trajectory(trajectory, bag)
+    live = network.start("live", "--reliable", "--json", "--timeout", "60")
+    listener = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE, text=True)
+    ended(network.start("play", bag, "--rate", "max", "--await", "live"))
+    stdout, _ = ended(live)
+    found, wanted = json.loads(stdout), compare(read_bag(bag)).to_json()
+    heard = json.loads(listener.communicate(timeout=60)[0])
+    assert (found["run"], found["experiment"], found["refused"]) == (wanted["run"], "net", {})
+    assert (found["first_step"], found["last_step"], found["steps"], found["missing"]) == (0, 299, 300, 0)
+    for ours, theirs in zip(
+        [found["system_error"], *found["node_errors"]], [wanted["system_error"], *wanted["node_errors"]], strict=True
+    ):
+        for key in ("measured", "predicted", "standard_error", "z", "p"):
+            assert ours[key] == pytest.approx(theirs[key], rel=1e-9), key
+    assert heard[:3] == [trajectory.record.run.hex, 0, 299]
+    system = wanted["system_error"]
+    assert heard[3:6] == pytest.approx([system[key] for key in ("measured", "predicted", "standard_error")], rel=1e-9)
+    assert heard[6] == pytest.approx([node["measured"] for node in wanted["node_errors"]], rel=1e-9)
+    assert heard[7:] == [14, 950_000_000]
+
+
+def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> None:
+    """It comes before the run. Whatever it missed, it says so; the run itself is as ever."""
+    live = network.start("live", "--reliable")
+    assert "waiting for one" in live.stderr.readline()
+    result = network.run(network.experiment(run={"processes": 2, "duration": 200}), domain=domain)
+    assert result.failures == []
+    assert result.trajectory.completeness.complete
+    last = ended(live)[0].splitlines()[-1]
+    assert last.startswith("step 4000 of 4000, system error ")
+    assert re.search(r", \d+ steps( since step \d+)?, \d+ missing, ", last)
+    measured = float(last.split("system error ")[1].split()[0])
+    assert measured == pytest.approx(compare(result.trajectory).system_error.measured, rel=0.5)
+
+
+def test_a_watcher_that_is_stopped_holds_nobody_up(network: Any, domain: int) -> None:
+    """By default nobody waits for it: it misses states, and says how many steps that makes."""
+    bag = network.directory / "bag"
+    write_trajectory(simulate(network.experiment(run={"duration": 400})), bag)
+    live = network.start("live")
+    play = network.start("play", bag, "--rate", "50", "--await", "live")
+    for _ in range(4):  # by then it has acknowledged the experiment
+        wait_for_steps(live)
+    live.send_signal(signal.SIGSTOP)
+    ended(play)
+    live.send_signal(signal.SIGCONT)
+    stdout, stderr = live.communicate(timeout=60)
+    assert live.returncode in (0, 3), stderr  # it may have missed the last step
+    assert re.search(r"system error [\d.]+ \+- [\d.]+, predicted [\d.]+, z = [+-][\d.]+, \d+ steps", stdout)
+
+
+def wait_for_steps(live: subprocess.Popen[str]) -> None:
+    """Until it has something to say."""
+    assert live.stdout
+    while " steps" not in (line := live.stdout.readline()):
+        assert line, live.communicate()
+
+
+def test_interrupted_it_says_what_it_has(network: Any, domain: int) -> None:
+    """Exit code 3: not seen to the end. Without any network too."""
+    bag = network.directory / "bag"
+    write_trajectory(simulate(network.experiment()), bag)
+    live, play = network.start("live"), network.start("play", bag, "--rate", "0.5", "--await", "live")
+    alone = network.start("live", "--domain", "232")
+    wait_for_steps(live)
+    live.send_signal(signal.SIGINT)
+    ended(live, 3)
+    play.send_signal(signal.SIGINT)
+    ended(play, 130)
+    assert "waiting for one" in alone.stderr.readline()
+    alone.send_signal(signal.SIGTERM)
+    assert "no network was seen" in ended(alone, 3)[1]
+    assert "after 1 s no network in ROS_DOMAIN_ID" in ended(network.start("live", "--timeout", "1"), 2)[1]
