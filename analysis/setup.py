@@ -43,6 +43,7 @@ setup(
         "rich",
         "scipy",
         "threadpoolctl",
+        "lz4",
         "zstandard",
     ],
     entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli:main"]},

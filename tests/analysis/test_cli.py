@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "tests/data/golden"
 LINE_RING = str(GOLDEN / "line_ring.yaml")
 HEAVY = ["numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich"]
-COMMANDS = ["compare", "facts", "info", "predict", "schema", "simulate", "transient"]
+COMMANDS = ["compare", "facts", "info", "predict", "salvage", "schema", "simulate", "transient"]
 
 
 def call(*arguments: str | Path) -> Result:
@@ -204,6 +204,72 @@ def test_info_of_a_bag(bag: Path) -> None:
     (mcap,) = bag.glob("*.mcap")
     assert json.loads(call("info", mcap, "--json").stdout)["run"] == document["run"]
     assert "complete: 5005 of 5005" in call("info", bag).stdout
+
+
+def test_simulate_compresses_and_splits(tmp_path: Path) -> None:
+    result = call(
+        *("simulate", LINE_RING, "--duration", "50", "--out", tmp_path / "bag", "--compression", "lz4"),
+        *("--split-size", "0.1"),
+    )
+    assert result.exit_code == 0, result.output
+    document = json.loads(call("info", tmp_path / "bag", "--json").stdout)
+    bags = [file for file in document["files"] if file["name"].endswith(".mcap")]
+    assert len(bags) > 1
+    assert {file["compression"] for file in bags} == {"lz4"}
+    assert sum(file["messages"] for file in bags) == sum(topic["messages"] for topic in document["topics"])
+
+
+@pytest.mark.parametrize(
+    "options", [["--compression", "zip"], ["--split-size", "0"], ["--split-size", "nan"], ["--split-size", "inf"]]
+)
+def test_storage_options_are_checked(options: list[str], tmp_path: Path) -> None:
+    result = call("simulate", LINE_RING, "--duration", "1", "--out", tmp_path / "bag", *options)
+    assert result.exit_code == 2
+    assert options[0].removeprefix("--") in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_salvage_of_a_torn_bag(bag: Path, tmp_path: Path) -> None:
+    """What is dropped is counted, nothing is overwritten, and what comes out is compared as incomplete."""
+    (mcap,) = bag.glob("*.mcap")
+    torn, out = tmp_path / "torn.mcap", tmp_path / "out"
+    data = mcap.read_bytes()
+    torn.write_bytes(data[: len(data) // 2])
+    told = json.loads(call("info", torn, "--json").stdout)
+    assert told["problem"] is None
+    assert told["files"][0]["torn"]
+    result = call("salvage", torn, out, "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["kept_bytes"] + document["dropped_bytes"] == len(data) // 2
+    assert document["kept_messages"] == told["files"][0]["messages"] > 0
+    assert document["completeness"]["missing"] == told["completeness"]["missing"] > 0
+    first = {file.name: file.read_bytes() for file in out.iterdir()}
+    again = call("salvage", torn, out)
+    assert (again.exit_code, again.stdout) == (2, "")
+    assert "exists already" in again.stderr
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == first
+    compared = call("compare", out, "--json")
+    assert compared.exit_code == 3
+    verdict = json.loads(compared.stdout)
+    assert verdict["verdict"] == "incomplete"
+    assert verdict["steps"] == document["prefix"] > 100
+    assert verdict["system_error"]["measured"] > 0
+    assert f"All states are there up to step {verdict['completeness']['stretch'][1]}" in call("compare", out).stdout
+    shown = " ".join(call("salvage", torn, tmp_path / "two").stdout.split())
+    assert f"kept {document['kept_messages']} messages" in shown
+    assert "behind the last whole record" in shown
+
+
+def test_salvage_of_nothing(bag: Path, tmp_path: Path) -> None:
+    (mcap,) = bag.glob("*.mcap")
+    head = tmp_path / "head.mcap"
+    head.write_bytes(mcap.read_bytes()[:3000])
+    for path, reason in ((head, "no whole message"), (tmp_path / "nope", "not found"), (LINE_RING, "no MCAP file")):
+        result = call("salvage", path, tmp_path / "out")
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert reason in result.stderr
+        assert [file.name for file in tmp_path.iterdir()] == ["head.mcap"]
 
 
 def test_schema_is_the_committed_file() -> None:

@@ -14,6 +14,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from msg_agents.runner import RunResult
+from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin import simulate
 
 STEPS, AGENTS = 300, 5
@@ -133,6 +134,55 @@ def _metadata(bag: Path) -> None:
             "type_description_hash",
         ]
         assert isinstance(topic["topic_metadata"]["offered_qos_profiles"], list)
+
+
+def test_compressed_and_split(network: Any) -> None:
+    """What is asked for on the command line is what is recorded; nothing is lost at the seams."""
+    file = network.file(run={"processes": 2, "replicas": 32})
+    options = ("--compression", "lz4", "--split-size", "0.1", "--out", network.directory / "runs", "--json")
+    bag = Path(network.completed(network.start("run", file, *options))["bag"])
+    files = sorted(bag.glob("*.mcap"))
+    assert [path.name for path in files] == [f"{bag.name}_{i}.mcap" for i in range(len(files))]
+    assert len(files) > 1
+    for path in files:
+        with path.open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            summary = reader.get_summary()
+            assert summary is not None
+            assert {index.compression for index in summary.chunk_indexes} == {"lz4"}
+            assert sum(1 for _ in reader.iter_messages()) > 0
+    with AnyReader([bag]) as reader:
+        counts = {topic: info.msgcount for topic, info in reader.topics.items() if topic.endswith("state")}
+    assert counts == {f"/agent_{i}/state": STEPS + 1 for i in range(1, AGENTS + 1)}
+
+
+def test_recorder_killed_between_two_files(network: Any) -> None:
+    """The files that were finished stay as they are, the last one is salvaged, and what was run says so."""
+    file = network.file(run={"processes": 2, "replicas": 64, "duration": 5000})
+    options = ("--split-size", "0.2", "--out", network.directory / "runs")
+    run = network.start("run", file, *options)
+
+    def files() -> list[Path]:
+        found = (network.directory / "runs").glob("*/*.mcap")
+        return sorted(found, key=lambda path: int(path.stem.rpartition("_")[2]))
+
+    network.wait_for(lambda: len(files()) > 2, 60, "three files")
+    (recorder,) = network.processes("recorder")
+    recorder.kill()
+    recorded = files()
+    finished = {path: path.read_bytes() for path in recorded[:-1]}
+    _, stderr = run.communicate(timeout=150)
+    assert run.returncode == 3
+    assert "the bag was salvaged" in stderr
+    assert "Traceback" not in stderr
+    assert {path: path.read_bytes() for path in finished} == finished
+    bag = recorded[0].parent
+    trajectory = read_bag(bag)
+    assert trajectory.prefix > 100
+    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        states = sum(info.msgcount for topic, info in reader.topics.items() if topic.endswith("state"))
+        assert states == trajectory.completeness.received
+        assert sum(1 for _ in reader.messages()) == reader.message_count
 
 
 def test_the_seed_is_the_run(network: Any, result: RunResult) -> None:

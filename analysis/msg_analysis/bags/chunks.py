@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 
 from msg_analysis.types import AnyArray, IntArray
 
-LIMIT = 2**30
+LIMIT = 2**28
 """Bytes of one record or chunk; recorders write megabytes, only damage claims more."""
 
 RECORD = struct.Struct("<BQ")

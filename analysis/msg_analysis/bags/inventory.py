@@ -8,12 +8,13 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import yaml
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel
+from mcap.records import Channel, ChunkIndex
 from mcap.summary import Summary
 
 from msg_analysis.bags.mcapfile import Batch, McapFile
@@ -22,6 +23,8 @@ from msg_analysis.bags.metadata import ChannelCount, FileCount
 RECORD_LIMIT = 2**28  # bytes of a record at the end of a file; damage claims more
 _FOOTER = struct.Struct("<9xQQI8x")  # starts of the summary and of its offsets, CRC from the former on to before itself
 _BEHIND_CRC = 12
+_CHUNK = struct.Struct("<BQQQ")  # opcode, length, first and last log time
+_RECORD_HEAD = 9
 
 
 @dataclass(slots=True)
@@ -113,16 +116,24 @@ def summary_of(file: Path) -> Summary | None:
             if crc and crc != zlib.crc32(stream.read()[:-_BEHIND_CRC]):  # the library does not look
                 return None
             stream.seek(0)
-            return SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary()
+            summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary()
+            return summary if summary and all(_is_there(stream, index) for index in summary.chunk_indexes) else None
     except Exception:  # the library reports damage by whatever goes wrong in it
         return None
+
+
+def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
+    """Whether there is a chunk where its index says."""
+    stream.seek(index.chunk_start_offset)
+    expected = (Opcode.CHUNK, index.chunk_length - _RECORD_HEAD, index.message_start_time, index.message_end_time)
+    return _CHUNK.unpack(stream.read(_CHUNK.size)) == expected
 
 
 def channel_count(channel: Channel, type_name: str) -> ChannelCount:
     """A topic without messages yet, as an MCAP channel describes it."""
     try:
         qos: Any = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "[]"))
-    except yaml.YAMLError:
+    except (ValueError, RecursionError, yaml.YAMLError):
         qos = []
     type_hash = channel.metadata.get("topic_type_hash", "")
     return ChannelCount(channel.topic, type_name, type_hash, qos if isinstance(qos, list) else [])

@@ -165,6 +165,9 @@ class McapFile:
                 return
             opcode, length = RECORD.unpack(head)
             content = b""
+            if not opcode:  # a power cut leaves zeros
+                self.torn = f"no record at byte {self.whole_bytes}, where one should be"
+                return
             if length <= min(LIMIT, size - self.whole_bytes):
                 content = stream.read(length)
             if len(content) < length:
@@ -214,7 +217,7 @@ class McapFile:
         while at < end:
             opcode, length = RECORD.unpack_from(data, at)
             at += RECORD.size
-            if length > end - at:
+            if length > end - at or not opcode:
                 raise DamageError
             if opcode == Opcode.MESSAGE:
                 yield at, length

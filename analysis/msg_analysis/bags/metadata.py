@@ -17,6 +17,7 @@ _ROOT = "rosbag2_bagfile_information"
 # Those in C, where PyYAML has them: a network of 1000 agents has 30,000 lines.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DEEPEST = 50
 _NEVER = 2**63 - 1  # what rosbag2 writes as the start of a bag without messages
 
 
@@ -146,6 +147,16 @@ def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
     temporary.replace(directory / METADATA_FILE)
 
 
+def _load(text: str) -> Any:
+    """The document. PyYAML's loader in C does not survive deep nesting, so that is looked for first."""
+    depth = 0
+    for event in yaml.parse(text, _LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _DEEPEST:
+            raise yaml.YAMLError(f"nested more than {_DEEPEST} deep")
+    return yaml.load(text, _LOADER)
+
+
 def read_metadata(directory: Path) -> dict[str, Any] | None:
     """Bag information of a directory, or None where there is no metadata.yaml.
 
@@ -155,10 +166,10 @@ def read_metadata(directory: Path) -> dict[str, Any] | None:
     """
     file = directory / METADATA_FILE
     try:
-        document = yaml.load(file.read_text(encoding="utf-8"), _LOADER)
+        document = _load(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: not UTF-8, or !!int x
         raise BagError(f"{file}: cannot be read ({error}): move it away to read the .mcap files alone") from error
     information = document.get(_ROOT) if isinstance(document, dict) else None
     if not isinstance(information, dict):

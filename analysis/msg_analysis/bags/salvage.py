@@ -185,7 +185,7 @@ def _custom(entries: Sequence[FileInventory]) -> dict[str, str]:
     custom = {"complete": "false", "salvaged": "true"}
     for entry in entries:
         for record in entry.file.metadata:
-            with contextlib.suppress(ValueError, KeyError, AttributeError):  # another's record of the same name
+            with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):  # another's of that name
                 if record.name == RECORD_NAME:
                     return {"run": str(json.loads(record.metadata["record"])["run"]), **custom}
     return custom

@@ -15,6 +15,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.spec import ExperimentSpec
 
 _LONGEST_VALUE = 60
+_MOST_LINES = 100  # of problems shown; a file with more has one that was made a thousand times
 
 
 class ExperimentError(InputError):
@@ -32,7 +33,11 @@ class ExperimentError(InputError):
         if len(self.problems) == 1:
             text = f"{source}: {self.problems[0]}"
         else:
-            text = f"{source}: {len(self.problems)} problems" + "".join(f"\n  {line}" for line in self.problems)
+            text = f"{source}: {len(self.problems)} problems" + "".join(
+                f"\n  {line}" for line in self.problems[:_MOST_LINES]
+            )
+            if len(self.problems) > _MOST_LINES:
+                text += f"\n  and {len(self.problems) - _MOST_LINES} more"
         super().__init__(text)
 
 

@@ -92,7 +92,7 @@ class RunRecord:
             record = cls(uuid.UUID(document["run"]), experiment, start, dict(document["versions"]))
         except InputError:
             raise
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise InputError(f"{source}: not a run record ({type(error).__name__}: {error})") from error
         expected = (experiment.agents, experiment.width)
         if start.shape != expected or not np.isfinite(start).all():

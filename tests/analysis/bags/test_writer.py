@@ -20,8 +20,10 @@ from rosbags.rosbag2 import Reader
 from msg_analysis.bags.cdr import StateCodec, encode_string, stamp_ns
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.schemas import network_topics
+from msg_analysis.bags.storage import Storage
 from msg_analysis.bags.writer import BagWriter, recording_pid
 from msg_analysis.errors import BagError
+from msg_analysis.report.info import describe_bag
 
 RUN = bytes(range(16))
 
@@ -172,6 +174,58 @@ def test_killed_recorder_is_not_taken_for_a_living_one(tmp_path: Path) -> None:
         process.join()
     assert json.loads((tmp_path / "bag" / ".recording").read_text())["pid"] == process.pid
     assert recording_pid(tmp_path / "bag") is None
+
+
+def _record_split_until_killed(directory: str, ready: Any) -> None:
+    bag = BagWriter(Path(directory), network_topics(1), record='{"run": "abc"}', storage=Storage("none", 50_000))
+    _fill(bag, 10_000)
+    bag.flush()
+    ready.set()
+    signal.pause()
+
+
+def test_killed_in_a_later_file(tmp_path: Path) -> None:
+    """Files that were finished are whole and stay as they are; of the last one all is there that was flushed."""
+    context = multiprocessing.get_context("spawn")
+    ready = context.Event()
+    bag = tmp_path / "bag"
+    process = context.Process(target=_record_split_until_killed, args=(str(bag), ready))
+    process.start()
+    try:
+        assert ready.wait(60)
+    finally:
+        process.kill()
+        process.join()
+    files = sorted(bag.glob("*.mcap"))
+    assert [file.name for file in files] == [f"bag_{i}.mcap" for i in range(len(files))]
+    assert len(files) > 2
+    assert {file.name for file in bag.iterdir()} == {".recording", *(file.name for file in files)}
+    finished = {file.name: file.read_bytes() for file in files[:-1]}
+    for file in files[:-1]:
+        with file.open("rb") as stream:
+            summary = make_reader(stream, validate_crcs=True).get_summary()
+            assert summary is not None
+    inventory = describe_bag(bag)
+    torn = [file["torn"] for file in inventory["files"] if file["name"].endswith(".mcap")]
+    assert [reason is None for reason in torn] == [True] * len(finished) + [False]
+    report = salvage_in_place(bag)
+    assert (report.kept_messages, report.dropped_bytes) == (10_001, 0)
+    assert {name: (bag / name).read_bytes() for name in finished} == finished
+    assert {file.name for file in bag.iterdir()} == {"metadata.yaml", *(file.name for file in files)}
+    with AnyReader([bag]) as reader:
+        assert reader.message_count == 10_001
+        found = [reader.deserialize(raw, c.msgtype).step for c, _, raw in reader.messages() if c.topic != "/experiment"]
+    assert found == list(range(10_000))
+    information = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert information["custom_data"] == {"run": "abc", "complete": "false", "salvaged": "true"}
+
+
+def test_a_head_larger_than_a_file_should_be(tmp_path: Path) -> None:
+    """The record of a large network may be: still a file holds more than a message."""
+    record = json.dumps({"run": "abc", "start": "x" * 200_000})
+    with BagWriter(tmp_path / "bag", network_topics(1), record=record, storage=Storage("zstd", 100_000)) as bag:
+        _fill(bag, 4000)
+    assert len(list((tmp_path / "bag").glob("*.mcap"))) < 4
 
 
 def test_full_disk(tmp_path: Path) -> None:
