@@ -11,7 +11,7 @@ RUNS := runs
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 LOCAL := --no-index --no-deps --no-build-isolation
 
-.PHONY: help setup demo test test-fast stress lint format bench calibrate docs colcon lock clean
+.PHONY: help setup demo test test-fast stress fuzz lint format bench calibrate docs colcon lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -47,6 +47,9 @@ STRESS ?= 20
 
 stress: setup ## Repeat every random fault 20 times (STRESS=N: N times): about an hour
 	STRESS=$(STRESS) $(BIN)/python -m pytest --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py realtime.py)
+
+fuzz: setup ## Damage 20,000 bags and 20,000 experiment files: only clean errors
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py
 
 lint: setup ## Check style and types
 	$(BIN)/ruff check
