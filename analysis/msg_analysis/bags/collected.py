@@ -16,9 +16,11 @@ from msg_analysis.errors import BagError
 from msg_analysis.model.air import LOST
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import Wiring, build_model
+from msg_analysis.model.validation import amount, available_memory
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
 _NEVER = np.zeros(1, dtype=np.bool_)
+_OTHER_COLUMNS = 4  # numbers of 8 bytes that are kept, or made on the way, of each state beside what it says
 
 
 class Collector:
@@ -147,7 +149,11 @@ class Collected:
         self._links = _Links(build_model(experiment), experiment.steps) if watched else None
         most = self._links.most if self._links else 0
         cells = self._shape[0] * self._shape[1]
+        # The record alone says how large the result is, however little of it the bag holds.
+        needed, available = 8 * cells * (width + _OTHER_COLUMNS + most), available_memory()
         try:
+            if needed > available:
+                raise MemoryError
             # Zeros cost no memory before they are written, so 0 is nowhere a value: all are one too large until the
             # end. The place in the bag is that of the copy that was taken.
             self._position = np.zeros(cells, dtype=np.int64)
@@ -159,8 +165,8 @@ class Collected:
             self._listed = np.zeros(cells if self._links else 0, dtype=np.bool_)  # whether ``heard`` said something
         except (MemoryError, ValueError) as error:
             raise BagError(
-                f"run {record.run}: {self._shape[0]} steps of {self._shape[1]} agents do not fit into memory: "
-                "analyse it on a larger machine"
+                f"run {record.run}: {experiment.steps} steps of {experiment.agents} agents need {amount(needed)}, "
+                f"expected at most {amount(available)}, the memory available: read it on a larger machine"
             ) from error
         self._contradicted: list[IntArray] = []
         self.lost: BoolArray | None = None

@@ -20,7 +20,6 @@ from msg_analysis.bags.writer import RECORD_NAME, recording_pid
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.trajectory import Completeness, Trajectory
-from msg_analysis.model.validation import amount, available_memory
 from msg_analysis.types import IntArray
 
 # Topics are told by type and by the end of their name: the network may run in any namespace.
@@ -31,7 +30,6 @@ _TOPICS = {
     ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
     STRING.full_name: re.compile(r"(?:^|/)(experiment)$"),
 }
-_OTHER_COLUMNS = 6  # numbers of 8 bytes that are kept, or made on the way, of each state beside the state itself
 _ZSTD_FRAME, _COMPRESSED = b"\x28\xb5\x2f\xfd", "compressed message"
 _EACH_COMPRESSED = (
     "every message in it is compressed by itself, which cannot be read: convert it, or record with "
@@ -75,7 +73,6 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
         raise unreadable[0]
     contents.refused["unreadable file"] += len(unreadable)
     record = _choose(contents, path)
-    _refuse_too_large(record, path)
     return _trajectory(contents, record)
 
 
@@ -222,19 +219,6 @@ def _choose(contents: _Contents, path: Path) -> RunRecord:
         )
         raise BagError(f"{path}: {len(candidates)} runs in one bag: {listed}: record each run into a bag of its own")
     return candidates[0]
-
-
-def _refuse_too_large(record: RunRecord, path: Path) -> None:
-    """The record alone says how large the trajectory is, however little of it the bag holds."""
-    experiment = record.experiment
-    cells = (experiment.steps + 1) * experiment.agents * (2 if experiment.truth else 1)
-    needed = cells * 8 * (2 * experiment.width + _OTHER_COLUMNS)
-    available = available_memory()
-    if needed > available:
-        raise BagError(
-            f"{path}: its run of {experiment.steps} steps of {experiment.agents} agents needs {amount(needed)}, "
-            f"expected at most {amount(available)}, the memory available: read it on a larger machine"
-        )
 
 
 def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
