@@ -283,10 +283,10 @@ class Collected:
         if self._realtime:
             self._used -= 1
             self._made -= 1
-            self.used = self._used.reshape(*self._shape, -1)[1:]
+            self.used = self._used.reshape(*self._shape, self._used.shape[1])[1:]
             self.made = self._made.reshape(self._shape)
         elif self._links:
-            self.lost = self._lost.reshape(*self._shape, -1)[1:]
+            self.lost = self._lost.reshape(*self._shape, self._lost.shape[1])[1:]
 
 
 def _out_of_order(position: IntArray) -> int:
