@@ -126,7 +126,7 @@ def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list
         losses = suspects.losses(tally.pairs, tally.messages, tally.lost, tally.probability)
     if accused.broadcast:
         broadcast = suspects.variances(np.diag(accused.broadcast.scatter), accused.broadcast.samples)
-    # The classes of the noise are counted before the gains are known, and those of the rates and pairs with them.
+    # All classes are counted before anything is selected: 3 of the rates, 1 of the pairs.
     guess = suspects.noise(sums, pardoned, np.zeros(len(sums.terms)))
     groups = (gains, guess, losses, broadcast)
     families = sum(len(group.classes) for group in groups if group) + 4
@@ -181,31 +181,33 @@ def _gain_words(one: Selected, accused: Accused) -> Cause:
         shown = f"{percent(share)} ({100 * around[0]:.3g} to {100 * around[1]:.3g} %)"
         words = f"{shown} of {whose} have no effect: they are ignored, or all gains on them are that much too small"
         return Cause("ignored", words, None if part == "all" else what + 1, None, None, share, around, 0.0, p)
-    agent, link, graph = None, None, None
-    if part == "link":
-        sender, receiver, number = what
-        link, graph = (sender + 1, receiver + 1), number
-        whose = f"the gain of agent {receiver + 1} on agent {sender + 1}"
-    elif part == "edge":
-        pair, graph = what
-        first, second = sorted(pair)
-        link = (first + 1, second + 1)
-        whose = f"the gain of the edge {first + 1}-{second + 1}, both ways,"
-    elif part in ("receiver", "receiver in graph"):
-        agent, graph = what if part == "receiver in graph" else (what, None)
-        whose, agent = f"agent {agent + 1}'s gain on all that it hears", agent + 1
-    elif part == "leader":
-        whose, agent = f"agent {what + 1}'s gain as a leader", what + 1
-    else:
-        whose = {"leaders": "the gain of the leaders", "sender": "the gain on agent {}", "graph": "all gains"}.get(
-            part, "every gain"
-        )
-        whose = whose.format(what + 1) if part == "sender" else whose
-        agent, graph = (what + 1 if part == "sender" else None), (what if part == "graph" else None)
+    whose, agent, link, graph = _whose_gain(part, what)
     name = None if graph is None else names[graph]
     where = "" if name is None else f" in graph {name}"
     words = f"{whose}{where} is {_numbers(factor, interval)} times what the file says"
     return Cause("gain", words, agent, link, name, factor, interval, 1.0, p)
+
+
+def _whose_gain(part: str, what: Any) -> tuple[str, int | None, tuple[int, int] | None, int | None]:
+    """In words; agent and link from 1, graph from 0."""
+    if part == "link":
+        sender, receiver, graph = what
+        return f"the gain of agent {receiver + 1} on agent {sender + 1}", None, (sender + 1, receiver + 1), graph
+    if part == "edge":
+        pair, graph = what
+        first, second = sorted(pair)
+        return f"the gain of the edge {first + 1}-{second + 1}, both ways,", None, (first + 1, second + 1), graph
+    if part == "receiver in graph":
+        return f"agent {what[0] + 1}'s gain on all that it hears", what[0] + 1, None, what[1]
+    if part == "receiver":
+        return f"agent {what + 1}'s gain on all that it hears", what + 1, None, None
+    if part == "leader":
+        return f"agent {what + 1}'s gain as a leader", what + 1, None, None
+    if part == "sender":
+        return f"the gain of all others on agent {what + 1}", what + 1, None, None
+    if part == "graph":
+        return "every gain", None, None, what
+    return ("the gain of the leaders" if part == "leaders" else "every gain"), None, None, None
 
 
 def _noise_words(one: Selected, names: Sequence[str]) -> Cause:
