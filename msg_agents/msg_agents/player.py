@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.time_source import CLOCK_TOPIC
 from rosgraph_msgs.msg import Clock
 
+from msg_agents.errors import RCLError
 from msg_agents.keyboard import Keyboard
 from msg_agents.playclock import SECOND, PlayClock
 from msg_agents.process import leave
@@ -37,6 +38,7 @@ SHOW = 0.2  # s between two reports of progress
 ACK_SLICE = 0.2  # s
 PATIENCE = 5.0  # s in which readers acknowledge the end; the middleware may ask for that no sooner than after 3 s
 BLOCKED = 0.05  # s that one message takes to publish, from which on it is a reader who holds the player back
+REFUSED = 0.05  # s; a reader that does not keep up blocks for 100 ms
 RATE_STEP = 1.1
 
 
@@ -180,7 +182,7 @@ class Player(QuietNode):
         count = 0
         if self._latched:
             for message in self._bag.messages(self._latched, self._first):
-                self.publish(self._writers[message.topic], message.data)
+                self._send(message)
                 count += 1
         self.played.messages += count
         return count
@@ -196,12 +198,28 @@ class Player(QuietNode):
                 continue
             self._wait_for(message)
             before = time.monotonic()
-            self.publish(self._writers[message.topic], message.data)
+            self._send(message)
             took = time.monotonic() - before
             if took > BLOCKED:
                 self._time.hold(took)
                 self.played.held_back += took
             self.played.messages += 1
+
+    def _send(self, message: Message) -> None:
+        """Publish a message until it goes through; one that is refused without any waiting never will."""
+        writer = self._writers[message.topic]
+        while True:
+            before = time.monotonic()
+            try:
+                writer.handle.publish_raw(message.data)
+                return
+            except RCLError as error:
+                if time.monotonic() - before < REFUSED:
+                    kind = self._bag.topics[message.topic].type_name
+                    raise InputError(
+                        f"topic {message.topic}: a message of {len(message.data)} bytes is no {kind} "
+                        f"({error}): leave the topic out with --exclude"
+                    ) from error
 
     def _wait_for(self, message: Message) -> None:
         """Until it is its turn, see to everything else."""
