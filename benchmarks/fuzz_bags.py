@@ -155,7 +155,7 @@ def _chunk_content(data: bytes, rng: random.Random) -> bytes:
         raise _NothingToDoError from error
     inside = _bytes(inside, rng) if rng.random() < 0.6 else _inner_records(inside, rng)
     if rng.random() < 0.02:
-        inside = bytes(2**28)  # small when packed
+        inside = rng.choice([bytes(2**27), 10**6 * (_RECORD.pack(MESSAGE, 22) + bytes(22))])  # small when packed
     packed = _pack(compression, inside)
     size = rng.choice(_BIG) if rng.random() < 0.05 else len(inside)
     crc = 0 if rng.random() < 0.3 else zlib.crc32(inside)
@@ -183,7 +183,7 @@ def _inner_records(inside: bytes, rng: random.Random) -> bytes:
     starts = []
     while at + _RECORD.size <= len(inside):
         opcode, length = _RECORD.unpack_from(inside, at)
-        if length > len(inside) - at:
+        if not opcode or length > len(inside) - at:
             break
         starts += [at + _RECORD.size] if opcode == MESSAGE and length >= 90 else []
         at += _RECORD.size + length

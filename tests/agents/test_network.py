@@ -95,7 +95,7 @@ def test_names_and_commands() -> None:
         "agents_3_to_5",
         "switcher",
     ]
-    assert recorder.arguments == ("recorder", "/run.json", "--out", "/bag")
+    assert recorder.arguments == ("recorder", "/run.json", "--out", "/bag", "--compression", "zstd")
     assert first.arguments == (
         *("agent", "/run.json", "--agent", "1", "--agent", "2"),
         *("--await", "recorder"),
