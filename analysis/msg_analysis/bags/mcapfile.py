@@ -32,15 +32,17 @@ class Batch:
     data : bytes in which they are; before the CDR bytes of each message there is the rest of its record
     start, size : (messages,) where the CDR bytes begin in ``data``, and how many they are
     head : (messages,) of type ``MESSAGE_HEAD``
+    end : bytes of the file up to the end of the chunk, or of the last record, that they are from
     """
 
     data: bytes
     start: IntArray
     size: IntArray
     head: AnyArray
+    end: int
 
     @classmethod
-    def of_contents(cls, data: bytes, start: IntArray, size: IntArray) -> Batch:
+    def of_contents(cls, data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
         """From the places of the contents of their records.
 
         Raises
@@ -52,7 +54,7 @@ class Batch:
         head = gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
         if _no_time(head).any():
             raise DamageError
-        return cls(data, start + MESSAGE_HEAD.itemsize, size - MESSAGE_HEAD.itemsize, head)
+        return cls(data, start + MESSAGE_HEAD.itemsize, size - MESSAGE_HEAD.itemsize, head, end)
 
     @property
     def channel(self) -> AnyArray:
@@ -131,7 +133,7 @@ class McapFile:
         chunk: bytes | None = None
         index: list[bytes] = []  # of the chunk
         loose: list[bytes] = []
-        filled = 0  # bytes in either list
+        filled = end = 0  # bytes in either list, and of the file up to their end
         for opcode, content in self._records(stream, size):
             if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
                 filled += len(content)
@@ -139,23 +141,23 @@ class McapFile:
                     index.append(content)
                 continue
             if chunk is not None:
-                yield from self._chunk(chunk, index, zstd)
+                yield from self._chunk(chunk, index, zstd, end)
                 chunk, index, filled = None, [], 0
             if loose and (opcode == Opcode.CHUNK or filled > _LOOSE):
-                yield _loose_batch(loose)
+                yield _loose_batch(loose, end)
                 loose, filled = [], 0
             if opcode == Opcode.CHUNK:
-                chunk = content
+                chunk, end = content, self.whole_bytes
             elif opcode == Opcode.MESSAGE:
                 loose.append(content)
-                filled += len(content)
+                filled, end = filled + len(content), self.whole_bytes
             else:
                 with contextlib.suppress(DamageError):
                     self._note(opcode, content)
         if chunk is not None:
-            yield from self._chunk(chunk, index, zstd)
+            yield from self._chunk(chunk, index, zstd, end)
         if loose:
-            yield _loose_batch(loose)
+            yield _loose_batch(loose, end)
 
     def _records(self, stream: io.BufferedReader, size: int) -> Iterator[tuple[int, bytes]]:
         while True:
@@ -199,14 +201,14 @@ class McapFile:
         except Exception as error:  # the library reports damage by whatever goes wrong in it
             raise DamageError from error
 
-    def _chunk(self, content: bytes, index: list[bytes], zstd: zstandard.ZstdDecompressor) -> Iterator[Batch]:
+    def _chunk(self, content: bytes, index: list[bytes], zstd: zstandard.ZstdDecompressor, end: int) -> Iterator[Batch]:
         try:
             data = unpack(content, zstd)
             places = locate(data, index)
             if places is None:
                 walked = np.array(list(self._walk(data)), dtype=np.int64).reshape(-1, 2)
                 places = walked[:, 0], walked[:, 1]
-            batch = Batch.of_contents(data, *places)
+            batch = Batch.of_contents(data, *places, end)
         except Exception:  # decompressors and the library report damage by whatever goes wrong in them
             self.damaged_chunks += 1
             return
@@ -236,13 +238,13 @@ def _keep_memory() -> None:
     np.empty(2**24, np.uint8)
 
 
-def _loose_batch(contents: list[bytes]) -> Batch:
+def _loose_batch(contents: list[bytes], end: int) -> Batch:
     """Messages that are not in a chunk; those that are damaged are left out one by one."""
     size = np.array([len(content) for content in contents])
     data, start = b"".join(contents), np.cumsum(size) - size
     start, size = start[size >= MESSAGE_HEAD.itemsize], size[size >= MESSAGE_HEAD.itemsize]
     timed = ~_no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
-    return Batch.of_contents(data, start[timed], size[timed])
+    return Batch.of_contents(data, start[timed], size[timed], end)
 
 
 def _no_time(head: AnyArray) -> BoolArray:

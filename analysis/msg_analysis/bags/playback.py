@@ -165,7 +165,7 @@ class Playback:
                     position += 1
                     held += size
                 pending.sort()
-                low = lows.behind(file.whole_bytes)
+                low = lows.behind(batch.end)
                 ready = bisect_right(pending, min(low, until), key=lambda entry: entry[0])
                 if held > MOST_HELD:
                     ready = max(ready, len(pending) // 2)
@@ -291,7 +291,7 @@ def _outline(path: Path) -> _Outline:
             continue
         times = batch.table[:, 2]
         first, last = int(times.min()), int(times.max())
-        outline.lows.append((file.whole_bytes, first))
+        outline.lows.append((batch.end, first))
         outline.start = first if outline.start is None else min(outline.start, first)
         outline.end = last if outline.end is None else max(outline.end, last)
         for number in batch.channel.tolist():
