@@ -209,7 +209,7 @@ def _run_record(data: bytes, rng: random.Random) -> bytes:
         raise _NothingToDoError from error
     try:
         changed = mutate_text(text, rng) if rng.random() < 0.4 else json.dumps(mutate_document(json.loads(text), rng))
-    except ValueError as error:  # no JSON any more
+    except (ValueError, RecursionError) as error:  # no JSON any more
         raise _NothingToDoError from error
     if rng.random() < 0.5:
         copy.add_metadata("msg_agents", {"record": changed})
