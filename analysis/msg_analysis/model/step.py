@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,8 +50,7 @@ class Wiring:
     @property
     def transition(self) -> FloatArray:
         """(n, n) P, the law of the graph one step later."""
-        with threadpool_limits(1):
-            return self.chain.transition(self.dt)
+        return _transition(self.chain, self.dt)
 
     @property
     def stationary(self) -> FloatArray:
@@ -111,6 +111,14 @@ class StepModel(Wiring):
     loss_variance: FloatArray
     grounded: BoolArray
     reference: float
+
+
+@lru_cache(maxsize=16)
+def _transition(chain: MarkovChain, dt: float) -> FloatArray:
+    with threadpool_limits(1):
+        transition = chain.transition(dt)
+    transition.flags.writeable = False
+    return transition
 
 
 def build_model(experiment: Experiment) -> Wiring:
