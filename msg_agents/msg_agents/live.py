@@ -14,6 +14,7 @@ from builtin_interfaces.msg import Time
 from msg_agents_interfaces.msg import AgentState as AgentStateMsg
 from msg_agents_interfaces.msg import Estimate as EstimateMsg
 from msg_agents_interfaces.msg import Progress as ProgressMsg
+from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -41,6 +42,8 @@ from msg_analysis.model.record import RunRecord
 ESTIMATE_TOPIC = "estimate"
 PERIOD = 1.0  # s between two estimates
 PATIENCE = 1.0  # s after which it is said that nobody is there
+FAREWELL = 5.0  # s for readers of the last estimate to say that they have it
+SILENCE = 5  # estimates without any state, after which a run of which there is nothing but its experiment is over
 LISTEN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """How states are read by default: a writer never waits for such a reader, which misses what it is too slow for."""
 
@@ -94,6 +97,7 @@ class Live(QuietNode):
         self._topics: list[str] = []
         self._estimate: LiveEstimate | None = None
         self._before = (-1, time.monotonic())  # newest step, and when that was
+        self._silent = 0  # estimates in a row that no newer state has come before
         self._writer = self.create_publisher(EstimateMsg, ESTIMATE_TOPIC, NEWEST)
         self.create_subscription(String, EXPERIMENT_TOPIC, self._receive_experiment, LATCHED, raw=True)
         self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LATCHED, raw=True)
@@ -176,11 +180,16 @@ class Live(QuietNode):
         self._on_report(watched, (newest - before) / max(now - then, 1e-9) if before >= 0 else 0.0)
         last = watched.record.experiment.steps
         assert self._estimate is not None
+        self._silent = self._silent + 1 if newest == before else 0
         # All is there; or nothing comes any more, because the run is over or whoever published it has gone.
-        quiet = newest == before and newest >= 0
+        quiet = self._silent >= (1 if newest >= 0 else SILENCE)
         over = self._estimate.steps.whole >= last or (quiet and (self._ended or not self._anybody()))
         if over and not self.done.done():
             self.done.set_result(None)
+
+    def farewell(self) -> None:
+        """Stay until whoever reads the estimates has the last one."""
+        self._writer.wait_for_all_acked(Duration(seconds=FAREWELL))
 
     def _anybody(self) -> bool:
         return any(self.count_publishers(topic) for topic in self._topics)
@@ -248,6 +257,7 @@ def watch(
         node.follow()
         while not node.done.done():
             executor.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
+        node.farewell()
     except (KeyboardInterrupt, SystemExit):
         pass
     finally:

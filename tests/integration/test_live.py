@@ -28,6 +28,7 @@ node = rclpy.create_node("listener")
 found = []
 qos = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 node.create_subscription(Estimate, "estimate", found.append, qos)
+print("ready", flush=True)
 while not found or found[-1].steps < 300:
     rclpy.spin_once(node, timeout_sec=1.0)
 last = found[-1]
@@ -56,8 +57,10 @@ def test_a_replay_gives_the_numbers_of_the_comparison(network: Any, domain: int)
     trajectory = simulate(network.experiment(noise={"process": 1.0, "loss": 0.05}))
     bag = network.directory / "bag"
     write_trajectory(trajectory, bag)
-    live = network.start("live", "--reliable", "--json", "--timeout", "60")
     listener = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE, text=True)
+    assert listener.stdout
+    assert listener.stdout.readline() == "ready\n"
+    live = network.start("live", "--reliable", "--json", "--timeout", "60")
     ended(network.start("play", bag, "--rate", "max", "--await", "live"))
     stdout, _ = ended(live)
     found, wanted = json.loads(stdout), compare(read_bag(bag)).to_json()
@@ -80,14 +83,25 @@ def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> N
     """It comes before the run. Whatever it missed, it says so; the run itself is as ever."""
     live = network.start("live", "--reliable")
     assert "waiting for one" in live.stderr.readline()
-    result = network.run(network.experiment(run={"processes": 2, "duration": 200}), domain=domain)
+    result = network.run(network.experiment(run={"processes": 2, "duration": 1000}), domain=domain)
     assert result.failures == []
     assert result.trajectory.completeness.complete
     last = ended(live)[0].splitlines()[-1]
-    assert last.startswith("step 4000 of 4000, system error ")
+    assert last.startswith("step 20000 of 20000, system error ")
     assert re.search(r", \d+ steps( since step \d+)?, \d+ missing, ", last)
     measured = float(last.split("system error ")[1].split()[0])
     assert measured == pytest.approx(compare(result.trajectory).system_error.measured, rel=0.5)
+
+
+def test_a_run_of_which_no_state_comes_is_over(network: Any, domain: int) -> None:
+    """It ended before the watcher had found its agents, for example."""
+    bag = network.directory / "bag"
+    write_trajectory(simulate(network.experiment()), bag)
+    live = network.start("live", "--timeout", "60")
+    play = network.start("play", bag, "--topics", "/experiment", "--await", "live")
+    ended(play)
+    stdout, _ = ended(live, code=3)
+    assert "nothing has come whole yet" in stdout
 
 
 def test_a_watcher_that_is_stopped_holds_nobody_up(network: Any, domain: int) -> None:
