@@ -36,9 +36,9 @@ $(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
 	$(BIN)/msg-agents run $(EXPERIMENTS)/line_ring.yaml --out $(RUNS)
 
-# Tests of networks wait more than they work: two at a time take little longer than one.
+# Tests that start no network share the CPUs; each network has them to itself.
 test: test-fast ## Run all tests
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal -m integration
+	$(BIN)/python -m pytest -m integration
 
 test-fast: setup ## Run the tests that start no network
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto -m "not integration"

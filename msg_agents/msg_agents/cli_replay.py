@@ -257,4 +257,6 @@ def live(*, reliable: bool, timeout: float | None, as_json: bool, domain: int | 
         print_json(live_document(found.report, found.record))
     elif found.report.note and not console.is_terminal:
         note(found.report.note)
-    sys.exit(0 if found.finished else INCOMPLETE)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0 if found.finished else INCOMPLETE)  # nothing is left to do, and the middleware may not let go

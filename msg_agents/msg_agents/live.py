@@ -233,7 +233,7 @@ def watch(
 
     Returns
     -------
-    What was seen; None: no network
+    What was seen; None: no network. Where the run was seen to be over, the node is still there: end the process at once
 
     Raises
     ------
@@ -262,7 +262,9 @@ def watch(
         pass
     finally:
         watched = nodes[0].watched() if nodes else None
-        leave(nodes, complete=False)
+        # When the run is over nobody waits for this node, and leaving while others leave can deadlock: see ``leave``.
+        if not all(node.done.done() for node in nodes):
+            leave(nodes, complete=False)
     return watched
 
 
