@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import rclpy
@@ -22,9 +23,11 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from msg_agents.cores import available_cores, keep_to, place
 from msg_agents.domain import free_domain
 from msg_agents.environment import node_environment
 from msg_agents.errors import RCLError
+from msg_agents.network import RECORDER, ProcessPlan
 from msg_agents.process import prefer_throughput
 
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0)
@@ -136,8 +139,14 @@ def measure(
     recorder: bool = False,
     replicas: int = 16,
     batch: bool = False,
+    pin: bool = False,
 ) -> float:
-    """Steps per second of the slowest process, in the environment that the real network gives its processes."""
+    """Steps per second of the slowest process, in the environment that the real network gives its processes.
+
+    Parameters
+    ----------
+    batch, pin : batch scheduling, and one core for each process, both of which the real network chooses itself
+    """
     common = f"--agents {agents} --processes {processes} --steps {steps} --replicas {replicas}"
     roles = [f"--worker {w}" for w in range(processes)] + (["--worker -1"] if recorder else [])
     command = [sys.executable, __file__, *common.split(), *(["--recorder"] if recorder else [])]
@@ -153,10 +162,22 @@ def measure(
             )
             for role in roles
         ]
+        if pin:
+            for child, core in zip(children, _cores(agents, processes, recorder), strict=False):
+                keep_to(child.pid, core)
         rates = [float(child.stdout.readline()) for child in children if child.stdout]
         for child in children:
             child.communicate(timeout=30)
     return min(rates[:processes])
+
+
+def _cores(agents: int, processes: int, recorder: bool) -> list[int]:
+    """The core of each process, recorder last, where the real network would have it."""
+    bounds = [worker * agents // processes for worker in range(processes + 1)]
+    plans = [ProcessPlan(RECORDER, ())] if recorder else []
+    plans += [ProcessPlan(f"{first}", (), tuple(range(first, end))) for first, end in pairwise(bounds)]
+    placed = list(place(plans, available_cores()).values())
+    return placed[recorder:] + placed[:recorder]
 
 
 def main() -> None:
@@ -167,6 +188,7 @@ def main() -> None:
     parser.add_argument("--replicas", type=int, default=16)
     parser.add_argument("--recorder", action="store_true")
     parser.add_argument("--batch", action="store_true", help="batch scheduling, which the real network chooses itself")
+    parser.add_argument("--pin", action="store_true", help="one core for each process, as in the real network")
     parser.add_argument("--worker", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.worker is None:
@@ -177,6 +199,7 @@ def main() -> None:
             recorder=arguments.recorder,
             replicas=arguments.replicas,
             batch=arguments.batch,
+            pin=arguments.pin,
         )
         print(f"{rate:.0f} steps/s")
     elif arguments.worker < 0:

@@ -100,10 +100,10 @@ def main() -> None:
     parser.parse_args()
     print(f"{'us per step of':20} {'user':>6} {'system':>6} {'switches':>10}")
     for recorded in (False, True):
-        print("bare loop, batch scheduling" + recorded * ", recorded")
-        watch(partial(bare_loop.measure, recorder=recorded, batch=True), 3000)
+        print("bare loop, batch and pinned" + recorded * ", recorded")
+        watch(partial(bare_loop.measure, recorder=recorded, batch=True, pin=True), 3000)
         print("network" + recorded * ", recorded")
-        watch(partial(network, record=recorded), 2500)
+        watch(partial(network, record=recorded), 3500)
 
 
 if __name__ == "__main__":

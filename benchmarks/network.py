@@ -3,8 +3,9 @@
 Each round measures every configuration once, in turn, so that a drift of the machine hits all of them alike; the
 ratios are taken within a round and the median over the rounds is what counts.
 
-The network's processes ask the scheduler for throughput (SCHED_BATCH), which the bare loop does only where it says so:
-against the plain one, the choice counts for the network; against the other one, what the network costs shows.
+The network's processes ask the scheduler for throughput (SCHED_BATCH), and keep to one core each where there are fewer
+cores than processes. The bare loop does so only where it says so: against the plain one, these choices count for the
+network; against the others, what the network costs shows.
 
 Where agents share a process the bare loop still sends every message through the middleware; the network does not, and
 can be faster than that. Such a ratio above 1 says nothing of what a message costs: the ratio of 5 processes does.
@@ -30,8 +31,13 @@ LARGE, PROCESSES = 100, 4  # agents, and the processes that they share
 RATIOS = {
     "network / bare loop": ("network", "bare loop"),
     "network / bare loop, both recorded": ("network, recorded", "bare loop, recorded"),
-    "network / bare loop with batch scheduling": ("network", "bare loop, batch"),
-    "the same, both recorded": ("network, recorded", "bare loop, batch, recorded"),
+    "network / bare loop, batch": ("network", "bare loop, batch"),
+    "network / bare loop, batch, both recorded": ("network, recorded", "bare loop, batch, recorded"),
+    "network / bare loop, batch and pinned": ("network", "bare loop, batch and pinned"),
+    "network / bare loop, batch and pinned, both recorded": (
+        "network, recorded",
+        "bare loop, batch and pinned, recorded",
+    ),
     "5 agents in 1 process, network / bare loop": (
         "5 agents in 1 process, network",
         "5 agents in 1 process, bare loop",
@@ -74,15 +80,19 @@ def configurations(steps: int) -> dict[str, Callable[[], float]]:
         "network, recorded": lambda: network(steps, record=True),
         "bare loop, batch": lambda: bare_loop.measure(steps=steps, batch=True),
         "bare loop, batch, recorded": lambda: bare_loop.measure(steps=steps, recorder=True, batch=True),
-        # Given the same scheduling policy: batch, the network's own choice.
-        "5 agents in 1 process, bare loop": lambda: bare_loop.measure(processes=1, steps=steps, batch=True),
+        "bare loop, batch and pinned": lambda: bare_loop.measure(steps=steps, batch=True, pin=True),
+        "bare loop, batch and pinned, recorded": lambda: bare_loop.measure(
+            steps=steps, recorder=True, batch=True, pin=True
+        ),
+        # Scheduled like the network.
+        "5 agents in 1 process, bare loop": lambda: bare_loop.measure(processes=1, steps=steps, batch=True, pin=True),
         "5 agents in 1 process, network": lambda: network(4 * steps, processes=1),
         "100 agents in 4 processes, bare loop": lambda: bare_loop.measure(
-            agents=LARGE, processes=PROCESSES, steps=steps // 15, batch=True
+            agents=LARGE, processes=PROCESSES, steps=steps // 15, batch=True, pin=True
         ),
         "100 agents in 4 processes, network": lambda: network(steps // 10, agents=LARGE, processes=PROCESSES),
         "100 agents in 4 processes, bare loop, recorded": lambda: bare_loop.measure(
-            agents=LARGE, processes=PROCESSES, steps=steps // 15, recorder=True, batch=True
+            agents=LARGE, processes=PROCESSES, steps=steps // 15, recorder=True, batch=True, pin=True
         ),
         "100 agents in 4 processes, network, recorded": lambda: network(
             steps // 15, agents=LARGE, processes=PROCESSES, record=True
@@ -110,12 +120,12 @@ def main() -> None:
         print(json.dumps({"rates": rates, "ratios": ratios}))
         return
     print(f"5 agents in 5 processes where not said otherwise, 16 replicas, {arguments.rounds} rounds")
-    print(f"{'steps per second':48} {'median':>8} {'lowest':>8} {'highest':>8}")
+    print(f"{'steps per second':52} {'median':>8} {'lowest':>8} {'highest':>8}")
     for name, values in rates.items():
-        print(f"{name:48} {statistics.median(values):8.0f} {min(values):8.0f} {max(values):8.0f}")
-    print(f"{'ratio within a round':48} {'median':>8}")
+        print(f"{name:52} {statistics.median(values):8.0f} {min(values):8.0f} {max(values):8.0f}")
+    print(f"{'ratio within a round':52} {'median':>8}")
     for title, ratio in ratios.items():
-        print(f"{title:48} {ratio:8.2f}")
+        print(f"{title:52} {ratio:8.2f}")
 
 
 if __name__ == "__main__":

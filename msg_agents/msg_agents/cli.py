@@ -7,7 +7,6 @@ Results go to stdout, everything else to stderr. Exit codes: 0 fine or agrees, 1
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,21 +15,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import msg_agents
-from msg_agents import cli_replay
-from msg_agents.environment import DISCOVERY_TIMEOUT, RESTARTS
-from msg_agents.ros_command import RosCommand
+from msg_agents import cli_nodes, cli_replay
+from msg_agents.environment import RESTARTS
 from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, result_console
 
 if TYPE_CHECKING:
-    from msg_agents.node import NetworkNode
     from msg_agents.runner import RunResult
     from msg_analysis.bags.storage import Compression
     from msg_analysis.model.experiment import Experiment
-    from msg_analysis.model.record import RunRecord
 
 DISAGREES, INCOMPLETE = 1, 3
-USE_SIM_TIME_HELP = "Take the time from /clock, which somebody else publishes in the same domain (realtime)."
 
 
 @click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -67,7 +62,13 @@ def main() -> None:
     help="How often, in all, agents or the switcher are started again when they were killed.",
 )
 @click.option("--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own.")
-@click.option("--use-sim-time", is_flag=True, help=USE_SIM_TIME_HELP)
+@cli_nodes.use_sim_time
+@click.option(
+    "--pin/--no-pin",
+    default=True,
+    show_default=True,
+    help="Keep each process to one core, where there are more of them than cores: faster (lockstep).",
+)
 @storage_options
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
@@ -84,6 +85,7 @@ def run(
     restarts: int,
     domain: int | None,
     use_sim_time: bool,
+    pin: bool,
     compression: Compression,
     split_size: float | None,
     executor: str | None,
@@ -108,6 +110,7 @@ def run(
             restarts=restarts,
             use_sim_time=use_sim_time,
             storage=storage(compression, split_size),
+            pin=pin,
             on_progress=on_progress,
             on_note=lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True),
             environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
@@ -225,185 +228,11 @@ def prepare(experiment: Path) -> None:
     click.echo(new_record(what).to_json())
 
 
-def _node_options(command: Callable[..., None]) -> Callable[..., None]:
-    """What the commands of single nodes have in common."""
-    for option in (
-        click.argument("run_record", type=click.Path(path_type=Path)),
-        click.option(
-            "--discovery-timeout",
-            type=float,
-            default=DISCOVERY_TIMEOUT,
-            show_default=True,
-            help="Seconds to wait for the other nodes.",
-        ),
-        click.option("--use-sim-time", is_flag=True, help=USE_SIM_TIME_HELP),
-        click.option("--lifeline", type=int, hidden=True),
-        click.option("--account", type=click.Path(path_type=Path), hidden=True),
-    ):
-        command = option(command)
-    return command
-
-
-_await = click.option(
-    "--await",
-    "readers",
-    multiple=True,
-    help="A node, such as recorder, that must be there before the run starts. Repeatable.",
-)
-
-
-_checkpoint = click.option(
-    "--checkpoint",
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Directory that keeps what is needed to go on after being killed: the same command then takes over.",
-)
-
-
-@main.command(cls=RosCommand, epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
-@_node_options
-@click.option(
-    "--agent",
-    "agents",
-    type=int,
-    multiple=True,
-    required=True,
-    help="Number of an agent, from 1. Repeatable.",
-)
-@_await
-@_checkpoint
-def agent(
-    run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...], checkpoint: Path | None, **options: Any
-) -> None:
-    """Run one or more agents of the run in RUN_RECORD in one process."""
-    from msg_analysis.errors import InputError
-    from msg_analysis.model.step import build_model
-
-    record = _load_record(run_record)
-    record.experiment.require_available()
-    total = record.experiment.agents
-    for number in agents:
-        if not 1 <= number <= total:
-            raise InputError(f"--agent: {number}: expected a number from 1 to {total}")
-    if len(set(agents)) < len(agents):
-        raise InputError(f"--agent: {list(agents)}: expected each agent once")
-
-    def nodes() -> list[NetworkNode]:
-        from msg_agents.group import AgentGroup
-        from msg_agents.node import agent_name
-        from msg_agents.succession import enter, succeed
-
-        indices = [number - 1 for number in agents]
-        model, directory = build_model(record.experiment), _make(checkpoint)
-        successions = succeed(directory, map(agent_name, indices))
-        group = AgentGroup(record=record, model=model, agents=indices, readers=readers, checkpoints=directory)
-        enter(successions, group.nodes[0])
-        return list(group.nodes)
-
-    _run_nodes(nodes, record, **options)
-
-
-@main.command(cls=RosCommand, epilog=examples("msg-agents switcher run.json --await recorder"))
-@_node_options
-@_await
-@_checkpoint
-@click.option("--status", type=int, hidden=True)
-def switcher(
-    run_record: Path, *, readers: tuple[str, ...], checkpoint: Path | None, status: int | None, **options: Any
-) -> None:
-    """Run the switcher of the run in RUN_RECORD: it publishes the experiment and the active graph."""
-    from msg_analysis.model.step import build_model
-
-    record = _load_record(run_record)
-
-    def report(steps: Any) -> None:
-        if status is not None:
-            os.write(status, json.dumps(list(steps)).encode() + b"\n")
-
-    def nodes() -> list[NetworkNode]:
-        from msg_agents.succession import enter, succeed
-        from msg_agents.switcher import SWITCHERS
-
-        model, directory = build_model(record.experiment), _make(checkpoint)
-        successions = succeed(directory, ["switcher"])
-        kind = SWITCHERS[record.experiment.run.pace]
-        node = kind(record=record, model=model, readers=list(readers), on_progress=report, checkpoints=directory)
-        enter(successions, node)
-        return [node]
-
-    _run_nodes(nodes, record, **options)
-
-
-@main.command(cls=RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
-@_node_options
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Directory of the bag; must not exist.")
-@storage_options
-def recorder(
-    run_record: Path, *, out: Path, compression: Compression, split_size: float | None, **options: Any
-) -> None:
-    """Record the run in RUN_RECORD to a bag."""
-    record = _load_record(run_record)
-
-    def nodes() -> list[NetworkNode]:
-        from msg_agents.recorder import Recorder
-
-        return [Recorder(record=record, directory=out, storage=storage(compression, split_size))]
-
-    _run_nodes(nodes, record, **options)
-
-
-def _run_nodes(
-    nodes: Callable[[], list[NetworkNode]],
-    record: RunRecord,
-    *,
-    lifeline: int | None,
-    discovery_timeout: float,
-    use_sim_time: bool,
-    account: Path | None,
-) -> None:
-    from msg_agents.process import hold_lifeline, run_nodes
-
-    if lifeline is not None:
-        hold_lifeline(lifeline)
-    executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
-    throughput = record.experiment.run.pace == "lockstep"
-    if not run_nodes(
-        nodes,
-        executor=executor,
-        discovery_timeout=discovery_timeout,
-        throughput=throughput,
-        use_sim_time=use_sim_time,
-        account=account,
-    ):
-        sys.exit(INCOMPLETE)
-
-
-def _make(directory: Path | None) -> Path | None:
-    from msg_analysis.errors import InputError
-
-    if directory is not None:
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"--checkpoint: {directory}: cannot be made ({error.strerror}): name another") from error
-    return directory
-
-
 def _load(path: Path) -> Experiment:
     from msg_analysis.model.experiment import Experiment
 
     return Experiment.load(path)
 
 
-def _load_record(path: Path) -> RunRecord:
-    from msg_analysis.errors import InputError
-    from msg_analysis.model.record import RunRecord
-
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read ({error}): expected a run record from msg-agents prepare") from error
-    return RunRecord.from_json(text, str(path))
-
-
-main.add_command(cli_replay.play)
-main.add_command(cli_replay.live)
+for _command in (cli_nodes.agent, cli_nodes.switcher, cli_nodes.recorder, cli_replay.play, cli_replay.live):
+    main.add_command(_command)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msg_agents.checkpoint import longest_heard, room_for
+from msg_agents.cores import available_cores, place
 from msg_agents.domain import free_domain
 from msg_agents.environment import RESTARTS, node_environment
 from msg_agents.network import count_processes, plan_network
@@ -83,6 +84,7 @@ def run_network(
     restarts: int = RESTARTS,
     use_sim_time: bool = False,
     storage: Storage = DEFAULT,
+    pin: bool = True,
     on_progress: Callable[[int], None] = lambda _: None,
     on_note: Callable[[str], None] = lambda _: None,
     environment: Mapping[str, str] | None = None,
@@ -97,6 +99,7 @@ def run_network(
     restarts : how often, in all, agents or the switcher are started again when they were killed; once more ends the run
     use_sim_time : whether the nodes take the time from ``/clock``, which somebody else publishes in the same domain
     storage : compression of the bag and size of its files
+    pin : whether the processes of a run in lockstep keep to one core each, where they are more than the cores
     on_progress : called a few times a second with the step that every agent has reached
     on_note : called with a line about what happens: a restart, a standstill
     environment : changes to the environment of the processes
@@ -127,16 +130,12 @@ def run_network(
                 _interruptible() as interrupted,
                 Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
             ):
-                supervisor.start(
-                    plan_network(
-                        experiment,
-                        run_file,
-                        bag,
-                        checkpoints=checkpoints,
-                        use_sim_time=use_sim_time,
-                        storage=storage,
-                    )
+                plans = plan_network(
+                    experiment, run_file, bag, checkpoints=checkpoints, use_sim_time=use_sim_time, storage=storage
                 )
+                if pin and experiment.run.pace == "lockstep":
+                    supervisor.cores = place(plans, available_cores(), first=chosen)
+                supervisor.start(plans)
                 _watch(supervisor, experiment.steps, result, restarts, interrupted, on_progress, on_note)
                 # Before the others are ended: what ends because we end it has not failed.
                 _collect_failures(supervisor, result, interrupted, restarts)

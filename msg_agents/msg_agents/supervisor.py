@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Self
 
 from msg_agents.account import Account, read_accounts
+from msg_agents.cores import keep_to
 from msg_agents.network import RECORDER, SWITCHER, ProcessPlan
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
@@ -107,12 +108,14 @@ class Supervisor:
     ----------
     logs : directory for what the children print
     environment : theirs
+    cores : the core that a child keeps to, by name; the others run where the scheduler likes
     children : in the order of their start
     steps : newest step of every agent as far as reported
     """
 
     logs: Path
     environment: Mapping[str, str]
+    cores: Mapping[str, int] = field(default_factory=dict)
     children: list[Child] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
@@ -151,6 +154,8 @@ class Supervisor:
                 pass_fds=descriptors,
                 start_new_session=True,
             )
+        if plan.name in self.cores:
+            keep_to(process.pid, self.cores[plan.name])
         return Child(plan, process, log, number)
 
     def read_status(self) -> None:

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from msg_agents.cores import place
 from msg_agents.environment import DISCOVERY_TIMEOUT
-from msg_agents.network import MOST_PROCESSES, ProcessPlan, count_processes, plan_network
+from msg_agents.network import MOST_PROCESSES, RECORDER, ProcessPlan, count_processes, plan_network
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import Experiment
 
@@ -108,3 +109,9 @@ def test_without_a_bag_nobody_waits_for_a_recorder() -> None:
     processes = plan(3, "auto", bag=None)
     assert [process.name for process in processes] == ["agent_1", "agent_2", "agent_3", "switcher"]
     assert not any("--await" in process.arguments for process in processes)
+
+
+def test_neighbours_share_a_core() -> None:
+    placed = place(plan(12, 6), [0, 1])
+    first = {RECORDER: 0, "agents_1_to_2": 0, "agents_3_to_4": 0}
+    assert placed == first | {"agents_5_to_6": 1, "agents_7_to_8": 1, "agents_9_to_10": 1, "agents_11_to_12": 1}

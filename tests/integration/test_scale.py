@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -41,3 +45,38 @@ def test_a_killed_process_of_many_agents_comes_back(network: Any) -> None:
     assert (len(result["restarts"]), result["failures"]) == (1, []), stderr
     outcome = check(read_bag(result["bag"]))
     assert (outcome.difference, outcome.missing) == (None, 0)
+
+
+def cores_of(pid: int) -> set[int]:
+    """Cores that any thread of a process may run on."""
+    with contextlib.suppress(ProcessLookupError, FileNotFoundError):
+        return set.union(*(os.sched_getaffinity(int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir()))
+    return set()
+
+
+@pytest.mark.parametrize("pin", [True, False])
+def test_processes_keep_to_one_core_each(network: Any, pin: bool) -> None:
+    """Where there are more of them than cores; whoever comes back keeps to the same one."""
+    cores = os.sched_getaffinity(0)
+    if not 2 <= len(cores) <= 5:
+        pytest.skip(f"{len(cores)} cores: of no use for 6 processes")
+    file = network.file(run={"duration": 500})
+    run = network.start("run", file, "--out", network.directory / "runs", "--json", *([] if pin else ["--no-pin"]))
+    network.wait_until_moving()
+    kept = {process.agent: cores_of(process.pid) for process in network.processes("agent")}
+    if pin:
+        assert {len(own) for own in kept.values()} == {1}
+        assert len(set.union(*kept.values())) == min(len(cores), 5)
+    else:
+        assert list(kept.values()) == [cores] * 5
+    victim = network.processes("agent")[0]
+    victim.kill()
+
+    def back() -> bool:
+        others = [p for p in network.processes("agent") if p.agent == victim.agent and p != victim]
+        return any(cores_of(process.pid) == kept[victim.agent] for process in others)
+
+    network.wait_for(back, 10, "the agent on its core again")
+    run.send_signal(signal.SIGINT)
+    run.communicate(timeout=30)
+    assert run.returncode == 3
