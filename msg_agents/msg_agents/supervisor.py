@@ -108,16 +108,16 @@ class Supervisor:
     ----------
     logs : directory for what the children print
     environment : theirs
-    cores : the core that a child keeps to, by name; the others run where the scheduler likes
     children : in the order of their start
     steps : newest step of every agent as far as reported
+    cores : the core that a child keeps to, by name; the others run where the scheduler likes
     """
 
     logs: Path
     environment: Mapping[str, str]
-    cores: Mapping[str, int] = field(default_factory=dict)
     children: list[Child] = field(default_factory=list)
     steps: list[int] = field(default_factory=list)
+    cores: Mapping[str, int] = field(default_factory=dict)
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _status: tuple[int, int] = field(default=(-1, -1), init=False)
     _pending: bytes = field(default=b"", init=False)
