@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -74,6 +75,29 @@ class Batch:
 
 
 @dataclass(slots=True)
+class _Chunk:
+    """A chunk that is being unpacked.
+
+    Attributes
+    ----------
+    data : the records in it, in the end
+    end : bytes of the file up to its own end
+    index : contents of the message index records behind it
+    """
+
+    data: Future[bytes]
+    end: int
+    index: list[bytes] = field(default_factory=list)
+    _filled: int = 0
+
+    def add_index(self, content: bytes) -> None:
+        """Take one more of its message index records, as long as they are not absurdly many."""
+        self._filled += len(content)
+        if self._filled <= LIMIT:
+            self.index.append(content)
+
+
+@dataclass(slots=True)
 class McapFile:
     """An MCAP file that is read once, from front to back, by iterating over ``batches()``.
 
@@ -130,32 +154,30 @@ class McapFile:
         self.whole_bytes = len(MAGIC)
         _keep_memory()
         zstd = zstandard.ZstdDecompressor()
-        chunk: bytes | None = None
-        index: list[bytes] = []  # of the chunk
+        chunk: _Chunk | None = None
         loose: list[bytes] = []
-        filled = end = 0  # bytes in either list, and of the file up to their end
-        for opcode, content in self._records(stream, size):
-            if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
-                filled += len(content)
-                if filled <= LIMIT:
-                    index.append(content)
-                continue
+        filled = end = 0  # bytes in the list, and of the file up to their end
+        with ThreadPoolExecutor(1) as unpacker:  # works on the next chunk while whoever reads works on this one
+            for opcode, content in self._records(stream, size):
+                if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
+                    chunk.add_index(content)
+                    continue
+                before, chunk = chunk, None
+                if opcode == Opcode.CHUNK:
+                    chunk = _Chunk(unpacker.submit(unpack, content, zstd), self.whole_bytes)
+                if before is not None:
+                    yield from self._chunk(before)
+                if loose and (opcode == Opcode.CHUNK or filled > _LOOSE):
+                    yield _loose_batch(loose, end)
+                    loose, filled = [], 0
+                if opcode == Opcode.MESSAGE:
+                    loose.append(content)
+                    filled, end = filled + len(content), self.whole_bytes
+                elif opcode != Opcode.CHUNK:
+                    with contextlib.suppress(DamageError):
+                        self._note(opcode, content)
             if chunk is not None:
-                yield from self._chunk(chunk, index, zstd, end)
-                chunk, index, filled = None, [], 0
-            if loose and (opcode == Opcode.CHUNK or filled > _LOOSE):
-                yield _loose_batch(loose, end)
-                loose, filled = [], 0
-            if opcode == Opcode.CHUNK:
-                chunk, end = content, self.whole_bytes
-            elif opcode == Opcode.MESSAGE:
-                loose.append(content)
-                filled, end = filled + len(content), self.whole_bytes
-            else:
-                with contextlib.suppress(DamageError):
-                    self._note(opcode, content)
-        if chunk is not None:
-            yield from self._chunk(chunk, index, zstd, end)
+                yield from self._chunk(chunk)
         if loose:
             yield _loose_batch(loose, end)
 
@@ -201,14 +223,14 @@ class McapFile:
         except Exception as error:  # the library reports damage by whatever goes wrong in it
             raise DamageError from error
 
-    def _chunk(self, content: bytes, index: list[bytes], zstd: zstandard.ZstdDecompressor, end: int) -> Iterator[Batch]:
+    def _chunk(self, chunk: _Chunk) -> Iterator[Batch]:
         try:
-            data = unpack(content, zstd)
-            places = locate(data, index)
+            data = chunk.data.result()
+            places = locate(data, chunk.index)
             if places is None:
                 walked = np.array(list(self._walk(data)), dtype=np.int64).reshape(-1, 2)
                 places = walked[:, 0], walked[:, 1]
-            batch = Batch.of_contents(data, *places, end)
+            batch = Batch.of_contents(data, *places, chunk.end)
         except Exception:  # decompressors and the library report damage by whatever goes wrong in them
             self.damaged_chunks += 1
             return
