@@ -137,9 +137,14 @@ def play(
     )
     with _play_bar(bag.name) as bar:
         try:
-            played = play_bag(bag, options, on_progress=bar.update, on_note=bar.note)
+            played = play_bag(
+                bag, options, on_progress=bar.update, on_note=bar.note, on_stop=bar.hide, on_continue=bar.show
+            )
         except (KeyboardInterrupt, SystemExit):
-            bar.note(f"stopped at {bar.played.now:g} s of the bag after {bar.played.messages} messages")
+            if bar.played.begun:
+                bar.note(f"stopped at {bar.played.now:g} s of the bag after {bar.played.messages} messages")
+            else:
+                bar.note("stopped before it began: nothing but latched messages has been played")
             raise
     held = f"; held back by readers for {played.held_back:.1f} s" if played.held_back >= 0.1 else ""
     click.echo(f"{played.messages} messages played in {played.seconds:.1f} s{held}", err=True)
@@ -163,21 +168,32 @@ class _play_bar:  # noqa: N801  used like a function
             console=self._console,
             disable=not self._console.is_terminal,
             transient=True,
+            auto_refresh=False,  # no thread, which might hold a lock that is wanted when a signal comes
         )
         self._task = self._progress.add_task(name, total=None, state="looking for readers")
 
     def __enter__(self) -> _play_bar:
-        self._progress.start()
+        self.show()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.hide()
+
+    def show(self) -> None:
+        """Draw the bar from now on."""
+        self._progress.start()
+
+    def hide(self) -> None:
+        """Take it off the terminal, which is left as it was."""
         self._progress.stop()
 
     def update(self, played: Played) -> None:
         self.played = played
         pace = "as fast as it goes" if math.isinf(played.rate) else f"x {played.rate:.3g}"
         state = f"{played.now:.1f}/{played.length:.1f} s  {'paused' if played.paused else pace}"
-        self._progress.update(self._task, completed=played.now, total=played.length, state=state)
+        if not played.begun:
+            state = "looking for readers"
+        self._progress.update(self._task, completed=played.now, total=played.length, state=state, refresh=True)
 
     def note(self, line: str) -> None:
         from rich.text import Text
@@ -241,7 +257,10 @@ def live(*, reliable: bool, timeout: float | None, as_json: bool, domain: int | 
     else:
         from rich.live import Live
 
-        with Live(console=console, auto_refresh=False) as screen:
+        from msg_agents.jobcontrol import JobControl
+
+        screen = Live(console=console, auto_refresh=False)
+        with screen, JobControl(before=screen.stop, after=lambda: screen.start(refresh=True)):
             found = watch(
                 reliable=reliable,
                 timeout=timeout,

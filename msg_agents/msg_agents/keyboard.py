@@ -6,7 +6,6 @@ import contextlib
 import os
 import re
 import select
-import signal
 import sys
 import termios
 import time
@@ -26,11 +25,13 @@ class Keyboard:
     """Keys typed at the terminal, one by one and without echo, as a context; none where stdin is no terminal.
 
     Ctrl-C and Ctrl-Z do what they always do. While the process is in the background, it does not touch the terminal.
+    Around a stop, call ``let_go`` and ``listen``.
     """
 
     def __init__(self) -> None:
         self._descriptor: int | None = None
-        self._saved: list[Any] = []
+        self._saved: list[Any] = []  # how the terminal was; nothing while it is as it was
+        self._ours: list[Any] = []  # how we set it
         with contextlib.suppress(ValueError, OSError, AttributeError):  # no stdin, or not a file
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor):
@@ -42,18 +43,33 @@ class Keyboard:
         return self._descriptor is not None
 
     def __enter__(self) -> Self:
-        if self._descriptor is not None and self._in_front():
-            self._listen()
-        if self._descriptor is not None:
-            self._continued = signal.signal(signal.SIGCONT, self._resume)
+        self.listen()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._descriptor is not None:
-            signal.signal(signal.SIGCONT, self._continued)
-            self._restore()
+        self.let_go()
+
+    def listen(self) -> None:
+        """Have the terminal give single keys, where it is ours; again after others may have changed it."""
+        if self._descriptor is None or not self._in_front():
+            return
+        with contextlib.suppress(termios.error):
+            found = termios.tcgetattr(self._descriptor)
+            if self._saved and found == self._ours:  # nobody has changed it: what was saved is still what was there
+                return
+            self._saved = found
+            tty.setcbreak(self._descriptor, termios.TCSADRAIN)
+            self._ours = termios.tcgetattr(self._descriptor)
+
+    def let_go(self) -> None:
+        """Leave the terminal as it was."""
+        if self._saved and self._in_front():
+            assert self._descriptor is not None
+            with contextlib.suppress(termios.error):
+                termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._saved)
+        self._saved = []
 
     def wait(self, seconds: float) -> list[str]:
         """What was typed: ``space``, ``step`` (right arrow, s, enter), ``up``, ``down``; at once, or at the end.
@@ -62,38 +78,23 @@ class Keyboard:
         ----------
         seconds : to wait if nothing was
         """
-        if not self._saved or not self._in_front():
+        if not self._saved:
+            self.listen()  # it may have been started in the background
+        if self._descriptor is None or not self._saved or not self._in_front():
             if seconds > 0:
                 time.sleep(seconds)
             return []
-        assert self._descriptor is not None
         if not select.select([self._descriptor], [], [], max(0.0, seconds))[0]:
             return []
-        typed = os.read(self._descriptor, 1024)
+        typed = b""
+        with contextlib.suppress(OSError):
+            typed = os.read(self._descriptor, 1024)
         if not typed:  # the terminal has gone
-            self._saved = []
+            self._descriptor, self._saved = None, []
         return [_NAMES[key] for key in _KEYS.findall(typed) if key in _NAMES]
 
     def _in_front(self) -> bool:
         """Whether the terminal is ours: otherwise the system would stop whoever reads from it or changes it."""
         with contextlib.suppress(OSError):
-            return os.tcgetpgrp(self._descriptor or 0) == os.getpgrp()
+            return self._descriptor is not None and os.tcgetpgrp(self._descriptor) == os.getpgrp()
         return False
-
-    def _listen(self) -> None:
-        assert self._descriptor is not None
-        with contextlib.suppress(termios.error):
-            self._saved = termios.tcgetattr(self._descriptor)
-            tty.setcbreak(self._descriptor, termios.TCSADRAIN)
-
-    def _resume(self, *_: object) -> None:
-        # A shell takes its terminal back from a stopped job, and gives it out anew.
-        if self._in_front():
-            self._listen()
-
-    def _restore(self) -> None:
-        if self._saved and self._in_front():
-            assert self._descriptor is not None
-            with contextlib.suppress(termios.error):
-                termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._saved)
-        self._saved = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from msg_agents_interfaces.msg import AgentState as AgentStateMsg
 from msg_agents_interfaces.msg import Estimate as EstimateMsg
 from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.duration import Duration
+from rclpy.executors import Executor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -255,8 +257,7 @@ def watch(
                 noted = True
                 on_note(f"{_nobody()} yet: waiting for one")
         node.follow()
-        while not node.done.done():
-            executor.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
+        _spin(executor, node.done)
         node.farewell()
     except (KeyboardInterrupt, SystemExit):
         pass
@@ -266,6 +267,26 @@ def watch(
         if not all(node.done.done() for node in nodes):
             leave(nodes, complete=False)
     return watched
+
+
+def _spin(executor: Executor, done: Future) -> None:
+    """Spin until something is done; a signal ends it between two callbacks: in one, the executor would complain of it.
+
+    Raises
+    ------
+    KeyboardInterrupt : by Ctrl-C or another signal
+    """
+    caught: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(number, lambda number, _: caught.append(number)) for number in numbers]
+    try:
+        while not done.done() and not caught:
+            executor.spin_until_future_complete(done, timeout_sec=SPIN_SLICE)
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+    if caught:
+        raise KeyboardInterrupt
 
 
 def _nobody() -> str:

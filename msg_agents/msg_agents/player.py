@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import math
-import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import rclpy
 from builtin_interfaces.msg import Time
@@ -20,19 +17,20 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.time_source import CLOCK_TOPIC
 from rosgraph_msgs.msg import Clock
 
+from msg_agents.audience import Audience
+from msg_agents.bagtypes import check_definitions, message_classes
 from msg_agents.errors import RCLError
+from msg_agents.jobcontrol import JobControl
 from msg_agents.keyboard import Keyboard
 from msg_agents.playclock import SECOND, PlayClock
 from msg_agents.process import leave
 from msg_agents.qos import LATCHED, STREAM
 from msg_agents.quiet import QuietNode
 from msg_agents.selection import parse_remaps, select_topics
-from msg_analysis.bags.playback import BagTopic, Message, Playback
+from msg_analysis.bags.playback import Message, Playback
 from msg_analysis.errors import InputError
 
 POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
-SETTLED = 0.8  # s in which nobody new is found: then those who are there already have been
-SETTLE_LIMIT = 5.0  # s for which to look for more
 LOOK = 0.05  # s between two looks at the keyboard
 SHOW = 0.2  # s between two reports of progress
 ACK_SLICE = 0.2  # s
@@ -87,6 +85,7 @@ class Played:
     length : s of the bag, all of it
     rate : at which it is played
     paused : whether it stands
+    begun : whether the readers who are waited for were there
     """
 
     messages: int = 0
@@ -96,6 +95,7 @@ class Played:
     length: float = 0.0
     rate: float = 1.0
     paused: bool = False
+    begun: bool = False
 
 
 class Player(QuietNode):
@@ -110,6 +110,7 @@ class Player(QuietNode):
     bag : to be played
     options : how
     keyboard : for pause, step and rate
+    jobs : says when the process had been stopped
     on_progress : told a few times a second how far it is
     on_note : told what somebody should know
     """
@@ -120,11 +121,12 @@ class Player(QuietNode):
         bag: Playback,
         options: PlayOptions,
         keyboard: Keyboard,
+        jobs: JobControl,
         on_progress: Callable[[Played], None],
         on_note: Callable[[str], None],
     ) -> None:
         super().__init__("player")
-        self._bag, self._options, self._keyboard = bag, options, keyboard
+        self._bag, self._options, self._keyboard, self._jobs = bag, options, keyboard, jobs
         self._on_progress, self._on_note = on_progress, on_note
         self._first = bag.start + round(options.start_offset * SECOND)
         self._last = bag.end
@@ -136,8 +138,13 @@ class Player(QuietNode):
         chosen = select_topics(bag.topics, options.topics, options.exclude)
         if options.clock is not None and CLOCK_TOPIC in chosen:
             chosen.remove(CLOCK_TOPIC)
+            if not chosen:
+                raise InputError(
+                    f"--clock: publishes {CLOCK_TOPIC} itself, and nothing else is chosen: leave it out to play "
+                    f"{CLOCK_TOPIC} as it was recorded, or choose more with --topics"
+                )
             on_note(f"{CLOCK_TOPIC} of the bag is not played: --clock publishes its own")
-        types = self._types([bag.topics[name] for name in chosen])
+        types = message_classes([bag.topics[name] for name in chosen], all_wanted=bool(options.topics), on_note=on_note)
         names = parse_remaps(options.remaps, chosen)
         self._latched = {name for name in types if bag.topics[name].latched}
         self._writers: dict[str, Publisher] = {}
@@ -147,11 +154,12 @@ class Player(QuietNode):
                 self._writers[name] = self.create_publisher(kind, names[name], qos)
             except InvalidTopicNameException as error:
                 raise InputError(f"--remap: {name}:={names[name]}: {error}") from error
-        self._check_types()
+        check_definitions(self, self._writers, bag.topics)
         self._ticker = self.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock else None
         self._time = PlayClock(self._first, options.rate, paused=options.paused)
         self._steps = 0  # messages to be played one by one
         self._began = self._shown = self._looked = self._ticked = 0.0
+        self._awake = time.monotonic()  # when it was last known not to be stopped
         self.played = Played(length=(bag.end - bag.start) / SECOND)
 
     def play(self) -> None:
@@ -162,9 +170,21 @@ class Player(QuietNode):
         InputError : readers that were to be waited for did not come
         """
         early = self._publish_early()
-        self._find_readers()
+        self._on_progress(self.played)
+        options = self._options
+        audience = Audience(
+            self,
+            self._writers,
+            self._latched,
+            subscribers=options.subscribers,
+            readers=options.readers,
+            timeout=options.wait_timeout,
+        )
+        audience.wait(self._bide, self._on_note)
+        self.played.begun = True
+        self._jobs.continued()
         self._time.jump(self._first)
-        self._began = time.monotonic()
+        self._began = self._awake = time.monotonic()
         skip = early
         while True:
             self._play_once(skip)
@@ -173,6 +193,11 @@ class Player(QuietNode):
                 break
             self._time.jump(self._first)
         self._wait_until_taken()
+
+    def _bide(self) -> None:
+        """Take some time, before it begins."""
+        self._press(self._keyboard.wait(POLL), self._first)
+        self._on_progress(self.played)
 
     def _publish_early(self) -> int:
         """Publish what a latched topic holds at the start, before anything else; how many messages these are.
@@ -202,7 +227,9 @@ class Player(QuietNode):
             took = time.monotonic() - before
             if took > BLOCKED:
                 self._time.hold(took)
+                self._jobs.continued()  # in that time, of which none counts
                 self.played.held_back += took
+                self._awake = before + took
             self.played.messages += 1
 
     def _send(self, message: Message) -> None:
@@ -240,7 +267,10 @@ class Player(QuietNode):
             self._press(self._keyboard.wait(soonest), message.time)
 
     def _look_around(self, now: float, next_time: int) -> None:
-        self._looked = now
+        if self._jobs.continued():  # nothing is hurried through afterwards
+            now = time.monotonic()
+            self._time.hold(now - self._awake)
+        self._looked = self._awake = now
         self._press(self._keyboard.wait(0.0), next_time)
         here = self._time.now(next_time)
         if self._ticker is not None and now >= self._next_tick():
@@ -272,85 +302,6 @@ class Player(QuietNode):
         played.rate, played.paused = self._time.rate, self._time.paused
         self._on_progress(played)
 
-    def _types(self, topics: Iterable[BagTopic]) -> dict[str, Any]:
-        """Message classes of the topics that can be played, by name; the others are noted."""
-        found, unplayable = {}, []
-        for topic in topics:
-            if topic.encoding != "cdr":
-                unplayable.append(
-                    f"{topic.name} (its messages are {topic.encoding or 'of no known encoding'}, not cdr)"
-                )
-                continue
-            try:
-                found[topic.name] = message_class(topic.type_name)
-            except (ImportError, AttributeError, ValueError):
-                unplayable.append(f"{topic.name} (the type {topic.type_name or '?'} is not installed here)")
-        if unplayable and (self._options.topics or not found):
-            raise InputError(f"cannot be played: {', '.join(unplayable)}: install it, or leave it out with --exclude")
-        for line in unplayable:
-            self._on_note(f"not played: {line}")
-        return found
-
-    def _check_types(self) -> None:
-        """The bytes mean something else under another definition of a type of that name."""
-        for name, publisher in self._writers.items():
-            recorded = self._bag.topics[name].type_hash
-            ours = {
-                str(info.topic_type_hash)
-                for info in self.get_publishers_info_by_topic(publisher.topic_name)
-                if info.node_name == self.get_name()
-            }
-            if recorded and ours and recorded not in ours:
-                raise InputError(
-                    f"topic {name}: was recorded with another definition of {self._bag.topics[name].type_name} than is "
-                    f"installed here ({recorded}, here {ours.pop()}): install that version, or leave it out with "
-                    "--exclude"
-                )
-
-    def _find_readers(self) -> None:
-        """Wait for those who are asked for, and in any case until those who are there have been found.
-
-        Latched topics need not be waited for: who reads them gets all of them.
-        """
-        names = self._writers.keys() - self._latched or self._writers.keys()
-        began = changed = time.monotonic()
-        counts: list[int] = []
-        while True:
-            now, missing = time.monotonic(), self._missing(sorted(names))
-            before, counts = counts, [each.get_subscription_count() for each in self._writers.values()]
-            if counts != before:
-                changed = now
-            if not missing and (now > changed + SETTLED or now > began + SETTLE_LIMIT):
-                break
-            if missing and now > began + self._options.wait_timeout:
-                raise InputError(
-                    f"after {self._options.wait_timeout:g} s {'; '.join(missing)}. Are they running, in the same "
-                    f"ROS_DOMAIN_ID ({os.environ.get('ROS_DOMAIN_ID', '0')}) and within ROS_AUTOMATIC_DISCOVERY_RANGE "
-                    f"({os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')})?"
-                )
-            self._press(self._keyboard.wait(POLL), self._first)
-        others = [each.topic_name for each in self._writers.values() if self.count_publishers(each.topic_name) > 1]
-        if others:
-            self._on_note(f"somebody else publishes too: {', '.join(others)}")
-
-    def _missing(self, names: Iterable[str]) -> list[str]:
-        """What is missing to begin, in words."""
-        few, without = [], dict[str, list[str]]()
-        for name in names:
-            publisher = self._writers[name]
-            count = publisher.get_subscription_count()
-            if count < self._options.subscribers:
-                few.append(f"{publisher.topic_name} ({count})")
-            if self._options.readers:
-                infos = self.get_subscriptions_info_by_topic(publisher.topic_name)
-                here = {info.node_name for info in infos}
-                here |= {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos}
-                for reader in self._options.readers:
-                    if reader not in here or count < 1:
-                        without.setdefault(reader, []).append(publisher.topic_name)
-        lines = [f"fewer than {self._options.subscribers} read {', '.join(few)}"] if few else []
-        return lines + [f"{reader} did not read {', '.join(topics)}" for reader, topics in without.items()]
-
     def _wait_until_taken(self) -> None:
         """Until all readers have acknowledged everything: what they have not would go with this process."""
         self._report(self._last)
@@ -365,23 +316,14 @@ class Player(QuietNode):
                 self._on_note(f"waiting until the readers of {names} have taken all")
 
 
-def message_class(type_name: str) -> Any:
-    """Class of a message type, ``package/msg/Name``.
-
-    Raises
-    ------
-    ImportError, AttributeError, ValueError : there is none of this name here
-    """
-    package, kind, name = type_name.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), name)
-
-
 def play(
     path: Path,
     options: PlayOptions,
     *,
     on_progress: Callable[[Played], None] = lambda _: None,
     on_note: Callable[[str], None] = lambda _: None,
+    on_stop: Callable[[], None] = lambda: None,
+    on_continue: Callable[[], None] = lambda: None,
 ) -> Played:
     """Play a bag in this process; what has been played comes back, also when that was interrupted.
 
@@ -391,6 +333,7 @@ def play(
     options : how
     on_progress : told a few times a second how far it is
     on_note : told what somebody should know
+    on_stop, on_continue : called before the process is stopped by Ctrl-Z, and when it goes on
 
     Raises
     ------
@@ -407,9 +350,22 @@ def play(
     complete = False
     try:
         with Keyboard() as keyboard:
-            nodes = [Player(bag=bag, options=options, keyboard=keyboard, on_progress=on_progress, on_note=on_note)]
-            nodes[0].play()
-            complete = True
+
+            def before() -> None:
+                on_stop()
+                keyboard.let_go()
+
+            def after() -> None:
+                keyboard.listen()
+                on_continue()
+
+            with JobControl(before=before, after=after) as jobs:
+                player = Player(
+                    bag=bag, options=options, keyboard=keyboard, jobs=jobs, on_progress=on_progress, on_note=on_note
+                )
+                nodes = [player]
+                player.play()
+                complete = True
     finally:
         for line in bag.damage[known:]:
             on_note(line)

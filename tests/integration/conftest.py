@@ -28,13 +28,17 @@ import yaml
 pytest.importorskip("rclpy")
 
 from msg_agents.check import check
+from msg_agents.domain import free_domain
 from msg_agents.runner import RunResult, run_network
 from msg_agents.workshop import PREFIX
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.store import write_trajectory
 from msg_analysis.model.experiment import Experiment
+from msg_analysis.twin import simulate
 
 MARK = "MSG_AGENTS_TEST"
 PROGRAM = Path(sys.executable).with_name("msg-agents")
+PLAIN_RECORDER = Path(__file__).parents[1] / "support" / "plain_recorder.py"
 LOOK = 0.5  # s between two looks at what the processes of a test have made for themselves
 
 
@@ -251,3 +255,43 @@ def rng(request: pytest.FixtureRequest) -> random.Random:
         f"STRESS={os.environ.get('STRESS', '1')} STRESS_SEED={os.environ.get('STRESS_SEED', '0')} {request.node.nodeid}"
     )
     return random.Random(seed)
+
+
+@pytest.fixture
+def domain(network: Network, monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A ROS domain of the test's own, in its environment."""
+    with free_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        yield number
+
+
+@pytest.fixture
+def twin_bag(network: Network) -> Path:
+    """300 steps of five agents, 15 s."""
+    bag = Path(network.directory / "twin")
+    write_trajectory(simulate(network.experiment()), bag)
+    return bag
+
+
+@pytest.fixture
+def plain(network: Network) -> Iterator[Callable[[Path, dict[str, int]], subprocess.Popen[str]]]:
+    """Start ``tests/support/plain_recorder.py`` for so many messages of these topics, of all together."""
+    started = []
+
+    def start(file: Path, topics: dict[str, int]) -> subprocess.Popen[str]:
+        total = str(sum(topics.values()))
+        started.append(
+            subprocess.Popen(
+                [sys.executable, PLAIN_RECORDER, file, total, *topics],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        )
+        return started[-1]
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()

@@ -7,12 +7,10 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from msg_agents.domain import free_domain
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.store import write_trajectory
 from msg_analysis.inference.compare import compare
@@ -36,13 +34,6 @@ system = [last.system_error, last.system_predicted, last.system_standard_error]
 stamp = [last.header.stamp.sec, last.header.stamp.nanosec]
 print(json.dumps([bytes(last.run).hex(), last.first_step, last.last_step, *system, list(last.node_errors), *stamp]))
 """
-
-
-@pytest.fixture
-def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    with free_domain() as number:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-        yield number
 
 
 def ended(process: subprocess.Popen[str], code: int = 0) -> tuple[str, str]:

@@ -1,0 +1,101 @@
+"""Who reads what a player publishes: it begins when they are there."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from msg_analysis.errors import InputError
+
+SETTLED = 0.8  # s in which nobody new is found: then those who are there already have been
+SETTLE_LIMIT = 5.0  # s for which to look for more
+SAID = 2.0  # s after which it is said who is waited for
+AWAKE = 1.0  # s between two looks, of which more do not count: then this process was stopped
+
+
+class Audience:
+    """The readers of the topics of a player.
+
+    Parameters
+    ----------
+    node : whose topics they are
+    writers : publishers of the topics
+    latched : keys of those that need not be waited for: who reads them gets all of them, however late
+    subscribers : how many readers every topic must have
+    readers : names of nodes that must read every topic
+    timeout : s to wait for them
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        writers: Mapping[str, Publisher],
+        latched: Iterable[str],
+        *,
+        subscribers: int,
+        readers: Sequence[str],
+        timeout: float,
+    ) -> None:
+        self._node, self._subscribers, self._readers, self._timeout = node, subscribers, readers, timeout
+        self._writers = list(writers.values())
+        self._awaited = [writers[name] for name in sorted(writers.keys() - set(latched) or writers.keys())]
+
+    def wait(self, pause: Callable[[], None], on_note: Callable[[str], None]) -> None:
+        """Until those who must be there are, and in any case until those who are there already have been found.
+
+        Parameters
+        ----------
+        pause : takes some time, between two looks
+        on_note : told whom it waits for
+
+        Raises
+        ------
+        InputError : somebody did not come
+        """
+        looked = time.monotonic()
+        waited = changed = 0.0
+        counts: list[int] = []
+        said = False
+        while True:
+            now = time.monotonic()
+            waited, looked = waited + min(now - looked, AWAKE), now
+            missing = self._missing()
+            before, counts = counts, [each.get_subscription_count() for each in self._writers]
+            if counts != before:
+                changed = waited
+            if not missing and (waited > changed + SETTLED or waited > SETTLE_LIMIT):
+                break
+            if missing and waited > self._timeout:
+                raise InputError(
+                    f"after {self._timeout:g} s {'; '.join(missing)}. Are they running, in the same "
+                    f"ROS_DOMAIN_ID ({os.environ.get('ROS_DOMAIN_ID', '0')}) and within ROS_AUTOMATIC_DISCOVERY_RANGE "
+                    f"({os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')})?"
+                )
+            if missing and not said and waited > SAID:
+                said = True
+                on_note(f"waiting for readers, {self._timeout:g} s at most: {'; '.join(missing)}")
+            pause()
+        others = [each.topic_name for each in self._writers if self._node.count_publishers(each.topic_name) > 1]
+        if others:
+            on_note(f"somebody else publishes too: {', '.join(others)}")
+
+    def _missing(self) -> list[str]:
+        """What is missing to begin, in words."""
+        few, without = [], dict[str, list[str]]()
+        for writer in self._awaited:
+            count = writer.get_subscription_count()
+            if count < self._subscribers:
+                few.append(f"{writer.topic_name} ({count})")
+            if self._readers:
+                infos = self._node.get_subscriptions_info_by_topic(writer.topic_name)
+                here = {info.node_name for info in infos}
+                here |= {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos}
+                for reader in self._readers:
+                    if reader not in here or count < 1:
+                        without.setdefault(reader, []).append(writer.topic_name)
+        lines = [f"fewer than {self._subscribers} read {', '.join(few)}"] if few else []
+        return lines + [f"{reader} does not read {', '.join(topics)}" for reader, topics in without.items()]

@@ -1,0 +1,200 @@
+"""The player on a terminal: keys, Ctrl-C, Ctrl-Z and `fg`, and what is said when nobody comes."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from recorded import contents, mcap
+
+PROGRAM = Path(sys.executable).with_name("msg-agents")
+SINGLE_KEYS = 0  # of ICANON and ECHO
+
+
+class Terminal:
+    """A program on a terminal of its own."""
+
+    def __init__(self, *command: str | Path) -> None:
+        self._master, slave = pty.openpty()
+        self.before = termios.tcgetattr(slave)
+        self._slave = slave
+        self.text = ""
+
+        def own() -> None:
+            os.setsid()
+            import fcntl
+
+            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+        self.process = subprocess.Popen(
+            command,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            preexec_fn=own,
+        )
+
+    def type(self, keys: bytes) -> None:
+        os.write(self._master, keys)
+
+    def mode(self) -> list[Any]:
+        return termios.tcgetattr(self._slave)
+
+    def local_flags(self) -> int:
+        """Whether lines are edited, and whether what is typed is shown."""
+        return int(termios.tcgetattr(self._slave)[3] & (termios.ICANON | termios.ECHO))
+
+    def read(self, seconds: float) -> str:
+        """What is printed within so much time."""
+        end, new = time.monotonic() + seconds, ""
+        while (left := end - time.monotonic()) > 0:
+            if select.select([self._master], [], [], left)[0]:
+                new += os.read(self._master, 65536).decode(errors="replace")
+        self.text += new
+        return new
+
+    def wait_for(self, *texts: str, seconds: float = 30) -> None:
+        """Until one of them is printed, wherever the lines are wrapped."""
+        end = time.monotonic() + seconds
+        while not any(text in self.text.replace("\r\n", "") for text in texts):
+            assert time.monotonic() < end, f"no {texts} in {self.text!r}"
+            self.read(0.1)
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        os.close(self._master)
+        os.close(self._slave)
+
+
+def state(pid: int) -> str:
+    """Of a process: T if it is stopped."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+@pytest.fixture
+def terminal(domain: int) -> Iterator[Any]:
+    opened: list[Terminal] = []
+
+    def start(*command: str | Path) -> Terminal:
+        opened.append(Terminal(*command))
+        return opened[-1]
+
+    yield start
+    for each in opened:
+        each.close()
+
+
+def test_keys_pause_and_step(network: Any, twin_bag: Path, plain: Any, terminal: Any) -> None:
+    """Paused, three steps give three messages; the space bar gives the rest; then the terminal is as it was."""
+    file = network.directory / "plain.mcap"
+    first = plain(file, {"/agent_3/state": 3})
+    screen = terminal(
+        PROGRAM, "play", twin_bag, "--paused", "--rate", "max", "--topics", "/agent_3/state", "--await", "plain"
+    )
+    screen.wait_for("paused")
+    for key in (b"s", b"\x1b[C", b"s"):
+        screen.type(key)
+        screen.read(0.2)
+    assert first.wait(timeout=60) == 0
+    assert contents(file) == {"/agent_3/state": contents(mcap(twin_bag))["/agent_3/state"][:3]}
+    assert screen.mode() != screen.before
+    screen.type(b" ")
+    screen.wait_for("301 messages played")
+    assert screen.process.wait(timeout=30) == 0
+    assert screen.mode() == screen.before
+
+
+def test_the_terminal_is_left_as_it_was(twin_bag: Path, terminal: Any) -> None:
+    """Whatever ends the player."""
+    screens = {number: terminal(PROGRAM, "play", twin_bag) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    for number, screen in screens.items():
+        screen.wait_for("x 1")
+        assert screen.mode() != screen.before
+        if number == signal.SIGINT:
+            screen.type(b"\x03")
+        else:
+            screen.process.send_signal(number)
+        assert screen.process.wait(timeout=30) == 128 + number
+        assert screen.mode() == screen.before
+        screen.read(0.2)
+        assert "Traceback" not in screen.text
+
+
+def test_stopped_and_continued(network: Any, twin_bag: Path, terminal: Any) -> None:
+    """Ctrl-Z twice, `fg`, `bg` and `fg`, under a shell: while it stands the terminal is as the shell left it.
+
+    The time that it stands is no time of the bag. A shell that restores nothing by itself shows most.
+    """
+    screen = terminal("/bin/sh", "-i")
+    screen.wait_for("$ ", "# ")
+    usual = screen.local_flags()
+    began = time.monotonic()
+    screen.type(f"{PROGRAM} play {twin_bag} --rate 0.5\n".encode())
+    screen.wait_for("x 0.5")
+    assert screen.local_flags() == SINGLE_KEYS
+    (player,) = network.processes("play")
+    stood = 0.0
+    for continued in (b"fg\n", b"bg\n"):
+        screen.type(b"\x1a")
+        network.wait_for(lambda: state(player.pid) == "T", 10, "a stopped player")
+        standing = time.monotonic()
+        assert screen.local_flags() == usual
+        screen.read(1.5)
+        stood += time.monotonic() - standing
+        screen.type(continued)
+        network.wait_for(lambda: state(player.pid) != "T", 10, "a player that goes on")
+    assert screen.local_flags() == usual
+    screen.type(b"fg\n")
+    network.wait_for(lambda: screen.local_flags() == SINGLE_KEYS, 10, "single keys")
+    screen.type(b" ")
+    screen.wait_for("paused")
+    screen.type(b"\x03")
+    screen.wait_for("stopped at")
+    took = time.monotonic() - began - stood
+    found = re.search(r"stopped at ([\d.]+) s of the bag", screen.text)
+    assert found is not None
+    assert 0 < float(found[1]) <= 0.5 * took
+    network.wait_for(lambda: not network.processes("play"), 10, "the end of the player")
+    assert screen.local_flags() == usual
+
+
+def test_standing_is_no_time_of_the_bag_without_a_terminal(network: Any, domain: int, twin_bag: Path) -> None:
+    """SIGSTOP, of which no process hears, and no stdin at all: 3 s of the bag take 3 s beside the 2 s that it stood."""
+    began = time.monotonic()
+    played = subprocess.Popen(
+        ["/bin/sh", "-c", f"exec {PROGRAM} play {twin_bag} --duration 3 --topics graph --clock 50 <&-"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(2.5)
+    played.send_signal(signal.SIGSTOP)
+    time.sleep(2.0)
+    played.send_signal(signal.SIGCONT)
+    _, stderr = played.communicate(timeout=60)
+    assert played.returncode == 0, stderr
+    assert "messages played" in stderr
+    assert time.monotonic() - began > 0.8 + 3.0 + 2.0  # it looks for readers for 0.8 s at least
+
+
+def test_ctrl_c_while_waiting_for_readers(network: Any, twin_bag: Path, terminal: Any) -> None:
+    """It says for whom it waits, and what was played: nothing."""
+    screen = terminal(PROGRAM, "play", twin_bag, "--await", "nobody")
+    screen.wait_for("waiting for readers, 30 s at most: nobody does not read /agent_1/state")
+    screen.type(b"\x03")
+    assert screen.process.wait(timeout=30) == 130
+    assert screen.mode() == screen.before
+    screen.wait_for("stopped before it began")
+    assert "Traceback" not in screen.text
