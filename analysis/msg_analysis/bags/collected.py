@@ -7,6 +7,7 @@ these only a few numbers per state are kept, whatever the length of the bag.
 from __future__ import annotations
 
 from collections import Counter
+from functools import cached_property
 
 import numpy as np
 
@@ -145,9 +146,9 @@ class Collected:
         self._width = width
         self._graphs = len(experiment.graph_list)
         self._realtime = experiment.run.pace == "realtime"
-        watched = experiment.noise.loss or self._realtime
-        self._links = _Links(build_model(experiment), experiment.steps) if watched else None
-        most = self._links.most if self._links else 0
+        self._experiment = experiment
+        self._lossy = bool(experiment.noise.loss) or self._realtime
+        most = self._links.most if self._lossy else 0
         cells = self._shape[0] * self._shape[1]
         # The record alone says how large the result is, however little of it the bag holds.
         needed, available = 8 * cells * (width + _OTHER_COLUMNS + most), available_memory()
@@ -162,7 +163,7 @@ class Collected:
             self._used = np.zeros((cells, most if self._realtime else 0), dtype=np.int64)
             self._made = np.zeros(cells if self._realtime else 0, dtype=np.int64)
             self._lost = np.zeros((cells, 0 if self._realtime else most), dtype=np.bool_)
-            self._listed = np.zeros(cells if self._links else 0, dtype=np.bool_)  # whether ``heard`` said something
+            self._listed = np.zeros(cells if self._lossy else 0, dtype=np.bool_)  # whether ``heard`` said something
         except (MemoryError, ValueError) as error:
             raise BagError(
                 f"run {record.run}: {experiment.steps} steps of {experiment.agents} agents need {amount(needed)}, "
@@ -203,6 +204,11 @@ class Collected:
         self.refused["contradicts an earlier copy"] += int(differs.sum())
         self._contradicted.append(np.unique(cell[again[differs]]))
 
+    @cached_property
+    def _links(self) -> _Links:
+        """Made when the first ``heard`` has to be understood: most runs have none."""
+        return _Links(build_model(self._experiment), self._experiment.steps)
+
     def _good(self, states: States) -> tuple[States, FloatArray]:
         """Those that can be states of this run, and their values; the others are counted."""
         right = states.replicas == self._width
@@ -224,8 +230,8 @@ class Collected:
                 good &= ~bad
         if not good.all():
             states, values = states[good], values[good]
-        if self._links:
-            fits = self._links.fit(states, realtime=self._realtime)
+        if self._lossy or states.heard_count.any():
+            fits = self._links.fit(states, realtime=self._realtime, lossy=self._lossy)
             self.refused["heard what it cannot have"] += int((~fits).sum())
             states, values = states[fits], values[fits]
         return states, values
@@ -233,7 +239,7 @@ class Collected:
     def _write(self, cell: IntArray, states: States, values: FloatArray) -> None:
         self._states[cell] = values
         self._modes[cell] = states.mode
-        if not self._links:
+        if not self._lossy:
             return
         heard = states.heard(self._links.most)
         self._listed[cell] = states.heard_count > 0
@@ -246,8 +252,8 @@ class Collected:
 
     def _differ(self, cell: IntArray, states: States, values: FloatArray) -> BoolArray:
         """Which of these copies say something else than the first ones, which are in their places."""
-        differs = (values != self._states[cell]).any(axis=1)
-        if self._links:
+        differs = (values != self._states[cell]).any(axis=1) | (states.mode != self._modes[cell])
+        if self._lossy:
             differs |= (states.heard(self._links.most) != self._heard(cell)).any(axis=1)
         if self._realtime:
             differs |= states.stamp + 1 != self._made[cell]
@@ -255,7 +261,6 @@ class Collected:
 
     def _heard(self, cell: IntArray) -> AnyArray:
         """(cells, D) what ``heard`` said in the copies that were taken."""
-        assert self._links
         step, agent = np.divmod(cell, self._shape[1])
         count = self._links.neighbours(self._modes[cell], agent) * self._listed[cell]
         if self._realtime:
@@ -285,7 +290,7 @@ class Collected:
             self._made -= 1
             self.used = self._used.reshape(*self._shape, self._used.shape[1])[1:]
             self.made = self._made.reshape(self._shape)
-        elif self._links:
+        elif self._lossy:
             self.lost = self._lost.reshape(*self._shape, self._lost.shape[1])[1:]
 
 
@@ -323,14 +328,17 @@ class _Links:
         """How many these agents (from 0) have under these graphs (from 1; 0: none, at step 0)."""
         return np.asarray(self._neighbours[mode, agent])
 
-    def fit(self, states: States, *, realtime: bool) -> BoolArray:
-        """Whether what they heard is, for each neighbour under their graph, a step that can be, or ``LOST``.
+    def fit(self, states: States, *, realtime: bool, lossy: bool) -> BoolArray:
+        """Whether what they heard is, for each neighbour under their graph, a step that can be.
 
-        In lockstep that is the step before, and nothing at all says the same of all neighbours.
+        In lockstep that is the step before, and nothing at all says the same of all neighbours. Where messages can be
+        lost it may be ``LOST``.
         """
         heard, count = states.heard(self.most), states.heard_count
         before = (states.step.astype(np.uint64) - np.uint64(1))[:, None]
         possible = heard <= self._last if realtime else heard == before
-        known = (heard == LOST) | possible | (np.arange(self.most) >= count[:, None])
+        if lossy:
+            possible |= heard == LOST
+        known = possible | (np.arange(self.most) >= count[:, None])
         fits = (count == self.neighbours(states.mode, states.agent - 1)) & known.all(axis=1)
         return np.asarray(fits if realtime else fits | (count == 0))

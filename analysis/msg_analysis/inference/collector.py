@@ -80,7 +80,8 @@ class StepCollector:
         before = row.payloads[agent]
         if before is not None:
             self.refused[AGAIN] += 1
-            if before != payload and row.usable:
+            differs = before != payload or (self._lockstep and mode != row.mode)
+            if differs and row.usable:
                 row.usable = False  # nobody knows which of them is forged
                 self.refused[CONTRADICTION] += 1
             return

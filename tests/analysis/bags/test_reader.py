@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -19,6 +20,7 @@ from msg_analysis.bags.cdr import ActiveGraph, AgentState, encode_string
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
 from msg_analysis.errors import BagError, InputError
+from msg_analysis.model.step import build_model
 from msg_analysis.model.trajectory import Trajectory
 
 Message = tuple[str, str, bytes, int]  # topic, type, data, time
@@ -126,12 +128,14 @@ def test_namespace_foreign_topics_and_split_files(tmp_path: Path, make_run: Make
 
 def test_states_with_frame_and_heard_and_in_big_endian(tmp_path: Path, make_run: MakeRun, typestore: Any) -> None:
     run = make_run(steps=8)
+    model = build_model(run.record.experiment)
     messages = _messages(run)
     kind = AGENT_STATE.full_name
     for index, (topic, name, data, time) in enumerate(messages):
         if name == kind and index % 2:
             state = AgentState.decode(data)
-            heard = np.array([max(state.step, 1) - 1], np.uint64)
+            neighbours = model.neighbours(state.mode - 1, state.agent - 1) if state.step else ()
+            heard = np.full(len(neighbours), max(state.step, 1) - 1, np.uint64)
             other = _state(run, state.step, state.agent - 1, frame_id="map", heard=heard).encode()
             messages[index] = (topic, name, other, time)
         elif name == kind:
@@ -214,6 +218,20 @@ def test_contradicting_copies_count_as_missing(tmp_path: Path, make_run: MakeRun
     assert found.completeness.missing == 1
     assert np.argwhere(~found.present).tolist() == [[4, 0]]
     assert np.array_equal(found.states[found.present], run.states[found.present])
+
+
+def test_copies_with_another_graph_contradict(tmp_path: Path, make_run: MakeRun) -> None:
+    """A copy that heard what cannot be in such a run is not even a copy: it is refused, and the state stays."""
+    run = make_run()
+    state = _state(run, 4, 0)
+    forged = dataclasses.replace(state, mode=3 - state.mode)
+    deaf = dataclasses.replace(_state(run, 5, 1), heard=np.array([0, 0, 0, 0, 0], np.uint64))
+    copies = [("/agent_1/state", AGENT_STATE.full_name, forged.encode(), 5)]
+    copies += [("/agent_2/state", AGENT_STATE.full_name, deaf.encode(), 5)]
+    found = read_bag(_mcap(tmp_path / "x.mcap", _messages(run) + copies))
+    assert found.completeness.refused == {"contradicts an earlier copy": 1, "heard what it cannot have": 1}
+    assert (found.completeness.duplicates, found.completeness.missing) == (1, 1)
+    assert np.argwhere(~found.present).tolist() == [[4, 0]]
 
 
 def test_gaps_and_overlaps_of_sojourns(tmp_path: Path, make_run: MakeRun) -> None:

@@ -105,7 +105,8 @@ def _rules(messages: list[Any], kind: str) -> dict[str, Any]:
         heard = [int(step) for step in message.heard]
         expected = NEIGHBOURS[message.mode][message.agent - 1] if message.mode < 3 and 1 <= message.agent <= 3 else 0
         possible = range(STEPS + 1) if kind == "realtime" else [message.step - 1]
-        silent = not heard and kind == "loss"
+        possible = [*possible, *([] if kind == "plain" else [LOST])]
+        silent = not heard and kind != "realtime"
         reasons = {
             "other run": bytes(message.run) != RECORDS[kind].run.bytes,
             "wrong length": len(message.state) != WIDTH,
@@ -114,16 +115,15 @@ def _rules(messages: list[Any], kind: str) -> dict[str, Any]:
             "unknown mode": message.mode > 2,
             "not finite": not np.isfinite(message.state).all(),
             "stamped before the start": kind == "realtime" and stamp < 0,
-            "heard what it cannot have": kind != "plain"
-            and not silent
-            and (len(heard) != expected or any(step != LOST and step not in possible for step in heard)),
+            "heard what it cannot have": not silent
+            and (len(heard) != expected or any(step not in possible for step in heard)),
         }
         reason = next((reason for reason, holds in reasons.items() if holds), None)
         if reason:
             refused[reason] += 1
             continue
         cell = (message.step, message.agent - 1)
-        said = [message.state.tolist()]
+        said = [message.state.tolist(), message.mode]
         said += [] if kind == "plain" else [[*heard, 0, 0][:2]]
         said += [stamp] if kind == "realtime" else []
         if cell not in first:

@@ -202,7 +202,8 @@ def test_a_step_is_ready_with_the_next_one() -> None:
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [
-        ((0, 1, 1, 9.0), "contradicts an earlier copy"),
+        ((0, 1, 2, 9.0), "contradicts an earlier copy"),
+        ((0, 1, 1, 3.0), "contradicts an earlier copy"),
         ((0, 1, 2, math.nan), "not finite"),
         ((0, 1, 1, 3.0), "agents used different graphs"),
     ],
@@ -210,8 +211,7 @@ def test_a_step_is_ready_with_the_next_one() -> None:
 def test_what_cannot_be_trusted_does_not_count(wrong: tuple[int, int, int, float], reason: str) -> None:
     good = [(i, k, min(k, 1) * 2, 3.0) for k in range(5) for i in (0, 1)]
     if reason == "contradicts an earlier copy":
-        states = [*good[:3], wrong, *good[3:]]
-        states[2], states[3] = (0, 1, 2, 3.0), (0, 1, 2, 9.0)
+        states = [*good[:3], wrong, *good[3:]]  # right behind the true one
     else:
         states = [wrong if entry[:2] == wrong[:2] else entry for entry in good]
     collector, steps = collect(*states)
