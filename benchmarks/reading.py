@@ -63,6 +63,29 @@ def make_bag(directory: Path, states: int, replicas: int) -> None:
     write_trajectory(simulate(Experiment.parse(document)), directory)
 
 
+def without_chunks(directory: Path) -> None:
+    """The same bag as `ros2 bag record --storage-preset-profile fastwrite` would have it, by mcap's own writer."""
+    from mcap.reader import make_reader
+    from mcap.writer import IndexType, Writer
+
+    (file,) = directory.glob("*.mcap")
+    loose = file.with_suffix(".loose")
+    with file.open("rb") as source, loose.open("wb") as target:
+        writer = Writer(target, use_chunking=False, index_types=IndexType.NONE)
+        writer.start("ros2")
+        numbers: dict[int, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages(log_time_order=False):
+            if channel.id not in numbers:
+                assert schema is not None
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            writer.add_message(numbers[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    loose.replace(file)
+
+
 def read_bag(directory: Path) -> Reading:
     """The reader of this software."""
     from msg_analysis.bags.reader import read_bag as read
@@ -147,11 +170,14 @@ def main() -> None:
     parser.add_argument("--replicas", type=int, default=1, help="numbers in a state")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", action="store_true", help="only the reader of this software")
+    parser.add_argument("--without-chunks", action="store_true", help="messages one after the other, not in chunks")
     arguments = parser.parse_args()
     names = list(READERS)[:1] if arguments.only else list(READERS)
     with tempfile.TemporaryDirectory() as workshop:
         bag = Path(workshop) / "bag"
         in_fresh_process(make_bag, bag, arguments.states, arguments.replicas)
+        if arguments.without_chunks:
+            in_fresh_process(without_chunks, bag)
         size = sum(file.stat().st_size for file in bag.glob("*.mcap"))
         readings = measure(bag, arguments.rounds, names)
     ours = readings[names[0]]

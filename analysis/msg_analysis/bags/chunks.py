@@ -25,6 +25,7 @@ _CHUNK = struct.Struct("<QQQII")  # start and end time, size, CRC (0: none), len
 _INDEX_HEAD = 6  # bytes before the entries of a message index record: channel, length; an entry is (time, place)
 _RECORD_HEAD = np.dtype([("opcode", "u1"), ("length", "<u8")])
 _LENGTH = struct.Struct("<Q")
+_ALIKE = 16  # records of equal length, after which more are expected
 
 
 class DamageError(Exception):
@@ -133,6 +134,58 @@ def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | N
     end = start + size
     followed = start[0] == RECORD.size and end[-1] == len(data) and (start[1:] - end[:-1] == RECORD.size).all()
     return (start, size) if followed and (head["opcode"] == Opcode.MESSAGE).all() else None
+
+
+def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
+    """Find the whole message records that follow upon each other from some place on.
+
+    Where the lengths differ they are walked one by one; after some of equal length, all more of them are found at once.
+
+    Parameters
+    ----------
+    data : bytes
+        a part of a file
+    at : int
+        where a record begins
+
+    Returns
+    -------
+    tuple[IntArray, IntArray, int]
+        (messages,) where the content of each begins, and its size; where what is no whole message record begins
+    """
+    starts: list[IntArray] = []
+    sizes: list[IntArray] = []
+    walked: list[tuple[int, int]] = []
+    before, alike, end = -1, 0, len(data) - RECORD.size
+
+    def keep_walked() -> None:
+        if walked:
+            places = np.array(walked, dtype=np.int64)
+            starts.append(places[:, 0])
+            sizes.append(places[:, 1])
+            walked.clear()
+
+    while at <= end:
+        opcode, length = RECORD.unpack_from(data, at)
+        step = RECORD.size + length
+        if opcode != Opcode.MESSAGE or at + step > len(data):
+            break
+        alike = alike + 1 if length == before else 0
+        before = length
+        if alike < _ALIKE:
+            walked.append((at + RECORD.size, length))
+            at += step
+            continue
+        heads: AnyArray = np.ndarray((len(data) - at) // step, _RECORD_HEAD, data, at, (step,))
+        others = np.flatnonzero((heads["opcode"] != Opcode.MESSAGE) | (heads["length"] != length))
+        count = int(others[0]) if len(others) else len(heads)
+        keep_walked()
+        starts.append(at + RECORD.size + step * np.arange(count))
+        sizes.append(np.full(count, length))
+        at, before = at + step * count, -1
+    keep_walked()
+    none = np.empty(0, dtype=np.int64)
+    return np.concatenate([none, *starts]), np.concatenate([none, *sizes]), at
 
 
 def _is_index(record: bytes) -> bool:

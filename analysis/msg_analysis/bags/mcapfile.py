@@ -15,12 +15,12 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
-from msg_analysis.bags.chunks import LIMIT, MESSAGE_HEAD, RECORD, DamageError, gather, locate, unpack
+from msg_analysis.bags.chunks import LIMIT, MESSAGE_HEAD, RECORD, DamageError, gather, locate, run_of_messages, unpack
 from msg_analysis.errors import BagError
 from msg_analysis.types import AnyArray, BoolArray, IntArray
 
 MAGIC = b"\x89MCAP0\r\n"
-_LOOSE = 2**18  # messages that are not in chunks are collected into batches of so many bytes
+_LOOSE = 2**18  # messages that are not in chunks are taken in batches of so many bytes
 _ZSTD = ".zstd"  # suffix of rosbag2's compression mode `file`
 
 
@@ -97,6 +97,50 @@ class _Chunk:
             self.index.append(content)
 
 
+class _Source:
+    """A stream of records, of which messages that follow upon each other are taken many at a time.
+
+    Parameters
+    ----------
+    stream : of which nothing else reads
+    """
+
+    def __init__(self, stream: io.BufferedReader) -> None:
+        self._stream = stream
+        self._buffer, self._at = b"", 0  # read from the stream already, and how much of that has been given out
+
+    def read(self, size: int) -> bytes:
+        """So many bytes; fewer at the end."""
+        found = self._buffer[self._at : self._at + size]
+        self._at += size
+        if len(found) < size:
+            self._buffer, self._at = b"", 0
+            found += self._stream.read(size - len(found))
+        return found
+
+    def messages(self, head: bytes) -> tuple[bytes, IntArray, IntArray, int]:
+        """Whole message records, the first of which has this head, which was the last that was read.
+
+        Returns
+        -------
+        the bytes in which they are; (messages,) where the content of each begins there, and its size; bytes of all:
+        0 where the first is too long for this, or cut off
+        """
+        if self._at >= len(head):
+            self._at -= len(head)
+        else:
+            self._buffer, self._at = head, 0
+        for _ in range(2):
+            start, size, end = run_of_messages(self._buffer, self._at)
+            if len(start):
+                break
+            self._buffer, self._at = self._buffer[self._at :] + self._stream.read(_LOOSE), 0
+        length, self._at = end - self._at, end
+        if not length:
+            self._at += len(head)  # as before
+        return self._buffer, start, size, length
+
+
 @dataclass(slots=True)
 class McapFile:
     """An MCAP file that is read once, from front to back, by iterating over ``batches()``.
@@ -155,10 +199,8 @@ class McapFile:
         _keep_memory()
         zstd = zstandard.ZstdDecompressor()
         chunk: _Chunk | None = None
-        loose: list[bytes] = []
-        filled = end = 0  # bytes in the list, and of the file up to their end
         with ThreadPoolExecutor(1) as unpacker:  # works on the next chunk while whoever reads works on this one
-            for opcode, content in self._records(stream, size):
+            for opcode, content, places in self._records(_Source(stream), size):
                 if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
                     chunk.add_index(content)
                     continue
@@ -167,21 +209,16 @@ class McapFile:
                     chunk = _Chunk(unpacker.submit(unpack, content, zstd), self.whole_bytes)
                 if before is not None:
                     yield from self._chunk(before)
-                if loose and (opcode == Opcode.CHUNK or filled > _LOOSE):
-                    yield _loose_batch(loose, end)
-                    loose, filled = [], 0
                 if opcode == Opcode.MESSAGE:
-                    loose.append(content)
-                    filled, end = filled + len(content), self.whole_bytes
+                    yield _loose_batch(content, *places, self.whole_bytes)
                 elif opcode != Opcode.CHUNK:
                     with contextlib.suppress(DamageError):
                         self._note(opcode, content)
             if chunk is not None:
                 yield from self._chunk(chunk)
-        if loose:
-            yield _loose_batch(loose, end)
 
-    def _records(self, stream: io.BufferedReader, size: int) -> Iterator[tuple[int, bytes]]:
+    def _records(self, stream: _Source, size: int) -> Iterator[tuple[int, bytes, tuple[IntArray, IntArray]]]:
+        """Opcode and content of each record; of messages many at once, with the places of the content of each."""
         while True:
             head = stream.read(RECORD.size)
             if len(head) < RECORD.size:
@@ -189,6 +226,12 @@ class McapFile:
                 return
             opcode, length = RECORD.unpack(head)
             content = b""
+            if opcode == Opcode.MESSAGE:
+                data, start, sizes, whole = stream.messages(head)
+                if whole:
+                    self.whole_bytes += whole
+                    yield opcode, data, (start, sizes)
+                    continue
             if not opcode:  # a power cut leaves zeros
                 self.torn = f"no record at byte {self.whole_bytes}, where one should be"
                 return
@@ -202,7 +245,7 @@ class McapFile:
                 if stream.read(len(MAGIC)) != MAGIC:
                     self.torn = "the closing magic bytes are missing"
                 return
-            yield opcode, content
+            yield opcode, content, (np.array([0]), np.array([length]))
 
     def _note(self, opcode: int, content: bytes) -> None:
         stream = ReadDataStream(io.BytesIO(content))
@@ -260,10 +303,8 @@ def _keep_memory() -> None:
     np.empty(2**24, np.uint8)
 
 
-def _loose_batch(contents: list[bytes], end: int) -> Batch:
+def _loose_batch(data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
     """Messages that are not in a chunk; those that are damaged are left out one by one."""
-    size = np.array([len(content) for content in contents])
-    data, start = b"".join(contents), np.cumsum(size) - size
     start, size = start[size >= MESSAGE_HEAD.itemsize], size[size >= MESSAGE_HEAD.itemsize]
     timed = ~_no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
     return Batch.of_contents(data, start[timed], size[timed], end)
