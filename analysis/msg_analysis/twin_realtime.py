@@ -8,10 +8,11 @@ import numpy as np
 
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.law import step
-from msg_analysis.model.realtime import phases, times_ns
+from msg_analysis.model.realtime import phases
 from msg_analysis.model.reception import padded_inputs
 from msg_analysis.model.sequential import ideal_uses
 from msg_analysis.model.step import StepModel
+from msg_analysis.model.steptime import StepClock
 from msg_analysis.types import FloatArray, IntArray
 
 
@@ -55,7 +56,7 @@ class IdealTimers:
         used = np.where(ahead >= 0, np.arange(steps)[:, None, None] + ahead, -1)
         made = np.zeros((steps + 1, model.agents), dtype=np.int64)
         for i in range(model.agents):
-            made[1:, i] = times_ns(np.arange(steps), self._dt, float(phase[i]))
+            made[1:, i] = StepClock(self._dt, float(phase[i])).times(np.arange(steps))
         return agent_modes, used, made
 
 

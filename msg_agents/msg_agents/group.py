@@ -16,7 +16,8 @@ from msg_agents.qos import LATCHED
 from msg_agents.realtime import RealtimeAgent
 from msg_agents.synchronizer import AGAIN, Refusal
 from msg_agents.turns import Turns
-from msg_analysis.bags.cdr import ActiveGraph, CdrError
+from msg_analysis.bags.cdr import ActiveGraph
+from msg_analysis.bags.cdr_stream import CdrError
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import Wiring
 

@@ -36,10 +36,12 @@ from msg_agents.process import SPIN_SLICE, leave, make_executor
 from msg_agents.qos import LATCHED, NEWEST, STREAM
 from msg_agents.quiet import QuietNode
 from msg_agents.timers import every
-from msg_analysis.bags.cdr import SECOND, CdrError, Progress, StateFrame, StepClock, decode_string
+from msg_analysis.bags.cdr import Progress, StateFrame, decode_string
+from msg_analysis.bags.cdr_stream import CdrError
 from msg_analysis.errors import InputError
 from msg_analysis.inference.online import LiveEstimate, LiveReport
 from msg_analysis.model.record import RunRecord
+from msg_analysis.model.steptime import SECOND, StepClock
 
 ESTIMATE_TOPIC = "estimate"
 PERIOD = 1.0  # s between two estimates

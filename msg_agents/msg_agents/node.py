@@ -17,9 +17,11 @@ from msg_agents.network import RECORDER, SWITCHER
 from msg_agents.qos import LATCHED
 from msg_agents.quiet import QuietNode
 from msg_agents.synchronizer import Refusal
-from msg_analysis.bags.cdr import AgentState, CdrError, Progress, StepClock
+from msg_analysis.bags.cdr import AgentState, Progress
+from msg_analysis.bags.cdr_stream import CdrError
 from msg_analysis.errors import InputError
 from msg_analysis.model.record import RunRecord
+from msg_analysis.model.steptime import StepClock
 
 EXPERIMENT_TOPIC = "experiment"
 GRAPH_TOPIC = "graph"

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 
-SECOND = 1_000_000_000  # ns
+from msg_analysis.model.steptime import SECOND
 
 
 class PlayClock:

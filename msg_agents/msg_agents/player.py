@@ -22,13 +22,14 @@ from msg_agents.bagtypes import check_definitions, message_classes
 from msg_agents.errors import RCLError
 from msg_agents.jobcontrol import JobControl
 from msg_agents.keyboard import Keyboard
-from msg_agents.playclock import SECOND, PlayClock
+from msg_agents.playclock import PlayClock
 from msg_agents.process import leave
 from msg_agents.qos import LATCHED, STREAM
 from msg_agents.quiet import QuietNode
 from msg_agents.selection import parse_remaps, select_topics
 from msg_analysis.bags.playback import Message, Playback
 from msg_analysis.errors import InputError
+from msg_analysis.model.steptime import SECOND
 
 POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
 LOOK = 0.05  # s between two looks at the keyboard

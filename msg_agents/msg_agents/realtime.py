@@ -13,12 +13,13 @@ from msg_agents.health import Health
 from msg_agents.newest import NOTHING, Newest
 from msg_agents.node import EPOCH_TOPIC, NOT_AN_AGENT, OTHER_RUN, state_topic, why_not
 from msg_agents.qos import LATCHED
-from msg_agents.schedule import MARGIN, SECOND, Schedule
+from msg_agents.schedule import MARGIN, Schedule
 from msg_agents.timers import DueTimer
 from msg_analysis.bags.cdr import ActiveGraph, stamp_ns
 from msg_analysis.model.air import LOST
 from msg_analysis.model.payload import all_finite
 from msg_analysis.model.realtime import phases
+from msg_analysis.model.steptime import SECOND
 
 AT_ONCE = 64
 """Late steps that are made before the middleware gets its turn: messages, timers, signals."""

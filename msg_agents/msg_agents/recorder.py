@@ -32,7 +32,8 @@ from msg_agents.node import (
 from msg_agents.qos import LATCHED, STREAM
 from msg_agents.synchronizer import AGAIN, Refusal
 from msg_agents.timers import every
-from msg_analysis.bags.cdr import ActiveGraph, CdrError, StateFrame, decode_string, stamp_ns
+from msg_analysis.bags.cdr import ActiveGraph, StateFrame, decode_string, stamp_ns
+from msg_analysis.bags.cdr_stream import CdrError
 from msg_analysis.bags.schemas import network_topics
 from msg_analysis.bags.storage import DEFAULT, Storage
 from msg_analysis.bags.writer import BagWriter

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-SECOND = 1_000_000_000  # ns
+from msg_analysis.model.steptime import SECOND, StepClock
+
 MARGIN = 1.0
 """s of the clock by which somebody else's clock, or news of it, may be ahead of ours."""
 
@@ -12,7 +13,7 @@ MARGIN = 1.0
 class Schedule:
     """Simulated time on a clock, and the steps of one agent in it.
 
-    Step k, from x(k) to x(k+1), is due at simulated time (k + phase) dt.
+    Step k, from x(k) to x(k+1), is due at simulated time (k + phase) dt: see ``StepClock``.
 
     Parameters
     ----------
@@ -25,8 +26,8 @@ class Schedule:
     def __init__(self, *, epoch: int, speed: float, step_length: float, phase: float = 0.0) -> None:
         self.epoch = epoch
         self._speed = speed
-        self._dt = step_length * SECOND
-        self._phase = phase
+        self._steps = StepClock(step_length, phase)
+        self._dt, self._phase = self._steps.step_ns, phase
 
     def simulated(self, now: int) -> int:
         """Simulated time [ns] when the clock says ``now`` [ns]; negative before the epoch."""
@@ -34,7 +35,7 @@ class Schedule:
 
     def due(self, step: int) -> int:
         """Simulated time [ns] at which a step is due."""
-        return round((step + self._phase) * self._dt)
+        return self._steps.nanoseconds(step)
 
     def clock_time(self, step: int) -> int:
         """Time of the clock [ns] at which a step is due; not earlier."""

@@ -28,12 +28,13 @@ from msg_agents.node import (
     agent_name,
 )
 from msg_agents.qos import LATCHED
-from msg_agents.schedule import SECOND, Schedule
+from msg_agents.schedule import Schedule
 from msg_agents.timers import DueTimer, every
 from msg_analysis.bags.cdr import ActiveGraph, Progress, encode_string
 from msg_analysis.model.path import Sojourn, sojourns
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import Wiring
+from msg_analysis.model.steptime import SECOND
 
 AHEAD = 1000
 """Sojourns that are published before the slowest agent reaches them. Enough never to be waited for; bounded, so that a

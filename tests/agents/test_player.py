@@ -6,9 +6,10 @@ import math
 
 import pytest
 
-from msg_agents.playclock import SECOND, PlayClock
+from msg_agents.playclock import PlayClock
 from msg_agents.selection import parse_remaps, select_topics
 from msg_analysis.errors import InputError
+from msg_analysis.model.steptime import SECOND
 
 TOPICS = ["/experiment", "/graph", "/agent_1/state", "/agent_2/state", "/lab/agent_1/state"]
 

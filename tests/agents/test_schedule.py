@@ -8,7 +8,8 @@ from fractions import Fraction
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.schedule import SECOND, Schedule
+from msg_agents.schedule import Schedule
+from msg_analysis.model.steptime import SECOND
 
 DAY = 86_400 * SECOND
 speeds = st.floats(1e-3, 1e3)

@@ -6,7 +6,7 @@ import pytest
 from msg_analysis.model.agent import agent_law
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.payload import from_payload, to_payload
-from msg_analysis.model.realtime import phases, times_ns
+from msg_analysis.model.realtime import phases
 from msg_analysis.model.step import build_step_model
 from msg_analysis.report.theory import describe_transient
 from msg_analysis.theory.prediction import predict
@@ -57,13 +57,6 @@ def test_phases_are_spread_over_the_period():
     found = {tuple(phases(experiment(run={"seed": seed}))) for seed in range(40)}
     assert len(found) == 6  # all orders of three agents
     assert {tuple(sorted(phase)) for phase in found} == {(0.5 / 3, 1.5 / 3, 2.5 / 3)}
-
-
-@pytest.mark.parametrize("dt", [0.1, 0.3, 1 / 3, 0.007])
-def test_times_do_not_drift(dt):
-    steps = np.array([0, 1, 3, 10_000_019])
-    exact = [round(k * dt * 1e9) for k in steps.tolist()]
-    np.testing.assert_allclose(times_ns(steps, dt), exact, rtol=1e-15, atol=1)
 
 
 def test_transients_are_those_of_the_sequential_law():

@@ -1,9 +1,4 @@
-"""The network's messages as CDR bytes, without ROS (OMG CDR, or XCDR1, as ROS 2 middleware sends it).
-
-Layout: a 4-byte encapsulation header (00 01: little-endian, 00 00: big-endian, two bytes of options), then
-the fields in order, each primitive aligned to its own size, counted from the end of the header. A string is
-its length with the closing NUL (uint32), its UTF-8 bytes and the NUL; a sequence is its length (uint32) and
-its elements.
+"""The network's messages as CDR bytes, without ROS: see :mod:`msg_analysis.bags.cdr_stream` for what those are.
 
 Two ways in: the message classes read and write anything that is valid; :class:`StateCodec` and
 :class:`StateFrame` do the one layout that the agents themselves send (empty ``frame_id``), which without
@@ -16,22 +11,14 @@ import contextlib
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
+from msg_analysis.bags.cdr_stream import HEADER_SIZE, LITTLE_ENDIAN, RUN_SIZE, CdrError, CdrReader, CdrWriter
 from msg_analysis.model.payload import to_payload
+from msg_analysis.model.steptime import SECOND, StepClock
 from msg_analysis.types import AnyArray, FloatArray
-
-LITTLE_ENDIAN = b"\x00\x01\x00\x00"
-HEADER_SIZE = 4
-RUN_SIZE = 16
-SECOND = 1_000_000_000  # ns
-# Bytes that may follow a message: Fast DDS aligns the end as if elements followed an empty sequence of 8-byte
-# numbers, and fills up to a multiple of four.
-_MAX_PADDING = 7
 
 _STAMP = {b"\x00\x01": struct.Struct("<4xiI"), b"\x00\x00": struct.Struct(">4xiI")}
 # Encapsulation, sec, nanosec, frame_id (1, NUL), run, agent, step, mode, len(heard) (0), len(state).
@@ -42,30 +29,6 @@ _STATE_FIXED = struct.Struct("<4s8x21s3xI4xQIII4x")
 _HEARD = struct.Struct("<I")
 _HEARD_START = _STATE.size - 8
 _LENGTH = struct.Struct("<I4x")  # of the state, before it
-
-
-class CdrError(ValueError):
-    """Bytes that are not the expected message. The text names the field and what is wrong with it."""
-
-
-class StepClock:
-    """Simulated time of the steps in whole nanoseconds, free of rounding drift.
-
-    Parameters
-    ----------
-    dt : length of a step [units of simulated time, written as seconds]; its decimal text counts: 0.1 is one
-        tenth
-    """
-
-    def __init__(self, dt: float) -> None:
-        step = Fraction(repr(float(dt))) * SECOND
-        self._numerator, self._denominator = step.numerator, step.denominator
-
-    def nanoseconds(self, step: int) -> int:
-        """Time k dt of step k, rounded to the nearest nanosecond (a half goes up)."""
-        if self._denominator == 1:
-            return step * self._numerator
-        return (2 * step * self._numerator + self._denominator) // (2 * self._denominator)
 
 
 def stamp_ns(data: bytes) -> int:
@@ -184,109 +147,6 @@ def with_state(data: bytes, payload: bytes, size: int | None = None) -> bytes:
     return data[: len(data) - size - _LENGTH.size] + _LENGTH.pack(len(payload) // 8) + payload
 
 
-_NUMBERS = {order: {code: struct.Struct(order + code) for code in "iIQ"} for order in "<>"}
-
-
-class _Reader:
-    """Takes fields off CDR bytes; checks every length before it makes anything of it."""
-
-    def __init__(self, data: bytes, kind: str) -> None:
-        self._kind = kind
-        if len(data) < HEADER_SIZE or data[0] != 0 or data[1] > 1:
-            start = bytes(data[:HEADER_SIZE]).hex(" ") or "nothing"
-            raise CdrError(f"{kind}: begins with {start}, expected a CDR header 00 01 00 00")
-        self._data, self._order = data, "<" if data[1] else ">"
-        self._numbers = _NUMBERS[self._order]
-        self._at = HEADER_SIZE
-
-    def _take(self, size: int, alignment: int, what: str) -> int:
-        start = self._at + (HEADER_SIZE - self._at) % alignment
-        if start + size > len(self._data):
-            raise CdrError(f"{self._kind}.{what}: needs {start + size} bytes, the message has {len(self._data)}")
-        self._at = start + size
-        return start
-
-    def number(self, code: str, what: str) -> int:
-        form = self._numbers[code]
-        size = form.size
-        value: int = form.unpack_from(self._data, self._take(size, size, what))[0]
-        return value
-
-    def raw(self, size: int, what: str) -> bytes:
-        start = self._take(size, 1, what)
-        return bytes(self._data[start : self._at])
-
-    def string(self, what: str) -> str:
-        size = self.number("I", what)
-        text = self.raw(size, what)
-        if size and text[-1]:
-            raise CdrError(f"{self._kind}.{what}: a string without its closing NUL")
-        try:
-            return text[:-1].decode()
-        except UnicodeDecodeError as error:
-            raise CdrError(f"{self._kind}.{what}: not UTF-8") from error
-
-    def array(self, code: str, what: str) -> AnyArray:
-        count = self.number("I", what)
-        if not count:  # nothing follows, not even padding
-            return np.empty(0, dtype=code)
-        size = np.dtype(code).itemsize
-        start = self._take(count * size, size, what)
-        return np.frombuffer(self._data, self._order + code, count, start).astype(code)
-
-    def stamp(self) -> int:
-        return self.number("i", "header") * SECOND + self.number("I", "header")
-
-    def rest(self) -> bytes:
-        """What has not been read."""
-        return self._data[self._at :]
-
-    def end(self) -> None:
-        left = len(self._data) - self._at
-        if left > _MAX_PADDING:
-            raise CdrError(f"{self._kind}: {left} bytes too many")
-
-
-class _Writer:
-    """Appends fields to little-endian CDR bytes."""
-
-    def __init__(self) -> None:
-        self._data = bytearray(LITTLE_ENDIAN)
-
-    def _align(self, size: int) -> None:
-        self._data += bytes((HEADER_SIZE - len(self._data)) % size)
-
-    def number(self, code: str, value: int) -> None:
-        self._align(struct.calcsize(code))
-        self._data += struct.pack("<" + code, value)
-
-    def raw(self, value: bytes) -> None:
-        self._data += value
-
-    def string(self, text: str) -> None:
-        encoded = text.encode() + b"\x00"
-        self.number("I", len(encoded))
-        self._data += encoded
-
-    def array(self, code: str, values: AnyArray | Sequence[Any]) -> None:
-        array = np.asarray(values, dtype="<" + code)
-        self.number("I", len(array))
-        if len(array):
-            self._align(array.itemsize)
-            self._data += array.tobytes()
-
-    def header(self, stamp: int, frame_id: str, run: bytes) -> None:
-        if len(run) != RUN_SIZE:
-            raise ValueError(f"run: {len(run)} bytes, expected the {RUN_SIZE} bytes of a UUID")
-        self.number("i", stamp // SECOND)
-        self.number("I", stamp % SECOND)
-        self.string(frame_id)
-        self.raw(run)
-
-    def bytes(self) -> bytes:
-        return bytes(self._data)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentState:
     """msg_agents_interfaces/msg/AgentState: x(k) of one agent.
@@ -314,7 +174,7 @@ class AgentState:
 
     def encode(self) -> bytes:
         """As CDR."""
-        out = _Writer()
+        out = CdrWriter()
         out.header(self.stamp, self.frame_id, self.run)
         out.number("I", self.agent)
         out.number("Q", self.step)
@@ -326,7 +186,7 @@ class AgentState:
     @classmethod
     def decode(cls, data: bytes) -> AgentState:
         """From CDR; raises CdrError."""
-        reader = _Reader(data, "AgentState")
+        reader = CdrReader(data, "AgentState")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run, agent = reader.raw(RUN_SIZE, "run"), reader.number("I", "agent")
         step, mode = reader.number("Q", "step"), reader.number("I", "mode")
@@ -363,7 +223,7 @@ class ActiveGraph:
 
     def encode(self) -> bytes:
         """As CDR."""
-        out = _Writer()
+        out = CdrWriter()
         out.header(self.stamp, self.frame_id, self.run)
         out.number("I", self.sequence)
         out.number("I", self.mode)
@@ -378,7 +238,7 @@ class ActiveGraph:
     @classmethod
     def decode(cls, data: bytes) -> ActiveGraph:
         """From CDR; raises CdrError, also where the three lists of the arcs are not equally long."""
-        reader = _Reader(data, "ActiveGraph")
+        reader = CdrReader(data, "ActiveGraph")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run, sequence = reader.raw(RUN_SIZE, "run"), reader.number("I", "sequence")
         mode, name = reader.number("I", "mode"), reader.string("name")
@@ -395,7 +255,7 @@ class ActiveGraph:
 _MAX_KNOWN = 2**18  # bytes of the arcs of one graph
 
 
-def _read_arcs(reader: _Reader) -> tuple[tuple[int, int, float], ...]:
+def _read_arcs(reader: CdrReader) -> tuple[tuple[int, int, float], ...]:
     source, target = reader.array("u4", "source"), reader.array("u4", "target")
     weight = reader.array("f8", "weight")
     reader.end()
@@ -407,7 +267,7 @@ def _read_arcs(reader: _Reader) -> tuple[tuple[int, int, float], ...]:
 @lru_cache(maxsize=32)
 def _known_arcs(data: bytes) -> tuple[tuple[int, int, float], ...]:
     """The same graphs come again and again: their arcs, behind ``last_step``, are read and kept in memory once."""
-    reader = _Reader(data, "ActiveGraph")
+    reader = CdrReader(data, "ActiveGraph")
     reader.number("Q", "last_step")
     return _read_arcs(reader)
 
@@ -433,7 +293,7 @@ class Progress:
 
     def encode(self) -> bytes:
         """As CDR."""
-        out = _Writer()
+        out = CdrWriter()
         out.header(self.stamp, self.frame_id, self.run)
         out.number("I", self.agent)
         out.number("Q", self.step)
@@ -442,7 +302,7 @@ class Progress:
     @classmethod
     def decode(cls, data: bytes) -> Progress:
         """From CDR; raises CdrError."""
-        reader = _Reader(data, "Progress")
+        reader = CdrReader(data, "Progress")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run = reader.raw(RUN_SIZE, "run")
         agent, step = reader.number("I", "agent"), reader.number("Q", "step")
@@ -452,14 +312,14 @@ class Progress:
 
 def encode_string(text: str) -> bytes:
     """A std_msgs/String as CDR."""
-    out = _Writer()
+    out = CdrWriter()
     out.string(text)
     return out.bytes()
 
 
 def decode_string(data: bytes) -> str:
     """Text of a std_msgs/String; raises CdrError."""
-    reader = _Reader(data, "String")
+    reader = CdrReader(data, "String")
     text = reader.string("data")
     reader.end()
     return text

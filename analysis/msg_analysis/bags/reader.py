@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_analysis.bags.cdr import ActiveGraph, CdrError, decode_string
+from msg_analysis.bags.cdr import ActiveGraph, decode_string
+from msg_analysis.bags.cdr_stream import CdrError
 from msg_analysis.bags.collected import Collector
 from msg_analysis.bags.inventory import Inventory
 from msg_analysis.bags.mcapfile import Batch, McapFile

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.bags.cdr import LITTLE_ENDIAN, SECOND, AgentState, CdrError
+from msg_analysis.bags.cdr import AgentState
+from msg_analysis.bags.cdr_stream import LITTLE_ENDIAN, CdrError
 from msg_analysis.bags.chunks import gather
 from msg_analysis.bags.mcapfile import Batch
+from msg_analysis.model.steptime import SECOND
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
 # An AgentState with empty frame_id, as far as all of them are alike; padding left out.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_analysis.bags.cdr import ActiveGraph, StateCodec, StepClock, encode_string
+from msg_analysis.bags.cdr import ActiveGraph, StateCodec, encode_string
 from msg_analysis.bags.schemas import network_topics, state_topic, truth_topic
 from msg_analysis.bags.storage import DEFAULT, Storage
 from msg_analysis.bags.writer import BagWriter
@@ -16,6 +16,7 @@ from msg_analysis.errors import BagError
 from msg_analysis.model.air import LOST
 from msg_analysis.model.payload import to_payload
 from msg_analysis.model.step import build_model
+from msg_analysis.model.steptime import StepClock
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.types import IntArray
 

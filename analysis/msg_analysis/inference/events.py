@@ -8,7 +8,7 @@ import numpy as np
 
 from msg_analysis.inference.observation import Observation, Timers
 from msg_analysis.inference.reception import neighbour_tables
-from msg_analysis.model.realtime import times_ns
+from msg_analysis.model.steptime import StepClock
 from msg_analysis.types import FloatArray, IntArray
 
 
@@ -99,7 +99,7 @@ def sampled(observation: Observation) -> FloatArray:
 
 def sampling_times(observation: Observation) -> IntArray:
     """(N + 1,) k dt [ns]."""
-    return times_ns(np.arange(observation.steps + 1), observation.step.dt)
+    return StepClock(observation.step.dt).times(np.arange(observation.steps + 1))
 
 
 def _timers(observation: Observation) -> Timers:

@@ -9,8 +9,9 @@ import numpy as np
 
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.reception import neighbour_tables
-from msg_analysis.model.realtime import phases, times_ns
+from msg_analysis.model.realtime import phases
 from msg_analysis.model.sequential import ideal_uses
+from msg_analysis.model.steptime import StepClock
 from msg_analysis.types import AnyArray, FloatArray
 
 BINS = 60
@@ -108,7 +109,7 @@ def measure_timing(observation: Observation) -> Timing:
     agents = np.arange(m)
     milliseconds = 1e-6 / experiment.run.speed  # of the agents' clock, in a nanosecond of simulated time
     phase = phases(experiment)
-    due = np.stack([times_ns(np.arange(steps), step.dt, float(phi)) for phi in phase], axis=1)
+    due = np.stack([StepClock(step.dt, phi).times(np.arange(steps)) for phi in phase.tolist()], axis=1)
     period = step.dt * 1e9
     lateness = timers.made[1:] - due
     late_ms = lateness * milliseconds

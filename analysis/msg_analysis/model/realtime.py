@@ -7,13 +7,12 @@ those of timers of equal period which nobody has synchronised: spread over the p
 
 from __future__ import annotations
 
-from fractions import Fraction
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from msg_analysis.model.streams import Stream, generator
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
     from msg_analysis.model.experiment import Experiment
@@ -26,19 +25,3 @@ def phases(experiment: Experiment) -> FloatArray:
     """
     ranks = generator(experiment.run.seed, Stream.PHASE).permutation(experiment.agents)
     return np.asarray((ranks + 0.5) / experiment.agents)
-
-
-def times_ns(steps: IntArray, dt: float, phase: float = 0.0) -> IntArray:
-    """Times (k + phase) dt in ns of simulated time, for whole steps k; exact to the nanosecond however late.
-
-    Parameters
-    ----------
-    steps : k, any shape
-    dt : step length; its decimal text counts, as for the stamps: 0.1 is one tenth
-    phase : in [0, 1)
-    """
-    step = Fraction(repr(float(dt))) * 10**9
-    whole, rest = divmod(step.numerator, step.denominator)
-    # k * rest stays exact: the denominator of a decimal text in nanoseconds is small.
-    fraction = (2 * steps * rest + step.denominator) // (2 * step.denominator)
-    return np.asarray(steps * whole + fraction + round(phase * float(step)), dtype=np.int64)

@@ -26,7 +26,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from msg_analysis.bags import chunks
-from msg_analysis.bags.cdr import ActiveGraph, AgentState, CdrError, encode_string
+from msg_analysis.bags.cdr import ActiveGraph, AgentState, encode_string
+from msg_analysis.bags.cdr_stream import CdrError
 from msg_analysis.bags.chunks import DamageError, locate, unpack
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.schemas import AGENT_STATE, STRING
