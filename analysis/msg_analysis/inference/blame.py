@@ -331,7 +331,7 @@ def _unknown(rejected: Sequence[str]) -> Cause:
 
 
 def _numbers(value: float, interval: tuple[float, float]) -> str:
-    return f"{value:.3g} ({interval[0]:.3g} to {interval[1]:.3g})"
+    return f"{value:#.3g} ({interval[0]:#.3g} to {interval[1]:#.3g})"
 
 
 def _share_interval(count: int, total: int) -> tuple[float, float]:

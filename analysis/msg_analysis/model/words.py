@@ -14,3 +14,13 @@ def percent(share: float) -> str:
     if 0.0 < value < 0.01:
         return "less than 0.01 %"
     return "more than 99.9 %" if 99.9 < value < 100.0 else f"{value:.3g} %"
+
+
+def counted(number: int, thing: str) -> str:
+    """So many things.
+
+    Parameters
+    ----------
+    number, thing : how many, and one of them; several get an s
+    """
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from msg_analysis.model.validation import amount
+from msg_analysis.model.words import counted
 from msg_analysis.report.tables import fact_table, number_text
 from msg_analysis.report.text import add_protocol, gaps
 
@@ -32,10 +33,10 @@ def print_bag(document: dict[str, Any], console: Console) -> None:
         _add_run(facts, document)
     topics = document["topics"]
     for topic in topics[:_TOPICS]:
-        facts.add_row("topic", Text(f"{topic['name']}, {topic['messages']} messages, {topic['type']}"))
+        facts.add_row("topic", Text(f"{topic['name']}, {counted(topic['messages'], 'message')}, {topic['type']}"))
     if len(topics) > _TOPICS:
         more = sum(topic["messages"] for topic in topics[_TOPICS:])
-        facts.add_row("topic", f"and {len(topics) - _TOPICS} more with {more} messages")
+        facts.add_row("topic", f"and {len(topics) - _TOPICS} more with {counted(more, 'message')}")
     for file in document["files"]:
         facts.add_row("file", Text(f"{file['name']}, {amount(file['size'])}{_state_of(file)}"))
     for name, version in document["versions"].items():
@@ -64,14 +65,14 @@ def _state_of(file: dict[str, Any]) -> str:
     """What is to say of a file of the bag, behind its size."""
     if "messages" not in file:
         return ""
-    words = [f"{file['messages']} messages"]
+    words = [counted(file["messages"], "message")]
     if file["compression"]:
-        words.append(f"compression {file['compression']}")
+        words.append(str(file["compression"]))
     if file["torn"]:
         words.append(f"torn: {file['torn']}")
     if file["damaged_chunks"]:
-        lost = f", {file['lost_messages']} messages lost" if file["lost_messages"] else ""
-        words.append(f"{file['damaged_chunks']} damaged chunks{lost}")
+        lost = f", {counted(file['lost_messages'], 'message')} lost" if file["lost_messages"] else ""
+        words.append(f"{counted(file['damaged_chunks'], 'damaged chunk')}{lost}")
     if file["problem"]:
         words.append(file["problem"])
     return ": " + ", ".join(words)
@@ -86,13 +87,13 @@ def print_salvage(document: dict[str, Any], console: Console) -> None:
     console : where to print
     """
     facts = fact_table(console, document["bag"])
-    facts.add_row("kept", f"{document['kept_messages']} messages")
+    facts.add_row("kept", counted(document["kept_messages"], "message"))
     dropped = [f"{amount(document['dropped_bytes'])} behind the last whole record"] if document["dropped_bytes"] else []
     if document["damaged_chunks"]:
-        known = f" with {document['lost_messages']} messages" if document["lost_messages"] else ""
-        dropped.append(f"{document['damaged_chunks']} damaged chunks{known}")
+        known = f" with {counted(document['lost_messages'], 'message')}" if document["lost_messages"] else ""
+        dropped.append(f"{counted(document['damaged_chunks'], 'damaged chunk')}{known}")
     if document["dropped_files"]:
-        dropped.append(f"{document['dropped_files']} files of which nothing can be read")
+        dropped.append(f"{counted(document['dropped_files'], 'file')} of which nothing can be read")
     facts.add_row("dropped", ", ".join(dropped) or "nothing")
     if document["torn"]:
         facts.add_row("torn", Text(document["torn"]))

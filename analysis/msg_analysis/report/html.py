@@ -102,7 +102,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": _number, "p": _p_value}
+    environment.filters |= {"number": _number, "p": _p_value, "z": _distance}
     known = trajectory.modes[: max(document["steps"], 0)]
     chain = experiment.chain
     names = [graph.name for graph in experiment.graph_list]
@@ -172,7 +172,8 @@ def _explanation(document: dict[str, Any]) -> str:
         return f"None of {len(tests)} tests rejects the predicted law ({chance}, all tests together)."
     named = ", ".join(f"{test['name']} (p {_p_value(test['p_adjusted'], '= ')})" for test in rejected[:6])
     more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
-    return f"{len(rejected)} of {len(tests)} tests reject the predicted law: {named}{more}; {chance}."
+    verb = "rejects" if len(rejected) == 1 else "reject"
+    return f"{len(rejected)} of {len(tests)} tests {verb} the predicted law: {named}{more}; {chance}."
 
 
 def _order(document: dict[str, Any]) -> list[str]:
@@ -196,6 +197,11 @@ def _number(value: float | None, digits: int = 4) -> str:
     if value is None:
         return "–"
     return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
+
+
+def _distance(z: float | None) -> str:
+    """In standard errors."""
+    return "–" if z is None else f"{z:+.2f}".replace("-", "−")
 
 
 def _p_value(p: float | None, equals: str = "") -> str:

@@ -189,13 +189,15 @@ def _print_errors(document: dict[str, Any], console: Console) -> None:
 
 
 def verdict_line(verdict: str, document: dict[str, Any]) -> str:
-    """The verdict; in real time with the deadlines that were missed, which are no disagreement.
+    """The verdict, of one run or of several; in real time with missed deadlines, which are no disagreement.
 
     Parameters
     ----------
     verdict : a sentence
     document : of ``Comparison.to_json()``
     """
+    if document.get("bags"):
+        verdict = verdict.replace("The run agrees", "The runs agree").replace("The run disagrees", "The runs disagree")
     deadlines = (document.get("timing") or {}).get("deadlines")
     if not deadlines or not deadlines["missed"]:
         return verdict

@@ -222,4 +222,4 @@ def test_real_time_has_its_sections(tmp_path: Path) -> None:
 def test_lockstep_has_no_timing(tmp_path: Path) -> None:
     page = _page(_comparison(_trajectory(3, 200)), tmp_path / "report.html")
     assert "Real time" not in page.text
-    assert "for the steps of this run" in page.text
+    assert "for these steps" in page.text

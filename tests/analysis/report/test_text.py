@@ -216,7 +216,7 @@ def test_bag() -> None:
     for part in (
         *("[bold]bag", "d3ba43f6", "incomplete: 3 of 4, 1 missing", "5: other run", "1.23 MB", "2.0"),
         *("process 4711", "steps 1 to 1; numbers need one from step 0", "/[red]11, 11 messages, pkg/msg/Kind"),
-        *("and 2 more with 25 messages", "8 messages, compression lz4, torn: cut off", "2 damaged chunks, 77 messages"),
+        *("and 2 more with 25 messages", "8 messages, lz4, torn: cut off", "2 damaged chunks, 77 messages"),
     ):
         assert part in output
     nothing = dict.fromkeys(document) | {
