@@ -45,11 +45,16 @@ class JobControl:
         signal.signal(signal.SIGTSTP, signal.SIG_DFL)
         self._standing = True
         os.kill(os.getpid(), signal.SIGTSTP)  # here it stands
-        signal.signal(signal.SIGTSTP, self._stop)
+        self._be_ready()
         if self._standing:  # no shell could make it go on again (setsid), so the system did not stop it
             self._standing = False
             self._after()
 
     def _go_on(self, *_: int | FrameType | None) -> None:
         self._continued, self._standing = True, False
+        self._be_ready()  # first: the next Ctrl-Z may come at any time
         self._after()
+
+    def _be_ready(self) -> None:
+        if signal.SIGTSTP in self._handlers:
+            signal.signal(signal.SIGTSTP, self._stop)

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from mcap.writer import Writer
 from recorded import contents, mcap, texts
 
 from msg_analysis.bags.reader import read_bag
@@ -93,3 +94,20 @@ def test_a_part_under_other_names_with_the_time(network: Any, domain: int, twin_
     assert times[-1] <= 7.0
     played.send_signal(signal.SIGINT)
     played.communicate(timeout=30)
+
+
+def test_nothing_but_the_time_is_refused(network: Any, domain: int) -> None:
+    """With --clock, the bag's own /clock is not played; where that was all, somebody should know."""
+    file = network.directory / "clock.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        schema = writer.register_schema("rosgraph_msgs/msg/Clock", "ros2msg", b"")
+        channel = writer.register_channel("/clock", "cdr", schema)
+        writer.add_message(channel, 1, bytes([0, 1, 0, 0]) + bytes(8), 1)
+        writer.finish()
+    played = network.start("play", file, "--clock", "10")
+    _, stderr = played.communicate(timeout=60)
+    assert played.returncode == 2, stderr
+    assert "error: --clock: publishes /clock itself, and nothing else is chosen" in stderr
+    assert "1 messages played" in finished(network.start("play", file, "--rate", "max"))
