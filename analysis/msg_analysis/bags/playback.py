@@ -232,6 +232,7 @@ def _quick_outline(path: Path) -> _Outline | None:
     """
     outline = _Outline(path)
     statistics: Statistics | None = None
+    size = path.stat().st_size
     silent = None  # end of a chunk that claims no time, or 0: which of the two its index tells
     with path.open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
@@ -239,6 +240,8 @@ def _quick_outline(path: Path) -> _Outline | None:
         while len(head := stream.read(_RECORD.size)) == _RECORD.size:
             opcode, length = _RECORD.unpack(head)
             end = stream.tell() + length
+            if end > size:  # cut off, or damaged
+                return None
             if opcode == Opcode.CHUNK:
                 times = stream.read(_TIMES.size)
                 if len(times) < _TIMES.size:
