@@ -188,6 +188,22 @@ def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
     return np.concatenate([none, *starts]), np.concatenate([none, *sizes]), at
 
 
+def indexed(start: IntArray, index: Sequence[bytes]) -> bool:
+    """Whether an index names just the messages that are there.
+
+    Parameters
+    ----------
+    start : IntArray
+        (messages,) where the content of each message's record starts, ascending
+    index : Sequence[bytes]
+        contents of the message index records behind the chunk
+    """
+    if not all(map(_is_index, index)):
+        return False
+    entries = [np.frombuffer(record, "<u8", offset=_INDEX_HEAD)[1::2] for record in index]
+    return np.array_equal(np.sort(np.concatenate(entries)), (start - RECORD.size).astype(np.uint64))
+
+
 def _is_index(record: bytes) -> bool:
     """Whether it has the length that it says, in whole entries."""
     if len(record) < _INDEX_HEAD:

@@ -23,7 +23,9 @@ from msg_analysis.bags.metadata import ChannelCount, FileCount
 RECORD_LIMIT = 2**28  # bytes of a record at the end of a file; damage claims more
 _FOOTER = struct.Struct("<9xQQI8x")  # starts of the summary and of its offsets, CRC from the former on to before itself
 _BEHIND_CRC = 12
-_CHUNK = struct.Struct("<BQQQ")  # opcode, length, first and last log time
+_CHUNK = struct.Struct("<BQQQQ")  # opcode, length, first and last log time, size when unpacked
+_CHUNK_CRC = 4  # bytes behind it
+_PACKED = struct.Struct("<Q")  # size, behind the name of the compression
 _RECORD_HEAD = 9
 
 
@@ -71,7 +73,7 @@ class FileInventory:
     @property
     def whole(self) -> bool:
         """Whether others can read it as it is: nothing torn, nothing damaged, and a summary that is true."""
-        return self.lost_messages == 0 and not self.file.damaged_chunks
+        return self.lost_messages == 0 and not self.file.damaged_chunks and not self.file.false_indexes
 
     @property
     def lost_messages(self) -> int | None:
@@ -123,10 +125,15 @@ def summary_of(file: Path) -> Summary | None:
 
 
 def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
-    """Whether there is a chunk where its index says."""
+    """Whether there is a chunk where its index says, which says the same of itself."""
+    name = index.compression.encode()
+    times = (index.message_start_time, index.message_end_time)
+    head = _CHUNK.pack(Opcode.CHUNK, index.chunk_length - _RECORD_HEAD, *times, index.uncompressed_size)
+    rest = len(name).to_bytes(4, "little") + name + _PACKED.pack(index.compressed_size)
     stream.seek(index.chunk_start_offset)
-    expected = (Opcode.CHUNK, index.chunk_length - _RECORD_HEAD, index.message_start_time, index.message_end_time)
-    return _CHUNK.unpack(stream.read(_CHUNK.size)) == expected
+    found = stream.read(len(head) + _CHUNK_CRC + len(rest))
+    filled = len(found) + index.compressed_size == index.chunk_length
+    return filled and found.startswith(head) and found.endswith(rest)
 
 
 def channel_count(channel: Channel, type_name: str) -> ChannelCount:

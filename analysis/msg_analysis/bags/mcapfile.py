@@ -15,7 +15,17 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
-from msg_analysis.bags.chunks import LIMIT, MESSAGE_HEAD, RECORD, DamageError, gather, locate, run_of_messages, unpack
+from msg_analysis.bags.chunks import (
+    LIMIT,
+    MESSAGE_HEAD,
+    RECORD,
+    DamageError,
+    gather,
+    indexed,
+    locate,
+    run_of_messages,
+    unpack,
+)
 from msg_analysis.errors import BagError
 from msg_analysis.types import AnyArray, BoolArray, IntArray
 
@@ -154,6 +164,7 @@ class McapFile:
     whole_bytes : length of the whole records so far
     torn : what is there instead of the end of the file; None where it ends well (known when all is read)
     damaged_chunks : chunks whose content did not survive; the reading goes on behind them
+    false_indexes : chunks whose message index says what is not so: here the records decide, others go by it
     """
 
     path: Path
@@ -166,6 +177,7 @@ class McapFile:
     whole_bytes: int = 0
     torn: str | None = None
     damaged_chunks: int = 0
+    false_indexes: int = 0
 
     def batches(self) -> Iterator[Batch]:
         """The messages of all whole records.
@@ -273,6 +285,7 @@ class McapFile:
             if places is None:
                 walked = np.array(list(self._walk(data)), dtype=np.int64).reshape(-1, 2)
                 places = walked[:, 0], walked[:, 1]
+                self.false_indexes += bool(chunk.index) and not indexed(places[0], chunk.index)
             batch = Batch.of_contents(data, *places, chunk.end)
         except Exception:  # decompressors and the library report damage by whatever goes wrong in them
             self.damaged_chunks += 1
