@@ -202,7 +202,7 @@ def test_200_flipped_bytes(recorded: tuple[Trajectory, Path], tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("compression", ["none", "zstd"])
-def test_every_byte_around_a_chunk(tmp_path: Path, make_run: MakeRun, compression: Compression) -> None:
+def test_damage_around_a_chunk(tmp_path: Path, make_run: MakeRun, compression: Compression) -> None:
     """Head and message indexes of a chunk: others go by what we need not believe. What is salvaged, mcap's can read."""
     run = make_run(steps=10)
     write_trajectory(run, tmp_path / "bag", storage=Storage(compression))
@@ -213,9 +213,9 @@ def test_every_byte_around_a_chunk(tmp_path: Path, make_run: MakeRun, compressio
     assert summary is not None
     chunk = summary.chunk_indexes[-1]
     content = chunk.chunk_start_offset + chunk.chunk_length
-    places = [*range(chunk.chunk_start_offset + 9, content - chunk.compressed_size)]
-    places += range(content, content + chunk.message_index_length, 3)
-    assert len(places) > 80
+    places = [*range(chunk.chunk_start_offset + 9, content - chunk.compressed_size, 2)]
+    places += range(content, content + chunk.message_index_length, 7)
+    assert len(places) > 40
     for place in places:
         damaged, out = tmp_path / "damaged.mcap", tmp_path / "out"
         damaged.write_bytes(data[:place] + bytes([data[place] ^ 0x41]) + data[place + 1 :])
