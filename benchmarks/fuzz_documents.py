@@ -75,6 +75,8 @@ _CHANGES: list[Callable[[str, random.Random], str]] = [_token, _line, _character
 def mutate_document(document: Any, rng: random.Random) -> Any:
     """Values and keys changed, removed, doubled, swapped."""
     document = copy.deepcopy(document)
+    if not isinstance(document, dict | list):  # what an earlier change has left
+        return rng.choice(VALUES)
     for _ in range(rng.choice([1, 1, 2, 4])):
         places = list(_places(document))
         if not places:

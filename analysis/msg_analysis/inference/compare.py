@@ -343,7 +343,8 @@ def without_numbers(trajectory: Trajectory, level: float, prediction: Prediction
 
 
 def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
-    tested = [(name, p) for name, p in family if p is not None]
+    # A statistic that is no number, from a log that nobody can compute with, is none that the law gives.
+    tested = [(name, 0.0 if math.isnan(p) else p) for name, p in family if p is not None]
     adjusted = holm(np.array([p for _, p in tested], dtype=float))
     return [Test(name, p, float(a), bool(a < level)) for (name, p), a in zip(tested, adjusted, strict=True)]
 

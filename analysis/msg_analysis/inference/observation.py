@@ -13,6 +13,8 @@ from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
+LARGEST = 1e60
+"""No run comes near it. The square of the square of a number much larger is none, and then no test says anything."""
 BLOCK_NUMBERS = 2_000_000
 """Numbers of temporary arrays per block of steps: 16 MB each, however long the run."""
 
@@ -40,7 +42,7 @@ class Observation:
     Attributes
     ----------
     prediction : of the experiment that the record says was run
-    states : (N + 1, m, R) x(0..N)
+    states : (N + 1, m, R) x(0..N), as of ``bounded``
     modes : (N,) g(0..N-1)
     start : (m, R) x(0) of the record
     published : (N + 1, m, R) what others heard of x(0..N), where that is not the truth; else None
@@ -77,10 +79,10 @@ class Observation:
             )
         return cls(
             prediction,
-            trajectory.states[: steps + 1],
+            bounded(trajectory.states[: steps + 1]),
             trajectory.modes[:steps],
-            trajectory.record.start,
-            None if published is None else published[: steps + 1],
+            bounded(trajectory.record.start),
+            None if published is None else bounded(published[: steps + 1]),
             None if lost is None else lost[:steps],
             timers,
         )
@@ -110,6 +112,13 @@ class Observation:
         length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
         for first in range(0, self.steps, length):
             yield first, min(first + length, self.steps)
+
+
+def bounded(states: FloatArray) -> FloatArray:
+    """The same, and what is beyond ``LARGEST`` as large as that: wrong all the same, and it can be computed with."""
+    if not states.size or (states.max() <= LARGEST and states.min() >= -LARGEST):
+        return states
+    return np.clip(states, -LARGEST, LARGEST)
 
 
 def _known_steps(trajectory: Trajectory) -> int:

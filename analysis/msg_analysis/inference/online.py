@@ -18,7 +18,7 @@ import numpy as np
 from msg_analysis.inference.collector import StepCollector
 from msg_analysis.inference.estimates import Estimate, beside
 from msg_analysis.inference.martingale import Value, forms_of, packed_moments, values_of
-from msg_analysis.inference.observation import BLOCK_NUMBERS
+from msg_analysis.inference.observation import BLOCK_NUMBERS, bounded
 from msg_analysis.model.record import RunRecord
 from msg_analysis.theory import symmetric
 from msg_analysis.theory.prediction import Prediction, predict
@@ -181,7 +181,7 @@ class RunningErrors:
 
     def _deviations(self, states: FloatArray) -> FloatArray:
         """(b, m, R): what the agents are off."""
-        values = states[:, :, : self._replicas]
+        values = bounded(states[:, :, : self._replicas])
         if self._record.experiment.problem == "consensus":
             return np.asarray(values - values.mean(axis=1, keepdims=True))
         return np.asarray(values - self._record.experiment.reference)

@@ -279,3 +279,17 @@ def test_agents_that_are_where_no_noise_could_have_put_them():
     result = compare(trajectory)
     assert result.verdict == "disagrees"
     assert result.innovations.p_covariance == 0.0
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [-1e300, 1e160, 1e40])
+@pytest.mark.parametrize("name", ["line_ring", "tracking", "discrete"])
+def test_a_number_too_large_to_compute_with_disagrees(name, value):
+    """Its square overflows: what is no number must not pass."""
+    run = simulate(golden(name, duration=50, replicas=2))
+    states = run.states.copy()
+    states[20, 1, 0] = value
+    comparison = compare(dataclasses.replace(run, states=states))
+    assert comparison.verdict == "disagrees"
+    assert "innovations: covariance" in {test.name for test in comparison.tests if test.rejected}
+    json.dumps(comparison.to_json(), allow_nan=False)
