@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -86,16 +85,16 @@ class Batch:
 
 @dataclass(slots=True)
 class _Chunk:
-    """A chunk that is being unpacked.
+    """A chunk.
 
     Attributes
     ----------
-    data : the records in it, in the end
+    content : of its record
     end : bytes of the file up to its own end
     index : contents of the message index records behind it
     """
 
-    data: Future[bytes]
+    content: bytes
     end: int
     index: list[bytes] = field(default_factory=list)
     _filled: int = 0
@@ -211,23 +210,22 @@ class McapFile:
         _keep_memory()
         zstd = zstandard.ZstdDecompressor()
         chunk: _Chunk | None = None
-        with ThreadPoolExecutor(1) as unpacker:  # works on the next chunk while whoever reads works on this one
-            for opcode, content, places in self._records(_Source(stream), size):
-                if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
-                    chunk.add_index(content)
-                    continue
-                before, chunk = chunk, None
-                if opcode == Opcode.CHUNK:
-                    chunk = _Chunk(unpacker.submit(unpack, content, zstd), self.whole_bytes)
-                if before is not None:
-                    yield from self._chunk(before)
-                if opcode == Opcode.MESSAGE:
-                    yield _loose_batch(content, *places, self.whole_bytes)
-                elif opcode != Opcode.CHUNK:
-                    with contextlib.suppress(DamageError):
-                        self._note(opcode, content)
+        for opcode, content, places in self._records(_Source(stream), size):
+            if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
+                chunk.add_index(content)
+                continue
             if chunk is not None:
-                yield from self._chunk(chunk)
+                yield from self._chunk(chunk, zstd)
+                chunk = None
+            if opcode == Opcode.CHUNK:
+                chunk = _Chunk(content, self.whole_bytes)
+            elif opcode == Opcode.MESSAGE:
+                yield _loose_batch(content, *places, self.whole_bytes)
+            else:
+                with contextlib.suppress(DamageError):
+                    self._note(opcode, content)
+        if chunk is not None:
+            yield from self._chunk(chunk, zstd)
 
     def _records(self, stream: _Source, size: int) -> Iterator[tuple[int, bytes, tuple[IntArray, IntArray]]]:
         """Opcode and content of each record; of messages many at once, with the places of the content of each."""
@@ -278,9 +276,9 @@ class McapFile:
         except Exception as error:  # the library reports damage by whatever goes wrong in it
             raise DamageError from error
 
-    def _chunk(self, chunk: _Chunk) -> Iterator[Batch]:
+    def _chunk(self, chunk: _Chunk, zstd: zstandard.ZstdDecompressor) -> Iterator[Batch]:
         try:
-            data = chunk.data.result()
+            data = unpack(chunk.content, zstd)
             places = locate(data, chunk.index)
             if places is None:
                 walked = np.array(list(self._walk(data)), dtype=np.int64).reshape(-1, 2)
