@@ -43,6 +43,7 @@ class _Rate(click.types.FloatParamType):
 
 @click.command(
     cls=RosCommand,
+    node_name="player",
     epilog=examples(
         "msg-agents play runs/line_ring_20260114_083441",
         "msg-agents play BAG --rate max --await recorder",

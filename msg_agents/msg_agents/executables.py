@@ -34,6 +34,8 @@ def live() -> None:
 
 
 def _run(command: str) -> None:
-    from msg_agents.cli import main
-
+    try:
+        from msg_agents.cli import main
+    except KeyboardInterrupt:  # what is being imported cannot be asked to see to it
+        sys.exit(130)
     main([command, *sys.argv[1:]], prog_name="msg-agents")

@@ -14,10 +14,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import rclpy
+from rclpy.exceptions import NotInitializedException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
-from msg_agents.errors import RCLError
 from msg_agents.health import Reporter
 from msg_agents.node import NetworkNode
 from msg_agents.parameters import ros_arguments
@@ -134,7 +134,7 @@ def run_nodes(
         complete = True
     except ExternalShutdownException:
         pass
-    except RCLError:
+    except (RuntimeError, NotInitializedException):  # RCLError among them: of whatever a signal has come in between
         if rclpy.ok():
             raise
     finally:

@@ -164,6 +164,11 @@ def test_replay(tmp_path: Path) -> None:
             replay_commands(defaults | changes)
 
 
+def test_arguments_are_documented() -> None:
+    text = (BRINGUP.parents[2] / "docs/ros.md").read_text(encoding="utf-8")
+    assert [name for name in {**NETWORK_ARGUMENTS, **REPLAY_ARGUMENTS} if f"`{name}`" not in text] == []
+
+
 @pytest.mark.parametrize("file", LAUNCH_FILES, ids=lambda file: file.name)
 def test_launch_files_use_what_there_is(file: Path) -> None:
     """Every name that they import from launch, and every argument that they give by name, is one that Jazzy has."""

@@ -63,6 +63,16 @@ def test_every_option_is_a_parameter(name: str) -> None:
         assert not descriptor.description.endswith("None")
 
 
+@pytest.mark.parametrize("name", NODES)
+def test_every_parameter_is_documented(name: str) -> None:
+    text = (Path(__file__).parents[2] / "docs/ros.md").read_text(encoding="utf-8")
+    assert [name_of(option) for option in options_of(NODES[name]) if f"`{name_of(option)}`" not in text] == []
+
+
+def test_parameters_are_found_by_the_name_of_the_executable() -> None:
+    assert {command.node_name for command in NODES.values()} == {"agent", "switcher", "recorder", "player", "live"}
+
+
 def test_ranges_are_those_of_the_options() -> None:
     (split,) = [option for option in options_of(NODES["recorder"]) if option.name == "split_size"]
     (bounds,) = describe(split).floating_point_range
