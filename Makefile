@@ -11,7 +11,7 @@ RUNS := runs
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 LOCAL := --no-index --no-deps --no-build-isolation
 
-.PHONY: help setup demo test test-fast stress fuzz lint format bench calibrate docs colcon lock clean
+.PHONY: help setup demo test test-fast stress fuzz lint format bench calibrate docs colcon colcon-test lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -76,10 +76,17 @@ docs: setup ## Build the documentation into site/
 	$(BIN)/mkdocs build --strict --quiet
 
 # Build the workspace as a ROS 2 user does. With ROS 2 from wheels, the virtual environment is the underlay.
+COLCON := cd ros_ws && env AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) PATH=$(CURDIR)/$(BIN):$$PATH \
+  colcon --log-base ../build/colcon/log
+COLCON_PLACES := --build-base ../build/colcon/build --install-base ../build/colcon/install
+
 colcon: setup ## Build ros_ws with colcon on the wheels
 	rm -rf build/colcon
-	cd ros_ws && AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) PATH=$(CURDIR)/$(BIN):$$PATH \
-	  colcon --log-base ../build/colcon/log build --build-base ../build/colcon/build --install-base ../build/colcon/install
+	$(COLCON) build $(COLCON_PLACES)
+
+colcon-test: colcon ## Build ros_ws with colcon and test what it has installed
+	$(COLCON) test $(COLCON_PLACES) --return-code-on-test-failure --event-handlers console_direct-
+	$(COLCON) test-result --test-result-base ../build/colcon/build
 
 lock: ## Pin the newest versions (needs uv)
 	cd requirements && uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --upgrade \

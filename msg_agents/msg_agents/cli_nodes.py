@@ -42,6 +42,11 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
             help="Seconds to wait for the other nodes.",
         ),
         use_sim_time,
+        click.option(
+            "--parameter-services",
+            is_flag=True,
+            help="Offer the parameters to `ros2 param`: six services a node, which large networks cannot afford.",
+        ),
         click.option("--lifeline", type=int, hidden=True),
         click.option("--account", type=click.Path(path_type=Path), hidden=True),
     ):
@@ -164,6 +169,7 @@ def _run_nodes(
     discovery_timeout: float,
     use_sim_time: bool,
     account: Path | None,
+    parameter_services: bool,  # noqa: ARG001  see QuietNode
 ) -> None:
     from msg_agents.process import hold_lifeline, run_nodes
 

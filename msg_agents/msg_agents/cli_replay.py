@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -27,18 +27,23 @@ def _positive(_: click.Context, __: click.Parameter, value: float | None) -> flo
     return value
 
 
-def _rate(_: click.Context, __: click.Parameter, value: str) -> float:
-    try:
-        rate = math.inf if value == "max" else float(value)
-    except ValueError:
-        rate = math.nan
-    if not rate > 0 or (math.isinf(rate) and value != "max"):
-        raise click.BadParameter(f"{value}: expected a positive number, or max")
-    return rate
+class _Rate(click.types.FloatParamType):
+    """A positive number, or "max" (infinite)."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """See click.ParamType."""
+        try:
+            rate = math.inf if value == "max" else float(value)
+        except ValueError:
+            rate = math.nan
+        if not rate > 0 or (isinstance(value, str) and math.isinf(rate) and value != "max"):
+            self.fail(f"{value}: expected a positive number, or max (as a parameter, .inf)", param, ctx)
+        return rate
 
 
 @click.command(
     cls=RosCommand,
+    node_name="player",
     epilog=examples(
         "msg-agents play runs/line_ring_20260114_083441",
         "msg-agents play BAG --rate max --await recorder",
@@ -49,7 +54,7 @@ def _rate(_: click.Context, __: click.Parameter, value: str) -> float:
 @click.option(
     "-r",
     "--rate",
-    callback=_rate,
+    type=_Rate(),
     metavar="RATE",
     default="1",
     show_default=True,

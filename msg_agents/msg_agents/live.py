@@ -32,6 +32,7 @@ from msg_agents.node import (
     truth_topic,
     why_not,
 )
+from msg_agents.parameters import ros_arguments
 from msg_agents.process import SPIN_SLICE, leave, make_executor
 from msg_agents.qos import LATCHED, NEWEST, STREAM
 from msg_agents.quiet import QuietNode
@@ -121,9 +122,8 @@ class Live(QuietNode):
         frame = StateFrame(record.run.bytes, width, longest_heard(record))
         # Before the prediction, which takes its time: what comes meanwhile waits in the middleware.
         for agent in range(experiment.agents):
-            name = self.resolve_topic_name(topic(agent))
-            self._topics.append(name)
-            self.create_subscription(AgentStateMsg, name, self._receiver(agent, frame), self._qos, raw=True)
+            self._topics.append(topic(agent))
+            self.create_subscription(AgentStateMsg, topic(agent), self._receiver(agent, frame), self._qos, raw=True)
         self._clock_of_steps = StepClock(experiment.step_length)
         self._estimate = LiveEstimate(record)
         every(self, PERIOD, self._report)
@@ -243,7 +243,8 @@ def watch(
     ------
     InputError : no network came in time, or there is no prediction for it
     """
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    with ros_arguments():
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Live] = []
     try:
         nodes = [node := Live(reliable=reliable, on_report=on_report, on_note=on_note)]

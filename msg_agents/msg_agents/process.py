@@ -14,12 +14,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import rclpy
+from rclpy.exceptions import NotInitializedException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
-from msg_agents.errors import RCLError
 from msg_agents.health import Reporter
 from msg_agents.node import NetworkNode
+from msg_agents.parameters import ros_arguments
 from msg_analysis.errors import InputError
 
 GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
@@ -108,7 +109,8 @@ def run_nodes(
     signal.signal(signal.SIGINT, lambda *_: None)
     if throughput:
         prefer_throughput()
-    rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
+    with ros_arguments():
+        rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
     nodes: Sequence[NetworkNode] = []
     reporter: Reporter | None = None
     complete = False
@@ -132,7 +134,7 @@ def run_nodes(
         complete = True
     except ExternalShutdownException:
         pass
-    except RCLError:
+    except (RuntimeError, NotInitializedException):  # RCLError among them: of whatever a signal has come in between
         if rclpy.ok():
             raise
     finally:

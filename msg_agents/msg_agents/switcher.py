@@ -21,6 +21,7 @@ from msg_agents.node import (
     END_TOPIC,
     EPOCH_TOPIC,
     EXPERIMENT_TOPIC,
+    FAREWELL,
     GRAPH_TOPIC,
     NOT_AN_AGENT,
     PROGRESS_TOPIC,
@@ -52,8 +53,6 @@ REPORT_PERIOD = 0.1  # s
 NAMESAKE = "a second node of this name"
 HEAD_START = SECOND // 2
 """ns of the clock from the publication of the epoch to the epoch: by then everybody should know it."""
-
-FAREWELL = 4.0  # s; more than the 3 s between two heartbeats of Fast DDS
 
 
 class Switcher(NetworkNode):
@@ -101,7 +100,8 @@ class Switcher(NetworkNode):
 
     def awaited(self) -> list[str]:
         """See NetworkNode. All that it publishes is latched: it is enough that the others are there."""
-        there = set(self.get_node_names())
+        here = self.get_namespace()
+        there = {name for name, namespace in self.get_node_names_and_namespaces() if namespace == here}
         return [name for name in self._expected if name not in there]
 
     def health(self) -> Health:
