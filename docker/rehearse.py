@@ -6,7 +6,8 @@ The image is built from docker/Dockerfile, step by step in a chroot (``buildah -
 fresh Debian with Python (debootstrap), since a registry of images may not be within reach. Then every service of
 docker/compose.yaml runs in that image's root file system: in a mount namespace, in a network namespace on a bridge, as
 the image's user, without capabilities, on a read-only root with its tmpfs and its volume, in the order of
-``depends_on``, with its health check. What an engine would do besides (cgroups, seccomp, DNS, restarts) is not rehearsed.
+``depends_on``, with its health check. What an engine would do besides (cgroups, seccomp, DNS, restarts) is not
+rehearsed.
 """
 
 from __future__ import annotations
@@ -141,8 +142,8 @@ class Services:
     def healthy(self, name: str) -> bool:
         """Whether the health check of a running service passes."""
         _, test = self._specs[name]["healthcheck"]["test"]
-        words: list[str | Path] = ["nsenter", "--target", str(self.processes[name].pid), "--mount", "chroot", self._root]
-        return subprocess.run([*words, "/bin/sh", "-c", interpolated(test)]).returncode == 0
+        enter = ["nsenter", "--target", str(self.processes[name].pid), "--mount", "chroot", str(self._root)]
+        return subprocess.run([*enter, "/bin/sh", "-c", interpolated(test)]).returncode == 0
 
     def up(self) -> dict[str, int]:
         """Run all; their exit codes."""
