@@ -305,6 +305,7 @@ def host(
     from msg_agents.hosts import Hosts, this_host
     from msg_agents.runner import run_network
     from msg_agents.workshop import workshop
+    from msg_analysis.model.problems import show
 
     record = cli_nodes.load_record(run_record)
     what = record.experiment
@@ -314,6 +315,8 @@ def host(
         return
     share = places.share(name or this_host(), discovery_timeout=discovery_timeout, patience=patience)
     console, note = _notes()
+    mine = show([agent + 1 for agent in share.agents])
+    note(f"this host runs agents {mine}{' and the recorder' if share.home else ''} in ROS_DOMAIN_ID {places.domain}")
     with workshop() as folder, _progress_bar(console, what) as on_progress:
         result = run_network(
             what,
@@ -328,6 +331,8 @@ def host(
             share=share,
         )
     _end(result, as_json)
+    if not share.home and not as_json:
+        click.echo(f"the run has ended: its verdict is on {places.recorder}")
 
 
 def _load(path: Path) -> Experiment:

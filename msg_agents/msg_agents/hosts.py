@@ -190,7 +190,7 @@ class Hosts:
         return ET.tostring(tree.getroot(), encoding="unicode", xml_declaration=True) + "\n"
 
     def environment(self, experiment: Experiment, folder: Path) -> dict[str, str]:
-        """The environment of the processes; where the user has chosen a profile or a discovery server, that stays.
+        """The environment of the processes; where the user has chosen a profile, that stays.
 
         Parameters
         ----------

@@ -125,10 +125,8 @@ def plan_network(
     here = tuple(range(experiment.agents)) if share is None else share.agents
     count = count_processes(experiment, len(here))
     common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
-    timeout = discovery_timeout(experiment.agents, count)
-    if share is not None:
-        timeout = max(timeout, share.discovery_timeout)
-    if timeout > DISCOVERY_TIMEOUT:
+    timeout = discovery_timeout(experiment.agents, count) if share is None else share.discovery_timeout
+    if timeout != DISCOVERY_TIMEOUT:
         common += ("--discovery-timeout", f"{timeout:g}")
     options = common + (("--await", RECORDER) if bag is not None or share is not None else ())
     if checkpoints is not None:
