@@ -123,6 +123,10 @@ class NetworkNode(QuietNode):
         """Names of those who have not been found yet."""
         return []
 
+    def companions(self) -> list[str]:
+        """Names of those without whom the run cannot go on. Whom agents hear would be too many to ask after."""
+        return [SWITCHER]
+
     def awaited_clock(self) -> list[str]:
         """Who should tell the time and has not been found."""
         if not self.get_parameter("use_sim_time").value or self.count_publishers(CLOCK_TOPIC):

@@ -21,6 +21,7 @@ from rclpy.node import Node
 from msg_agents.health import Reporter
 from msg_agents.node import NetworkNode
 from msg_agents.parameters import ros_arguments
+from msg_agents.presence import Presence
 from msg_analysis.errors import InputError
 
 GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
@@ -83,6 +84,7 @@ def run_nodes(
     throughput: bool = True,
     use_sim_time: bool = False,
     account: Path | None = None,
+    patience: float | None = None,
 ) -> bool:
     """Run nodes in this process until each has done its part.
 
@@ -94,6 +96,7 @@ def run_nodes(
     throughput : whether much work in little time counts for more than being woken at once
     use_sim_time : whether the nodes take the time from ``/clock``; as the ROS parameter of that name
     account : file that says once a second, and at the end, what the nodes have refused and what they wait for
+    patience : s after which it ends when it has been left alone; None: never
 
     Returns
     -------
@@ -127,6 +130,8 @@ def run_nodes(
         gc.set_threshold(GC_THRESHOLD)
         for node in nodes:
             node.begin()
+        if patience is not None:
+            Presence(nodes[0], patience)
         for node in nodes:
             while not node.done.done():
                 spinner.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)

@@ -65,6 +65,7 @@ class Switcher(NetworkNode):
     readers : names of the nodes, besides the agents, that must read the graph before the run starts
     on_progress : called with the newest step of every agent (-1: none yet) a few times a second, if one has reported
     checkpoints : directory in which it leaves a mark; whoever finds one there takes over from a process that has gone
+    farewell : s to wait for everybody to say that the end has been heard
     """
 
     def __init__(
@@ -75,8 +76,10 @@ class Switcher(NetworkNode):
         readers: list[str],
         on_progress: Callable[[Sequence[int]], None] = lambda _: None,
         checkpoints: Path | None = None,
+        farewell: float = FAREWELL,
     ) -> None:
         super().__init__("switcher", record=record)
+        self._farewell = farewell
         self._graphs = record.experiment.graph_list
         self._path = sojourns(record.experiment, model.initial)
         self._steps = record.experiment.steps
@@ -103,6 +106,10 @@ class Switcher(NetworkNode):
         here = self.get_namespace()
         there = {name for name, namespace in self.get_node_names_and_namespaces() if namespace == here}
         return [name for name in self._expected if name not in there]
+
+    def companions(self) -> list[str]:
+        """See NetworkNode."""
+        return self._expected
 
     def health(self) -> Health:
         """See NetworkNode."""
@@ -136,7 +143,7 @@ class Switcher(NetworkNode):
     def finish(self, *, complete: bool) -> None:
         """See NetworkNode. Nobody needs anything but the end any more, and who has left has had it."""
         if complete:
-            self._end.wait_for_all_acked(Duration(seconds=FAREWELL))
+            self._end.wait_for_all_acked(Duration(seconds=self._farewell))
 
     def _receive(self, data: bytes) -> None:
         progress = self.decode_progress(data, PROGRESS_TOPIC)
