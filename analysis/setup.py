@@ -46,5 +46,6 @@ setup(
         "lz4",
         "zstandard",
     ],
+    extras_require={"test": ["pytest"]},  # by which colcon knows how to test it
     entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli:main"]},
 )

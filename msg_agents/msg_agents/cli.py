@@ -92,16 +92,13 @@ def run(
     as_json: bool,
 ) -> None:
     """Run EXPERIMENT as a network of processes, record it, and compare the record with the theory."""
-    from rich.console import Console
-    from rich.text import Text
-
-    from msg_agents.runner import conclude, run_network
+    from msg_agents.runner import run_network
 
     changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
     if processes is not None:
         changes["processes"] = int(processes) if processes.isdigit() else processes
     what = _load(experiment).with_run(**{key: value for key, value in changes.items() if value is not None})
-    console = Console(stderr=True)
+    console, note = _notes()
     with _progress_bar(console, what) as on_progress:
         result = run_network(
             what,
@@ -112,9 +109,25 @@ def run(
             storage=storage(compression, split_size),
             pin=pin,
             on_progress=on_progress,
-            on_note=lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True),
+            on_note=note,
             environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
         )
+    _end(result, as_json)
+
+
+def _notes() -> tuple[Any, Callable[[str], None]]:
+    """A console on stderr, and what prints a note there."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True)
+    return console, lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
+
+
+def _end(result: RunResult, as_json: bool) -> None:
+    """Say what failed, judge what was recorded, show the result, and leave with the exit code."""
+    from msg_agents.runner import conclude
+
     for line in result.failures:
         click.echo(f"{click.style('failed:', fg='red', bold=True)} {line}", err=True)
     conclude(result)
@@ -228,11 +241,112 @@ def prepare(experiment: Path) -> None:
     click.echo(new_record(what).to_json())
 
 
+@main.command(
+    epilog=examples(
+        "msg-agents prepare line_ring.yaml > run.json    # once; give every host run.json and hosts.yaml",
+        "msg-agents host run.json hosts.yaml             # on every host",
+    )
+)
+@click.argument("run_record", type=click.Path(path_type=Path))
+@click.argument("hosts", type=click.Path(path_type=Path))
+@click.option("--name", help="Which of the hosts this is. Default: the name of this machine.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("runs"),
+    show_default=True,
+    help="Where the directory <name>_<time> is made: bag, report and logs on the recorder's host, logs on the others.",
+)
+@click.option(
+    "--discovery-timeout",
+    type=click.FloatRange(0, min_open=True),
+    default=120.0,
+    show_default=True,
+    help="Seconds to wait for the other hosts.",
+)
+@click.option(
+    "--patience",
+    type=click.FloatRange(0, min_open=True),
+    default=30.0,
+    show_default=True,
+    help="Seconds after which this host ends when another one has left the run before its end.",
+)
+@click.option(
+    "--restarts",
+    type=click.IntRange(0),
+    default=RESTARTS,
+    show_default=True,
+    help="How often, in all, what was killed on this host is started again.",
+)
+@click.option(
+    "--profile", "only_profile", is_flag=True, help="Only print the discovery profile, for other ROS 2 tools."
+)
+@storage_options
+@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
+def host(
+    run_record: Path,
+    hosts: Path,
+    *,
+    name: str | None,
+    out: Path,
+    discovery_timeout: float,
+    patience: float,
+    restarts: int,
+    only_profile: bool,
+    compression: Compression,
+    split_size: float | None,
+    as_json: bool,
+) -> None:
+    """Run this host's share of a network that is spread over several, as the file HOSTS says.
+
+    All hosts are given the same RUN_RECORD (of `msg-agents prepare`) and HOSTS, in any order. The recorder's host
+    compares the record with the theory, as `msg-agents run` does; the others end when the run does.
+    """
+    from msg_agents.hosts import Hosts, this_host
+    from msg_agents.runner import run_network
+    from msg_agents.workshop import workshop
+    from msg_analysis.model.problems import show
+
+    record = cli_nodes.load_record(run_record)
+    what = record.experiment
+    places = Hosts.load(hosts, what)
+    if only_profile:
+        click.echo(places.profile(what), nl=False)
+        return
+    share = places.share(name or this_host(), discovery_timeout=discovery_timeout, patience=patience)
+    console, note = _notes()
+    mine = show([agent + 1 for agent in share.agents])
+    note(f"this host runs agents {mine}{' and the recorder' if share.home else ''} in ROS_DOMAIN_ID {places.domain}")
+    with workshop() as folder, _progress_bar(console, what) as on_progress:
+        result = run_network(
+            what,
+            out,
+            domain=places.domain,
+            restarts=restarts,
+            storage=storage(compression, split_size),
+            on_progress=on_progress,
+            on_note=note,
+            environment=places.environment(what, folder),
+            record=record,
+            share=share,
+        )
+    _end(result, as_json)
+    if not share.home and not as_json:
+        click.echo(f"the run has ended: its verdict is on {places.recorder}")
+
+
 def _load(path: Path) -> Experiment:
     from msg_analysis.model.experiment import Experiment
 
     return Experiment.load(path)
 
 
-for _command in (cli_nodes.agent, cli_nodes.switcher, cli_nodes.recorder, cli_replay.play, cli_replay.live):
+for _command in (
+    cli_nodes.agent,
+    cli_nodes.switcher,
+    cli_nodes.recorder,
+    cli_replay.play,
+    cli_replay.live,
+    cli_replay.markers,
+):
     main.add_command(_command)

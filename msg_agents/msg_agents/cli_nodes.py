@@ -42,8 +42,17 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
             help="Seconds to wait for the other nodes.",
         ),
         use_sim_time,
+        click.option(
+            "--parameter-services",
+            is_flag=True,
+            help="Offer the parameters to `ros2 param`: six services a node, which large networks cannot afford.",
+        ),
         click.option("--lifeline", type=int, hidden=True),
-        click.option("--account", type=click.Path(path_type=Path), hidden=True),
+        click.option(
+            "--account",
+            type=click.Path(path_type=Path),
+            help="File that says once a second what the nodes refused and wait for: for health checks.",
+        ),
     ):
         command = option(command)
     return command
@@ -54,6 +63,13 @@ _await = click.option(
     "readers",
     multiple=True,
     help="A node, such as recorder, that must be there before the run starts. Repeatable.",
+)
+
+
+_patience = click.option(
+    "--patience",
+    type=float,
+    help="Seconds after which it ends when others have left before the end. By default it waits for ever.",
 )
 
 
@@ -76,6 +92,7 @@ _checkpoint = click.option(
 )
 @_await
 @_checkpoint
+@_patience
 def agent(
     run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...], checkpoint: Path | None, **options: Any
 ) -> None:
@@ -83,7 +100,7 @@ def agent(
     from msg_analysis.errors import InputError
     from msg_analysis.model.step import build_model
 
-    record = _load_record(run_record)
+    record = load_record(run_record)
     record.experiment.require_available()
     total = record.experiment.agents
     for number in agents:
@@ -111,31 +128,46 @@ def agent(
 @_node_options
 @_await
 @_checkpoint
+@_patience
 @click.option("--status", type=int, hidden=True)
 def switcher(
-    run_record: Path, *, readers: tuple[str, ...], checkpoint: Path | None, status: int | None, **options: Any
+    run_record: Path,
+    *,
+    readers: tuple[str, ...],
+    checkpoint: Path | None,
+    status: int | None,
+    patience: float | None,
+    **options: Any,
 ) -> None:
     """Run the switcher of the run in RUN_RECORD: it publishes the experiment and the active graph."""
     from msg_analysis.model.step import build_model
 
-    record = _load_record(run_record)
+    record = load_record(run_record)
 
     def report(steps: Any) -> None:
         if status is not None:
             os.write(status, json.dumps(list(steps)).encode() + b"\n")
 
     def nodes() -> list[NetworkNode]:
+        from msg_agents.node import FAREWELL
         from msg_agents.succession import enter, succeed
         from msg_agents.switcher import SWITCHERS
 
         model, directory = build_model(record.experiment), _make(checkpoint)
         successions = succeed(directory, ["switcher"])
         kind = SWITCHERS[record.experiment.run.pace]
-        node = kind(record=record, model=model, readers=list(readers), on_progress=report, checkpoints=directory)
+        node = kind(
+            record=record,
+            model=model,
+            readers=list(readers),
+            on_progress=report,
+            checkpoints=directory,
+            farewell=max(FAREWELL, patience or 0.0),
+        )
         enter(successions, node)
         return [node]
 
-    _run_nodes(nodes, record, **options)
+    _run_nodes(nodes, record, patience=patience, **options)
 
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
@@ -146,7 +178,7 @@ def recorder(
     run_record: Path, *, out: Path, compression: Compression, split_size: float | None, **options: Any
 ) -> None:
     """Record the run in RUN_RECORD to a bag."""
-    record = _load_record(run_record)
+    record = load_record(run_record)
 
     def nodes() -> list[NetworkNode]:
         from msg_agents.recorder import Recorder
@@ -164,6 +196,8 @@ def _run_nodes(
     discovery_timeout: float,
     use_sim_time: bool,
     account: Path | None,
+    parameter_services: bool,  # noqa: ARG001  see QuietNode
+    patience: float | None = None,
 ) -> None:
     from msg_agents.process import hold_lifeline, run_nodes
 
@@ -178,6 +212,7 @@ def _run_nodes(
         throughput=throughput,
         use_sim_time=use_sim_time,
         account=account,
+        patience=patience,
     ):
         sys.exit(INCOMPLETE)
 
@@ -193,7 +228,13 @@ def _make(directory: Path | None) -> Path | None:
     return directory
 
 
-def _load_record(path: Path) -> RunRecord:
+def load_record(path: Path) -> RunRecord:
+    """The run record in a file.
+
+    Raises
+    ------
+    InputError : it cannot be read, or is none
+    """
     from msg_analysis.errors import InputError
     from msg_analysis.model.record import RunRecord
 

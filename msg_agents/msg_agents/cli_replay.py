@@ -1,4 +1,4 @@
-"""Commands of ``msg-agents`` about running and recorded networks: ``play`` and ``live``."""
+"""Commands of ``msg-agents`` about running and recorded networks: ``play``, ``live`` and ``markers``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import math
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -27,18 +28,23 @@ def _positive(_: click.Context, __: click.Parameter, value: float | None) -> flo
     return value
 
 
-def _rate(_: click.Context, __: click.Parameter, value: str) -> float:
-    try:
-        rate = math.inf if value == "max" else float(value)
-    except ValueError:
-        rate = math.nan
-    if not rate > 0 or (math.isinf(rate) and value != "max"):
-        raise click.BadParameter(f"{value}: expected a positive number, or max")
-    return rate
+class _Rate(click.types.FloatParamType):
+    """A positive number, or "max" (infinite)."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """See click.ParamType."""
+        try:
+            rate = math.inf if value == "max" else float(value)
+        except ValueError:
+            rate = math.nan
+        if not rate > 0 or (isinstance(value, str) and math.isinf(rate) and value != "max"):
+            self.fail(f"{value}: expected a positive number, or max (as a parameter, .inf)", param, ctx)
+        return rate
 
 
 @click.command(
     cls=RosCommand,
+    node_name="player",
     epilog=examples(
         "msg-agents play runs/line_ring_20260114_083441",
         "msg-agents play BAG --rate max --await recorder",
@@ -49,7 +55,7 @@ def _rate(_: click.Context, __: click.Parameter, value: str) -> float:
 @click.option(
     "-r",
     "--rate",
-    callback=_rate,
+    type=_Rate(),
     metavar="RATE",
     default="1",
     show_default=True,
@@ -201,6 +207,15 @@ class _play_bar:  # noqa: N801  used like a function
         self._console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
 
 
+def _notes() -> Callable[[str], None]:
+    """What prints a note on stderr."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True)
+    return lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
+
+
 def _enter(domain: int | None) -> None:
     """Choose the domain, and see to it that signals end the process in order."""
     if domain is not None:
@@ -234,18 +249,11 @@ def live(*, reliable: bool, timeout: float | None, as_json: bool, domain: int | 
     It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). The numbers are those of `msg-analysis
     compare`, on the topic `estimate` too, but they are no verdict.
     """
-    from rich.console import Console
-    from rich.text import Text
-
     from msg_agents.live import Watched, watch
     from msg_analysis.report.live import live_document, live_line, live_table
 
     _enter(domain)
-    notes = Console(stderr=True)
-
-    def note(line: str) -> None:
-        notes.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
-
+    note = _notes()
     console = result_console()
     if as_json or not console.is_terminal:
 
@@ -279,3 +287,32 @@ def live(*, reliable: bool, timeout: float | None, as_json: bool, domain: int | 
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0 if found.finished else INCOMPLETE)  # nothing is left to do, and the middleware may not let go
+
+
+@click.command(
+    cls=RosCommand,
+    epilog=examples("msg-agents markers --domain 42", "msg-agents markers --rate 30 --replica 2 --frame map"),
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0, 1000, min_open=True),
+    default=10.0,
+    show_default=True,
+    help="Pictures a second.",
+)
+@click.option("--replica", type=click.IntRange(1), default=1, show_default=True, help="Which of the copies is drawn.")
+@click.option("--frame", default="network", show_default=True, help="Frame of reference: the fixed frame of RViz.")
+@click.option("--timeout", type=float, callback=_positive, help="Seconds to wait for a network; by default for ever.")
+@_domain
+def markers(*, rate: float, replica: int, frame: str, timeout: float | None, domain: int | None) -> None:
+    """Draw a network, running or played, for RViz and Foxglove: markers on the topic `markers`.
+
+    Agents on a circle, coloured by how far their states are from the mean (or the reference), and the links of the
+    active graph. It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). Nobody waits for it.
+    """
+    from msg_agents.markers import show_markers
+
+    _enter(domain)
+    over = show_markers(rate=rate, replica=replica - 1, frame=frame, timeout=timeout, on_note=_notes())
+    sys.stderr.flush()
+    os._exit(0 if over else INCOMPLETE)  # nothing is left to do, and the middleware may not let go

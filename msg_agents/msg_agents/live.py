@@ -3,53 +3,34 @@
 from __future__ import annotations
 
 import math
-import os
-import signal
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import rclpy
 from builtin_interfaces.msg import Time
 from msg_agents_interfaces.msg import AgentState as AgentStateMsg
 from msg_agents_interfaces.msg import Estimate as EstimateMsg
-from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.duration import Duration
-from rclpy.executors import Executor
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
-from rclpy.task import Future
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header
 
 from msg_agents.checkpoint import longest_heard
 from msg_agents.node import (
-    END_TOPIC,
-    EXPERIMENT_TOPIC,
-    OTHER_RUN,
-    UNDECODABLE,
     state_topic,
     truth_topic,
     why_not,
 )
-from msg_agents.process import SPIN_SLICE, leave, make_executor
-from msg_agents.qos import LATCHED, NEWEST, STREAM
-from msg_agents.quiet import QuietNode
+from msg_agents.qos import NEWEST, STREAM
 from msg_agents.timers import every
-from msg_analysis.bags.cdr import Progress, StateFrame, decode_string
-from msg_analysis.bags.cdr_stream import CdrError
-from msg_analysis.errors import InputError
+from msg_agents.watcher import LISTEN, Watcher, run_watcher
+from msg_analysis.bags.cdr import StateFrame
 from msg_analysis.inference.online import LiveEstimate, LiveReport
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.steptime import SECOND, StepClock
 
 ESTIMATE_TOPIC = "estimate"
 PERIOD = 1.0  # s between two estimates
-PATIENCE = 1.0  # s after which it is said that nobody is there
 FAREWELL = 5.0  # s for readers of the last estimate to say that they have it
 SILENCE = 5  # estimates without any state, after which a run of which there is nothing but its experiment is over
-LISTEN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""How states are read by default: a writer never waits for such a reader, which misses what it is too slow for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +49,7 @@ class Watched:
     finished: bool
 
 
-class Live(QuietNode):
+class Live(Watcher):
     """Reads the states of the first network that it hears of, and publishes its running estimates.
 
     Parameters
@@ -76,11 +57,6 @@ class Live(QuietNode):
     reliable : whether to miss no state, and so hold the network back where this node does not keep up
     on_report : told of every estimate, with the number of steps per second
     on_note : told what somebody should know
-
-    Attributes
-    ----------
-    record : of the run, once it is known; None before
-    done : set when the run is over; True if its last step has been seen
     """
 
     def __init__(
@@ -90,21 +66,13 @@ class Live(QuietNode):
         on_report: Callable[[Watched, float], None],
         on_note: Callable[[str], None],
     ) -> None:
-        super().__init__("live")
+        super().__init__("live", on_note=on_note)
         self._qos = STREAM if reliable else LISTEN
-        self._on_report, self._on_note = on_report, on_note
-        self.record: RunRecord | None = None
-        self.known, self.done = Future(), Future()
-        self._refused: Counter[str] = Counter()
-        self._others: set[str] = set()
-        self._ended = False
-        self._topics: list[str] = []
+        self._on_report = on_report
         self._estimate: LiveEstimate | None = None
         self._before = (-1, time.monotonic())  # newest step, and when that was
         self._silent = 0  # estimates in a row that no newer state has come before
         self._writer = self.create_publisher(EstimateMsg, ESTIMATE_TOPIC, NEWEST)
-        self.create_subscription(String, EXPERIMENT_TOPIC, self._receive_experiment, LATCHED, raw=True)
-        self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LATCHED, raw=True)
 
     def follow(self) -> None:
         """Read the states of the run that has been found.
@@ -121,9 +89,8 @@ class Live(QuietNode):
         frame = StateFrame(record.run.bytes, width, longest_heard(record))
         # Before the prediction, which takes its time: what comes meanwhile waits in the middleware.
         for agent in range(experiment.agents):
-            name = self.resolve_topic_name(topic(agent))
-            self._topics.append(name)
-            self.create_subscription(AgentStateMsg, name, self._receiver(agent, frame), self._qos, raw=True)
+            self._topics.append(topic(agent))
+            self.create_subscription(AgentStateMsg, topic(agent), self._receiver(agent, frame), self._qos, raw=True)
         self._clock_of_steps = StepClock(experiment.step_length)
         self._estimate = LiveEstimate(record)
         every(self, PERIOD, self._report)
@@ -152,28 +119,6 @@ class Live(QuietNode):
 
         return receive
 
-    def _receive_experiment(self, data: bytes) -> None:
-        try:
-            record = RunRecord.from_json(decode_string(data), f"topic {self.resolve_topic_name(EXPERIMENT_TOPIC)}")
-        except (CdrError, InputError) as error:
-            self._refused[UNDECODABLE] += 1
-            self._on_note(str(error))
-            return
-        if self.record is None:
-            self.record = record
-            self.known.set_result(None)
-        elif record.run != self.record.run and str(record.run) not in self._others:
-            self._others.add(str(record.run))
-            self._refused[OTHER_RUN] += 1
-            self._on_note(f"another run is there too, {record.run}: only {self.record.run} is watched")
-
-    def _receive_end(self, data: bytes) -> None:
-        try:
-            run = Progress.decode(data).run
-        except CdrError:
-            return
-        self._ended |= self.record is not None and run == self.record.run.bytes
-
     def _report(self) -> None:
         watched = self.watched()
         assert watched is not None
@@ -194,9 +139,6 @@ class Live(QuietNode):
     def farewell(self) -> None:
         """Stay until whoever reads the estimates has the last one."""
         self._writer.wait_for_all_acked(Duration(seconds=FAREWELL))
-
-    def _anybody(self) -> bool:
-        return any(self.count_publishers(topic) for topic in self._topics)
 
     def _message(self, watched: Watched) -> EstimateMsg:
         report = watched.report
@@ -243,54 +185,7 @@ def watch(
     ------
     InputError : no network came in time, or there is no prediction for it
     """
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    nodes: list[Live] = []
-    try:
-        nodes = [node := Live(reliable=reliable, on_report=on_report, on_note=on_note)]
-        executor = make_executor()
-        executor.add_node(node)
-        began, noted = time.monotonic(), False
-        while not node.known.done():
-            executor.spin_until_future_complete(node.known, timeout_sec=SPIN_SLICE)
-            waited = time.monotonic() - began
-            if timeout is not None and waited > timeout and not node.known.done():
-                raise InputError(f"after {timeout:g} s {_nobody()}: is one running there, or being played?")
-            if waited > PATIENCE and not noted and not node.known.done():
-                noted = True
-                on_note(f"{_nobody()} yet: waiting for one")
-        node.follow()
-        _spin(executor, node.done)
-        node.farewell()
-    except (KeyboardInterrupt, SystemExit):
-        pass
-    finally:
-        watched = nodes[0].watched() if nodes else None
-        # When the run is over nobody waits for this node, and leaving while others leave can deadlock: see ``leave``.
-        if not all(node.done.done() for node in nodes):
-            leave(nodes, complete=False)
-    return watched
-
-
-def _spin(executor: Executor, done: Future) -> None:
-    """Spin until something is done; a signal ends it between two callbacks: in one, the executor would complain of it.
-
-    Raises
-    ------
-    KeyboardInterrupt : by Ctrl-C or another signal
-    """
-    caught: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(number, lambda number, _: caught.append(number)) for number in numbers]
-    try:
-        while not done.done() and not caught:
-            executor.spin_until_future_complete(done, timeout_sec=SPIN_SLICE)
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-    if caught:
-        raise KeyboardInterrupt
-
-
-def _nobody() -> str:
-    domain, reach = os.environ.get("ROS_DOMAIN_ID", "0"), os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
-    return f"no network in ROS_DOMAIN_ID {domain}, within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}"
+    node = run_watcher(
+        lambda: Live(reliable=reliable, on_report=on_report, on_note=on_note), timeout=timeout, on_note=on_note
+    )
+    return node and node.watched()

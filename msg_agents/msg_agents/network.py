@@ -38,14 +38,37 @@ class ProcessPlan:
     resumes: bool = False
 
 
-def count_processes(experiment: Experiment) -> int:
+@dataclass(frozen=True, slots=True)
+class Share:
+    """What one host runs of a network that is spread over several.
+
+    Attributes
+    ----------
+    agents : indices from 0, ascending
+    home : whether recorder and switcher are here
+    discovery_timeout : s for which nodes look for those of other hosts, which people start
+    patience : s after which nodes end that have been left alone
+    """
+
+    agents: tuple[int, ...]
+    home: bool
+    discovery_timeout: float
+    patience: float
+
+
+def count_processes(experiment: Experiment, agents: int | None = None) -> int:
     """Agent processes that an experiment asks for.
+
+    Parameters
+    ----------
+    experiment : what is run
+    agents : how many of them are on this machine; None: all
 
     Raises
     ------
     InputError : more than discovery can handle
     """
-    agents, wanted = experiment.agents, experiment.run.processes
+    agents, wanted = experiment.agents if agents is None else agents, experiment.run.processes
     if wanted == "auto":
         # A message to another process costs more than the step that it is for: no more processes than can run at once.
         return agents if agents <= SMALL else min(math.ceil(agents / SMALL), MOST_PROCESSES, os.cpu_count() or 1)
@@ -56,6 +79,12 @@ def count_processes(experiment: Experiment) -> int:
             "machine finds about 100 participants: give a smaller number, several agents share a process"
         )
     return count
+
+
+def most_processes(experiment: Experiment, agents: int) -> int:
+    """Agent processes that an experiment may have for so many agents, on a machine of any number of cores."""
+    wanted = experiment.run.processes
+    return min(agents, MOST_PROCESSES, int(wanted) if isinstance(wanted, int) else agents)
 
 
 def discovery_timeout(agents: int, processes: int) -> float:
@@ -75,6 +104,7 @@ def plan_network(
     *,
     use_sim_time: bool = False,
     storage: Storage = DEFAULT,
+    share: Share | None = None,
 ) -> list[ProcessPlan]:
     """The processes of a run, in the order in which they should be started.
 
@@ -86,32 +116,39 @@ def plan_network(
     checkpoints : directory for what agents and switcher need to go on after being killed; None: they cannot
     use_sim_time : whether the nodes take the time from ``/clock``
     storage : how the recorder stores the bag
+    share : what of it runs on this host, of several, one of which records; None: all
 
     Raises
     ------
     InputError : more processes than discovery can handle
     """
-    count = count_processes(experiment)
+    here = tuple(range(experiment.agents)) if share is None else share.agents
+    count = count_processes(experiment, len(here))
     common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
-    timeout = discovery_timeout(experiment.agents, count)
-    if timeout > DISCOVERY_TIMEOUT:
+    timeout = discovery_timeout(experiment.agents, count) if share is None else share.discovery_timeout
+    if timeout != DISCOVERY_TIMEOUT:
         common += ("--discovery-timeout", f"{timeout:g}")
-    options = common + (("--await", RECORDER) if bag is not None else ())
+    options = common + (("--await", RECORDER) if bag is not None or share is not None else ())
     if checkpoints is not None:
         options += ("--checkpoint", str(checkpoints))
+    if share is not None:
+        options += ("--patience", f"{share.patience:g}")
     resumes = checkpoints is not None
+    home = share is None or share.home
     plans = []
-    if bag is not None:
+    if bag is not None and home:
         files: tuple[str, ...] = ("--compression", storage.compression)
         if storage.split_size is not None:
             files += ("--split-size", repr(storage.split_size / MEGABYTE))
         plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
     for index in range(count):
         # Neighbouring numbers share a process: in most graphs they are neighbours, and their messages stay inside.
-        agents = tuple(range(index * experiment.agents // count, (index + 1) * experiment.agents // count))
+        agents = here[index * len(here) // count : (index + 1) * len(here) // count]
         numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
         first, last = agents[0] + 1, agents[-1] + 1
-        name = f"agent_{first}" if first == last else f"agents_{first}_to_{last}"
+        rest = f"to_{last}" if last - first == len(agents) - 1 else f"and_{len(agents) - 1}_more"
+        name = f"agent_{first}" if first == last else f"agents_{first}_{rest}"
         plans.append(ProcessPlan(name, ("agent", str(run_file), *numbers, *options), agents, resumes))
-    plans.append(ProcessPlan(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
+    if home:
+        plans.append(ProcessPlan(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
     return plans

@@ -29,6 +29,7 @@ PROGRESS_TOPIC = "progress"
 END_TOPIC = "end"
 EPOCH_TOPIC = "epoch"
 RESEND_TOPIC = "resend"
+FAREWELL = 4.0  # s for readers to acknowledge what was last; more than the 3 s between two heartbeats of Fast DDS
 NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
 OTHER_RUN, UNDECODABLE = "other run", "undecodable"
 UNKNOWN_AGENT, OTHER_AGENT = "unknown agent", "of another agent than its topic"
@@ -85,6 +86,11 @@ class NetworkNode(QuietNode):
 
     def __init__(self, name: str, *, record: RunRecord) -> None:
         super().__init__(name)
+        if self.get_name() != name:
+            raise InputError(
+                f"--ros-args: __node:={self.get_name()}: the nodes of a run know each other by their names, and this "
+                f"one is {name}: leave the name alone (give none in a launch file) and choose a namespace, __ns:=/..."
+            )
         self.record = record
         self.run = record.run.bytes
         self._step_clock = StepClock(record.experiment.step_length)
@@ -116,6 +122,10 @@ class NetworkNode(QuietNode):
     def awaited(self) -> list[str]:
         """Names of those who have not been found yet."""
         return []
+
+    def companions(self) -> list[str]:
+        """Names of those without whom the run cannot go on. Whom agents hear would be too many to ask after."""
+        return [SWITCHER]
 
     def awaited_clock(self) -> list[str]:
         """Who should tell the time and has not been found."""

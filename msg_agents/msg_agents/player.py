@@ -22,6 +22,7 @@ from msg_agents.bagtypes import check_definitions, message_classes
 from msg_agents.errors import RCLError
 from msg_agents.jobcontrol import JobControl
 from msg_agents.keyboard import Keyboard
+from msg_agents.parameters import ros_arguments
 from msg_agents.playclock import PlayClock
 from msg_agents.process import leave
 from msg_agents.qos import LATCHED, STREAM
@@ -346,7 +347,8 @@ def play(
         on_note(line)
     known = len(bag.damage)
     # Python's own handlers: this process only sleeps and publishes, and can end anywhere.
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    with ros_arguments():
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Player] = []
     complete = False
     try:

@@ -14,12 +14,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import rclpy
+from rclpy.exceptions import NotInitializedException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
-from msg_agents.errors import RCLError
 from msg_agents.health import Reporter
 from msg_agents.node import NetworkNode
+from msg_agents.parameters import ros_arguments
+from msg_agents.presence import Presence
 from msg_analysis.errors import InputError
 
 GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
@@ -82,6 +84,7 @@ def run_nodes(
     throughput: bool = True,
     use_sim_time: bool = False,
     account: Path | None = None,
+    patience: float | None = None,
 ) -> bool:
     """Run nodes in this process until each has done its part.
 
@@ -93,6 +96,7 @@ def run_nodes(
     throughput : whether much work in little time counts for more than being woken at once
     use_sim_time : whether the nodes take the time from ``/clock``; as the ROS parameter of that name
     account : file that says once a second, and at the end, what the nodes have refused and what they wait for
+    patience : s after which it ends when it has been left alone; None: never
 
     Returns
     -------
@@ -108,7 +112,8 @@ def run_nodes(
     signal.signal(signal.SIGINT, lambda *_: None)
     if throughput:
         prefer_throughput()
-    rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
+    with ros_arguments():
+        rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
     nodes: Sequence[NetworkNode] = []
     reporter: Reporter | None = None
     complete = False
@@ -125,6 +130,8 @@ def run_nodes(
         gc.set_threshold(GC_THRESHOLD)
         for node in nodes:
             node.begin()
+        if patience is not None:
+            Presence(nodes[0], patience)
         for node in nodes:
             while not node.done.done():
                 spinner.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
@@ -132,7 +139,7 @@ def run_nodes(
         complete = True
     except ExternalShutdownException:
         pass
-    except RCLError:
+    except (RuntimeError, NotInitializedException):  # RCLError among them: of whatever a signal has come in between
         if rclpy.ok():
             raise
     finally:

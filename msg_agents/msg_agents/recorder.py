@@ -64,14 +64,15 @@ class Recorder(NetworkNode):
     def __init__(self, *, record: RunRecord, directory: Path, storage: Storage = DEFAULT) -> None:
         super().__init__("recorder", record=record)
         experiment = record.experiment
-        topics = network_topics(experiment.agents, self.get_namespace(), truth=experiment.truth)
-        self.bag = BagWriter(directory, topics, record=record.to_json(), storage=storage)
+        # In the bag every topic has its own name, also where it is remapped: by that readers of bags find it.
+        self._root = self.get_namespace().rstrip("/") + "/"
+        topics = network_topics(experiment.agents, self._root, truth=experiment.truth)
         self._last = experiment.steps
         kinds = [(state_topic, experiment.run.replicas)]
         if experiment.truth:
             kinds.append((truth_topic, experiment.width))
         self._sources = [  # of states: agent, a topic of his, and what is on it
-            (agent, self.resolve_topic_name(topic(agent)), StateFrame(self.run, width, longest_heard(record)))
+            (agent, self._root + topic(agent), StateFrame(self.run, width, longest_heard(record)))
             for topic, width in kinds
             for agent in range(experiment.agents)
         ]
@@ -84,9 +85,11 @@ class Recorder(NetworkNode):
         self.create_subscription(String, EXPERIMENT_TOPIC, self._record_experiment, LATCHED, raw=True)
         self.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._record_graph, LATCHED, raw=True)
         for source, (_, topic, _) in enumerate(self._sources):
-            self.create_subscription(AgentStateMsg, topic, self._collector(source), STREAM, raw=True)
+            relative = topic.removeprefix(self._root)  # so that it can be remapped as where it is published
+            self.create_subscription(AgentStateMsg, relative, self._collector(source), STREAM, raw=True)
         self._progress = self.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
         self.leave_at_end()
+        self.bag = BagWriter(directory, topics, record=record.to_json(), storage=storage)
         every(self, WRITE_PERIOD, self._guarded(self._write_states))
         every(self, FLUSH_PERIOD, self._guarded(self.bag.flush))
 
@@ -181,7 +184,7 @@ class Recorder(NetworkNode):
             self.refuse(RECORDED, topic)
             return
         self._seen.add(data)
-        name = self.resolve_topic_name(topic)
+        name = self._root + topic
         self._guarded(lambda: self.bag.write(name, data, time))()
         if last:
             self._came(name)

@@ -16,7 +16,7 @@ from msg_agents.checkpoint import longest_heard, room_for
 from msg_agents.cores import available_cores, place
 from msg_agents.domain import free_domain
 from msg_agents.environment import RESTARTS, node_environment
-from msg_agents.network import count_processes, plan_network
+from msg_agents.network import Share, count_processes, plan_network
 from msg_agents.pace import Pace
 from msg_agents.supervisor import ACCOUNTS, CRASHED, Supervisor
 from msg_agents.workshop import workshop
@@ -27,6 +27,7 @@ from msg_analysis.bags.storage import DEFAULT, Storage
 from msg_analysis.bags.writer import RECORDING_MARKER
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.record import RunRecord
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.twin import new_record
 
@@ -88,6 +89,8 @@ def run_network(
     on_progress: Callable[[int], None] = lambda _: None,
     on_note: Callable[[str], None] = lambda _: None,
     environment: Mapping[str, str] | None = None,
+    record: RunRecord | None = None,
+    share: Share | None = None,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
 
@@ -103,6 +106,9 @@ def run_network(
     on_progress : called a few times a second with the step that every agent has reached
     on_note : called with a line about what happens: a restart, a standstill
     environment : changes to the environment of the processes
+    record : of the run; a new one is made if not given
+    share : what of it this host runs, of several; None: all. Where there is no recorder, only the logs are kept in
+        the directory of the bag
 
     Returns
     -------
@@ -113,13 +119,14 @@ def run_network(
     NotAvailableError, InputError : the experiment cannot be run; nothing was started or written
     """
     experiment.require_available()
-    count_processes(experiment)
+    count_processes(experiment, None if share is None else len(share.agents))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-    bag = make_bag_directory(experiment, out.absolute()) if out is not None else None
+    directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
+    bag = directory if share is None or share.home else None
     result = RunResult(bag)
     try:
-        record = new_record(experiment)
+        record = record or new_record(experiment)
         longest = StateFrame(record.run.bytes, experiment.width, longest_heard(record)).size
         keeping = workshop(experiment.agents * room_for(longest)) if restarts else nullcontext()
         with workshop() as folder, keeping as checkpoints:
@@ -131,7 +138,13 @@ def run_network(
                 Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
             ):
                 plans = plan_network(
-                    experiment, run_file, bag, checkpoints=checkpoints, use_sim_time=use_sim_time, storage=storage
+                    experiment,
+                    run_file,
+                    bag,
+                    checkpoints=checkpoints,
+                    use_sim_time=use_sim_time,
+                    storage=storage,
+                    share=share,
                 )
                 if pin and experiment.run.pace == "lockstep":
                     supervisor.cores = place(plans, available_cores(), first=chosen)
@@ -142,11 +155,12 @@ def run_network(
             result.strangers = supervisor.account().strangers()
             if bag is not None:
                 _settle(bag, result)
-                _keep_logs(folder, bag / "log", result)
+            if directory is not None:
+                _keep_logs(folder, directory / "log", result)
     finally:
-        if bag is not None:
+        if directory is not None:
             with suppress(OSError):
-                bag.rmdir()  # if nothing came of it
+                directory.rmdir()  # if nothing came of it
     return result
 
 
@@ -185,6 +199,9 @@ def _standstill(supervisor: Supervisor) -> str:
     silent = [child.plan.name for child in supervisor.silent]
     if silent:
         words.append("nothing heard from " + ", ".join(silent))
+    if not words and supervisor.steps:  # whoever knows is on another host
+        last = min(supervisor.steps)
+        words.append(f"the last to get on is agent {supervisor.steps.index(last) + 1}, at step {last}")
     return "; ".join(words) or "nobody says why"
 
 
@@ -267,11 +284,11 @@ def _interruptible() -> Iterator[list[int]]:
 
 def conclude(result: RunResult) -> None:
     """Compare the bag of a run with its prediction; write report.html and result.json beside it."""
+    if result.trajectory is None or result.bag is None:
+        return
     from msg_analysis.inference.compare import compare
     from msg_analysis.report.html import write_report
 
-    if result.trajectory is None or result.bag is None:
-        return
     result.comparison = compare(result.trajectory)
     report = result.bag / REPORT_FILE
     write_report(result.comparison, result.trajectory, report, restarts=result.restarts, strangers=result.strangers)

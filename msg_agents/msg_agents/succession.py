@@ -15,12 +15,13 @@ import os
 import socket
 import struct
 from collections.abc import Iterable, Sequence
+from itertools import product
 from pathlib import Path
 
 from rclpy.node import Node
 
 from msg_agents.domain import PORT_BASE, PORTS_PER_DOMAIN
-from msg_agents.environment import MOST_PARTICIPANTS
+from msg_agents.environment import MOST_PARTICIPANTS, PEERS_VARIABLE
 from msg_analysis.errors import InputError
 
 PREFIX_SIZE = 12  # bytes of a GUID that all endpoints of a participant share
@@ -122,7 +123,7 @@ def farewell(prefix: bytes, number: int = _LATE) -> bytes:
 
 
 def bury(prefix: bytes, domain: int) -> None:
-    """Tell every participant of this machine that one is gone. Those of other machines wait for its lease to end.
+    """Tell every participant of the hosts of the run that one is gone. Other machines wait for its lease to end.
 
     Parameters
     ----------
@@ -130,9 +131,10 @@ def bury(prefix: bytes, domain: int) -> None:
     domain : ROS_DOMAIN_ID
     """
     base = PORT_BASE + PORTS_PER_DOMAIN * domain + 10  # the RTPS rule for the ports of discovery
+    addresses = {"127.0.0.1", *os.environ.get(PEERS_VARIABLE, "").split()}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for repeat in range(_REPEATS):
             message = farewell(prefix, _LATE + repeat)
-            for participant in range(MOST_PARTICIPANTS):
+            for address, participant in product(addresses, range(MOST_PARTICIPANTS)):
                 with contextlib.suppress(OSError):  # nobody there
-                    sender.sendto(message, ("127.0.0.1", base + 2 * participant))
+                    sender.sendto(message, (address, base + 2 * participant))

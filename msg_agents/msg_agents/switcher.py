@@ -21,6 +21,7 @@ from msg_agents.node import (
     END_TOPIC,
     EPOCH_TOPIC,
     EXPERIMENT_TOPIC,
+    FAREWELL,
     GRAPH_TOPIC,
     NOT_AN_AGENT,
     PROGRESS_TOPIC,
@@ -53,8 +54,6 @@ NAMESAKE = "a second node of this name"
 HEAD_START = SECOND // 2
 """ns of the clock from the publication of the epoch to the epoch: by then everybody should know it."""
 
-FAREWELL = 4.0  # s; more than the 3 s between two heartbeats of Fast DDS
-
 
 class Switcher(NetworkNode):
     """Draws the exact path of the chain; when it publishes what of it, is a matter of its pace.
@@ -66,6 +65,7 @@ class Switcher(NetworkNode):
     readers : names of the nodes, besides the agents, that must read the graph before the run starts
     on_progress : called with the newest step of every agent (-1: none yet) a few times a second, if one has reported
     checkpoints : directory in which it leaves a mark; whoever finds one there takes over from a process that has gone
+    farewell : s to wait for everybody to say that the end has been heard
     """
 
     def __init__(
@@ -76,8 +76,10 @@ class Switcher(NetworkNode):
         readers: list[str],
         on_progress: Callable[[Sequence[int]], None] = lambda _: None,
         checkpoints: Path | None = None,
+        farewell: float = FAREWELL,
     ) -> None:
         super().__init__("switcher", record=record)
+        self._farewell = farewell
         self._graphs = record.experiment.graph_list
         self._path = sojourns(record.experiment, model.initial)
         self._steps = record.experiment.steps
@@ -101,8 +103,13 @@ class Switcher(NetworkNode):
 
     def awaited(self) -> list[str]:
         """See NetworkNode. All that it publishes is latched: it is enough that the others are there."""
-        there = set(self.get_node_names())
+        here = self.get_namespace()
+        there = {name for name, namespace in self.get_node_names_and_namespaces() if namespace == here}
         return [name for name in self._expected if name not in there]
+
+    def companions(self) -> list[str]:
+        """See NetworkNode."""
+        return self._expected
 
     def health(self) -> Health:
         """See NetworkNode."""
@@ -136,7 +143,7 @@ class Switcher(NetworkNode):
     def finish(self, *, complete: bool) -> None:
         """See NetworkNode. Nobody needs anything but the end any more, and who has left has had it."""
         if complete:
-            self._end.wait_for_all_acked(Duration(seconds=FAREWELL))
+            self._end.wait_for_all_acked(Duration(seconds=self._farewell))
 
     def _receive(self, data: bytes) -> None:
         progress = self.decode_progress(data, PROGRESS_TOPIC)

@@ -13,6 +13,7 @@ pytest.importorskip("rclpy")
 
 from msg_agents import succession
 from msg_agents.domain import PORT_BASE, PORTS_PER_DOMAIN, free_domain
+from msg_agents.environment import PEERS_VARIABLE
 from msg_agents.succession import bury, farewell, succeed
 from msg_analysis.errors import InputError
 
@@ -32,11 +33,14 @@ def test_the_message_byte_for_byte() -> None:
     assert farewell(PREFIX, 5) == FAREWELL
 
 
-def test_every_participant_of_the_domain_is_told() -> None:
+def test_every_participant_of_the_domain_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On this machine, and on the other hosts of the run."""
+    monkeypatch.setenv(PEERS_VARIABLE, "127.0.0.1 127.0.0.2")
+    places = [("127.0.0.1", 0), ("127.0.0.1", 99), ("127.0.0.2", 3)]
     with free_domain() as domain:
-        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
-        for listener, participant in zip(sockets, (0, 99), strict=True):
-            listener.bind(("127.0.0.1", PORT_BASE + PORTS_PER_DOMAIN * domain + 10 + 2 * participant))
+        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in places]
+        for listener, (address, participant) in zip(sockets, places, strict=True):
+            listener.bind((address, PORT_BASE + PORTS_PER_DOMAIN * domain + 10 + 2 * participant))
             listener.settimeout(10)
         bury(PREFIX, domain)
         for listener in sockets:

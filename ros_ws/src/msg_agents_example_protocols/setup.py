@@ -22,6 +22,7 @@ setup(
     ],
     zip_safe=False,
     install_requires=["msg_analysis", "numpy", "pydantic>=2"],
+    extras_require={"test": ["pytest"]},  # by which colcon knows how to test it
     # This is all that makes a class a protocol: the name on the left is the one that experiments use.
     entry_points={
         "msg_agents.protocols": [

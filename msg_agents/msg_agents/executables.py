@@ -1,0 +1,41 @@
+"""The nodes as executables of the ROS 2 package: ``ros2 run msg_agents agent --ros-args -p run:=... -p agents:=[1,2]``.
+
+Each is the command of that name of ``msg-agents``.
+"""
+
+from __future__ import annotations
+
+import sys
+
+
+def agent() -> None:
+    """``msg-agents agent``."""
+    _run("agent")
+
+
+def switcher() -> None:
+    """``msg-agents switcher``."""
+    _run("switcher")
+
+
+def recorder() -> None:
+    """``msg-agents recorder``."""
+    _run("recorder")
+
+
+def player() -> None:
+    """``msg-agents play``."""
+    _run("play")
+
+
+def live() -> None:
+    """``msg-agents live``."""
+    _run("live")
+
+
+def _run(command: str) -> None:
+    try:
+        from msg_agents.cli import main
+    except KeyboardInterrupt:  # what is being imported cannot be asked to see to it
+        sys.exit(130)
+    main([command, *sys.argv[1:]], prog_name="msg-agents")

@@ -1,0 +1,36 @@
+"""What is installed is what ROS 2 looks for. Run by ``colcon test`` in the workspace that has been built."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+from ament_index_python.packages import get_package_prefix, get_package_share_directory
+
+EXECUTABLES = ("msg-agents", "agent", "switcher", "recorder", "player", "live")
+LIBEXEC = Path(get_package_prefix("msg_agents")) / "lib" / "msg_agents"
+
+
+@pytest.mark.parametrize("name", EXECUTABLES)
+def test_executable(name: str) -> None:
+    """As ``ros2 run`` and ``ros2 launch`` find and start it."""
+    file = LIBEXEC / name
+    assert os.access(file, os.X_OK)
+    process = subprocess.run([file, "--help"], capture_output=True, text=True, timeout=60)
+    assert process.returncode == 0, process.stderr
+    assert "Usage: msg-agents" in process.stdout or "Usage: " in process.stdout
+
+
+def test_share() -> None:
+    assert (Path(get_package_share_directory("msg_agents")) / "package.xml").is_file()
+
+
+def test_a_node_is_an_ordinary_one(tmp_path: Path) -> None:
+    """It takes what ``ros2 run`` hands on, and says what is wrong with it: exit code 2, no traceback."""
+    command = [LIBEXEC / "agent", "--ros-args", "-r", "__ns:=/lab", "-p", f"run:={tmp_path}/no", "-p", "agents:=[1]"]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert process.returncode == 2
+    assert "cannot be read" in process.stderr
+    assert "Traceback" not in process.stderr

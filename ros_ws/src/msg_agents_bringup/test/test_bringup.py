@@ -1,0 +1,34 @@
+"""What this package brings is where ROS 2 looks for it. Run by ``colcon test`` in the workspace that has been built."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from msg_analysis.model.experiment import Experiment
+
+PACKAGE = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("file", sorted((PACKAGE / "experiments").glob("*.yaml")), ids=lambda file: file.stem)
+def test_experiment(file: Path) -> None:
+    Experiment.load(file).require_available()
+
+
+@pytest.mark.parametrize("file", sorted((PACKAGE / "launch").glob("*.launch.py")), ids=lambda file: file.stem)
+def test_launch_file(file: Path) -> None:
+    """With ``launch`` installed it can be described, and every argument says what it is for."""
+    launch = pytest.importorskip("launch", reason="no launch here (there are no wheels of it)")
+    pytest.importorskip("launch_ros", reason="no launch_ros here (there are no wheels of it)")
+    from launch.launch_description_sources import get_launch_description_from_python_launch_file
+
+    description = get_launch_description_from_python_launch_file(str(file))
+    assert isinstance(description, launch.LaunchDescription)
+    assert all(argument.description for argument in description.get_launch_arguments())
+
+
+def test_parameter_file() -> None:
+    document = yaml.safe_load((PACKAGE / "config" / "nodes.yaml").read_text(encoding="utf-8"))
+    assert all(set(section) == {"ros__parameters"} for section in document.values())

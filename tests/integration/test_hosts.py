@@ -1,0 +1,188 @@
+"""A network over three hosts: network namespaces, each with an address of its own, on a bridge in a fourth."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from msg_agents.check import check
+from msg_analysis.bags.reader import read_bag
+
+PREFIX = "msga"
+NAMES = ("base", "left", "right")
+PROGRAM = Path(sys.executable).with_name("msg-agents")
+
+
+def ip(*words: str) -> None:
+    subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
+
+
+def clear(prefix: str) -> None:
+    """Remove namespaces; what is in them goes with them."""
+    for line in subprocess.run(["ip", "netns", "list"], capture_output=True, text=True).stdout.splitlines():
+        name = line.split()[0]
+        if name.startswith(prefix):
+            subprocess.run(["ip", "netns", "delete", name], capture_output=True)
+
+
+def clear_abandoned() -> None:
+    """Namespaces of tests that were killed."""
+    for line in subprocess.run(["ip", "netns", "list"], capture_output=True, text=True).stdout.splitlines():
+        found = re.match(rf"({PREFIX}([0-9]+)_)", line)
+        if found and not Path(f"/proc/{found[2]}").exists():
+            clear(found[1])
+
+
+@dataclass
+class Lan:
+    """Three hosts, their files, and the means to start processes on them and to cut them off."""
+
+    network: Any
+    prefix: str
+    hosts_file: Path
+    run_file: Path
+
+    def start(self, host: str, *arguments: str | Path) -> subprocess.Popen[str]:
+        """Start ``msg-agents`` on a host."""
+        return subprocess.Popen(
+            ["ip", "netns", "exec", self.prefix + host, str(PROGRAM), *(str(argument) for argument in arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"NO_COLOR": "1"},
+        )
+
+    def start_all(self, *options: str) -> dict[str, subprocess.Popen[str]]:
+        """Every host's share; what they leave is in a directory of each."""
+        return {
+            name: self.start(
+                name, "host", self.run_file, self.hosts_file, "--name", name, "--json", *options,
+                "--out", self.network.directory / name,
+            )
+            for name in NAMES
+        }  # fmt: skip
+
+    def plug(self, host: str, state: str, *, cable: bool) -> None:
+        """Set a host's interface, or the port of the bridge that its cable is in, up or down."""
+        where, device = ("switch", host) if cable else (host, "eth0")
+        ip("-n", self.prefix + where, "link", "set", device, state)
+
+
+@pytest.fixture
+def lan(network: Any) -> Iterator[Lan]:
+    if os.geteuid() != 0:
+        pytest.skip("network namespaces can be made by root only")
+    if shutil.which("ip") is None:
+        pytest.skip("there is no command ip (Debian package iproute2)")
+    clear_abandoned()
+    prefix = f"{PREFIX}{os.getpid()}_"
+    try:
+        try:
+            ip("netns", "add", prefix + "switch")
+            ip("-n", prefix + "switch", "link", "add", "bridge", "type", "bridge")
+        except subprocess.CalledProcessError as error:
+            pytest.skip(f"this system has no network namespaces or bridges for us: {error.stderr.strip()}")
+        ip("-n", prefix + "switch", "link", "set", "bridge", "up")
+        for number, name in enumerate(NAMES, start=1):
+            ip("netns", "add", prefix + name)
+            ip("-n", prefix + "switch", "link", "add", name, "type", "veth", "peer", "name", "eth0",
+               "netns", prefix + name)  # fmt: skip
+            ip("-n", prefix + "switch", "link", "set", name, "master", "bridge", "up")
+            ip("-n", prefix + name, "address", "add", f"10.77.0.{number}/24", "dev", "eth0")
+            for device in ("lo", "eth0"):
+                ip("-n", prefix + name, "link", "set", device, "up")
+        hosts = {
+            "base": {"address": "10.77.0.1"},
+            "left": {"address": "10.77.0.2", "agents": [1, 4]},
+            "right": {"address": "10.77.0.3", "agents": ["2-3", 5]},
+        }
+        hosts_file = network.directory / "hosts.yaml"
+        hosts_file.write_text(yaml.safe_dump({"domain": 42, "recorder": "base", "hosts": hosts}))
+        yield Lan(network, prefix, hosts_file, network.directory / "run.json")
+    finally:
+        for process in network.processes():
+            process.kill()
+        clear(prefix)
+
+
+def prepare(lan: Lan, duration: float) -> None:
+    """The run record, made once for all hosts."""
+    file = lan.network.file(run={"duration": duration})
+    done = subprocess.run([str(PROGRAM), "prepare", file], capture_output=True, text=True, check=True)
+    lan.run_file.write_text(done.stdout)
+
+
+def ended(processes: dict[str, subprocess.Popen[str]], code: int) -> dict[str, tuple[str, str]]:
+    texts = {name: process.communicate(timeout=90) for name, process in processes.items()}
+    assert {name: process.returncode for name, process in processes.items()} == dict.fromkeys(NAMES, code), texts
+    assert not any("Traceback" in text for pair in texts.values() for text in pair), texts
+    return texts
+
+
+def whole(lan: Lan, texts: dict[str, tuple[str, str]]) -> None:
+    """All is there, once, and as the twin says. One bag, on the recorder's host; logs everywhere."""
+    results = {name: json.loads(stdout) for name, (stdout, _) in texts.items()}
+    assert all(result["failures"] == [] for result in results.values())
+    assert [result["bag"] is None for result in results.values()] == [False, True, True]
+    trajectory = read_bag(results["base"]["bag"])
+    assert trajectory.record.run.hex == json.loads(lan.run_file.read_text())["run"].replace("-", "")
+    assert trajectory.completeness.complete
+    assert trajectory.completeness.duplicates == 0
+    outcome = check(trajectory)
+    assert (outcome.difference, outcome.missing) == (None, 0)
+    logs = {name: {log.stem for log in (lan.network.directory / name).glob("*/log/*.log")} for name in NAMES}
+    assert logs == {
+        "base": {"recorder", "switcher"},
+        "left": {"agent_1", "agent_4"},
+        "right": {"agent_2", "agent_3", "agent_5"},
+    }
+
+
+def test_three_hosts(lan: Lan) -> None:
+    """The demo network across them equals the twin to the last bit, and agrees with the prediction."""
+    prepare(lan, 100)
+    texts = ended(lan.start_all(), 0)
+    whole(lan, texts)
+    assert json.loads(texts["base"][0])["verdict"] == "agrees"
+
+
+def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: random.Random) -> None:
+    """Its cable is pulled, or its interface goes down: everybody waits, then all goes on, and nothing is lost."""
+    prepare(lan, 600)
+    host, cable = rng.choice(NAMES), rng.random() < 0.5
+    hosts = lan.start_all()
+    lan.network.wait_until_moving("base")
+    time.sleep(rng.uniform(0, 0.5))
+    assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
+    lan.plug(host, "down", cable=cable)
+    time.sleep(5)
+    assert all(process.poll() is None for process in hosts.values()), (host, cable)
+    lan.plug(host, "up", cable=cable)
+    whole(lan, ended(hosts, 0))
+
+
+def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
+    """Ctrl-C on one of them: they say who has gone. Exit code 3 everywhere."""
+    prepare(lan, 20000)
+    hosts = lan.start_all("--patience", "2")
+    lan.network.wait_until_moving("base")
+    hosts["left"].send_signal(signal.SIGINT)
+    texts = ended(hosts, 3)
+    assert "ended by SIGINT" in texts["left"][1]
+    assert re.search(r"switcher: exit code 2: error: agent_1, agent_4 left the network", texts["base"][1])
+    assert re.search(r"agent_[235]: exit code 2: error: switcher left the network", texts["right"][1])
+    assert read_bag(json.loads(texts["base"][0])["bag"]).completeness.missing > 0

@@ -1,0 +1,232 @@
+"""The nodes as ROS 2 users start them: parameters, namespaces, remapping, launch; a node that knows nothing of ours."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from mcap.reader import make_reader
+
+from msg_agents.check import check
+from msg_agents.domain import free_domain
+from msg_agents.launching import NETWORK_ARGUMENTS, LaunchedNetwork, environment
+from msg_analysis.bags.reader import read_bag
+
+BIN = Path(sys.executable).parent
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """Of all processes of the test, on this machine only."""
+    with free_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield number
+
+
+def start(executable: str, *arguments: Any, **options: Any) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [str(BIN / executable), *(str(argument) for argument in arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"NO_COLOR": "1"} | options.pop("environment", {}),
+        **options,
+    )
+
+
+def end(process: subprocess.Popen[str], code: int = 0) -> str:
+    """Wait for it; what it printed."""
+    stdout, stderr = process.communicate(timeout=90)
+    assert process.returncode == code, stderr
+    assert "Traceback" not in stderr
+    return stdout
+
+
+def run_record(network: Any, **changes: Any) -> Path:
+    text = end(network.start("prepare", network.file(**changes)))
+    file = network.directory / "run.json"
+    file.write_text(text)
+    return Path(file)
+
+
+def topics(bag: Path) -> Counter[str]:
+    """Messages by topic, as mcap's own reader counts them."""
+    (file,) = bag.glob("*.mcap")
+    with file.open("rb") as stream:
+        return Counter(channel.topic for _, channel, _ in make_reader(stream).iter_messages())
+
+
+@pytest.mark.usefixtures("domain")
+def test_parameters_namespace_and_remapping(network: Any) -> None:
+    """One parameter file for all, in a namespace, one topic under another name: complete, and as the twin says.
+
+    In the bag the topic has its own name. Another network of the same domain, in a namespace of its own, is not in the
+    way, though its nodes have the same names.
+    """
+    nodes = []
+    bags = {"/lab": network.directory / "lab", "/hall": network.directory / "hall"}
+    for seed, (namespace, bag) in enumerate(bags.items()):
+        record = run_record(network, run={"seed": seed})
+        record = record.rename(record.with_stem(bag.name))
+        file = network.directory / f"{bag.name}.yaml"
+        sections = {
+            "/**": {"run": str(record), "await": ["recorder"]},
+            f"{namespace}/recorder": {"out": str(bag), "compression": "lz4", "parameter_services": True},
+            f"{namespace}/agent_4": {
+                f"qos_overrides.{namespace}/agent_4/state.publisher.durability": "transient_local"
+            },
+        }
+        file.write_text(yaml.safe_dump({name: {"ros__parameters": section} for name, section in sections.items()}))
+        ros = [
+            "--ros-args",
+            "--params-file",
+            file,
+            "-r",
+            f"__ns:={namespace}",
+            "-r",
+            f"agent_1/state:=/other{namespace}/one",
+        ]
+        nodes.append(start("recorder", *ros))
+        if namespace == "/lab":  # before the run can be over
+            described = json.loads(end(start("python", "-P", "-c", DESCRIBE)))
+        nodes += [
+            start("agent", *ros, "-p", "agents:=[1, 3]"),
+            start("agent", "--agent", "2", "--agent", "4", "--agent", "5", *ros),
+            start("switcher", *ros),
+        ]
+    for node in nodes:
+        assert end(node) == ""
+    assert described["out"] == {"type": 4, "read_only": True, "value": str(bags["/lab"])}
+    assert described["compression"]["value"] == "lz4"
+    for namespace, bag in bags.items():
+        found = topics(bag)
+        assert {name: found[name] for name in found if name.endswith("/state")} == {
+            f"{namespace}/agent_{i}/state": 301 for i in range(1, 6)
+        }
+        assert found[f"{namespace}/experiment"] == 1
+        trajectory = read_bag(bag)
+        assert trajectory.completeness.complete
+        assert check(trajectory).difference is None
+        assert trajectory.completeness.refused == {}
+
+
+DESCRIBE = """
+import json, sys
+import rclpy
+from rclpy.parameter_client import AsyncParameterClient
+rclpy.init(args=sys.argv)
+node = rclpy.create_node("asking")
+client = AsyncParameterClient(node, "/lab/recorder")
+assert client.wait_for_services(timeout_sec=60)
+names = ["out", "compression"]
+futures = [client.describe_parameters(names), client.get_parameters(names)]
+for future in futures:
+    rclpy.spin_until_future_complete(node, future, timeout_sec=60)
+descriptors, values = futures[0].result().descriptors, futures[1].result().values
+print(json.dumps({
+    d.name: {"type": d.type, "read_only": d.read_only, "value": v.string_value} for d, v in zip(descriptors, values)
+}))
+"""
+
+
+@pytest.mark.usefixtures("domain")
+def test_what_the_launch_files_do(network: Any) -> None:
+    """The processes as launch_ros starts them, the ends as launch tells them, then the analysis."""
+    arguments = {name: default for name, (default, _) in NETWORK_ARGUMENTS.items()} | {
+        "experiment": str(network.file()),
+        "out": str(network.directory / "runs"),
+        "processes": "2",
+        "namespace": "/lab",
+    }
+    launched = LaunchedNetwork(arguments, ROOT / "ros_ws/src/msg_agents_bringup")
+    ros = ["--ros-args", "-r", "__ns:=/lab"]
+    running = {
+        plan.name: start(plan.arguments[0], *plan.arguments[1:], *ros, environment=environment())
+        for plan in launched.processes
+    }
+    completed = []
+    for name, process in running.items():
+        process.communicate(timeout=90)
+        completed.append(launched.ended(name, process.returncode))
+    assert completed == [False, False, False, True]
+    assert launched.analysis
+    assert launched.bag
+    analysis = start("msg-analysis", *launched.analysis)
+    stdout, stderr = analysis.communicate(timeout=90)
+    assert analysis.returncode in (0, 1), stderr  # which, is a matter of the seed
+    assert "Mean-square error" in stdout
+    launched.close()
+    assert json.loads((launched.bag / "log/run.json").read_text())["experiment"]["name"] == "net"
+    assert (launched.bag / "report.html").is_file()
+    assert topics(launched.bag)["/lab/agent_5/state"] == 301
+    assert check(read_bag(launched.bag)).difference is None
+
+
+def stranger(directory: Path) -> Path:
+    """The node of docs/ros.md, as a file."""
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs/ros.md").read_text(encoding="utf-8"), re.M | re.S)
+    (code,) = [block for block in blocks if "class Stranger" in block]
+    assert "msg_agents." not in code
+    assert "msg_analysis" not in code
+    file = directory / "stranger.py"
+    file.write_text(code)
+    return file
+
+
+def test_a_stranger(network: Any, domain: int) -> None:
+    """A plain rclpy node sees graphs and states of a running network, and ends with it."""
+    watching = start("python", stranger(network.directory), cwd=network.directory)
+    file = network.file(run={"pace": "realtime", "speed": 2.5})  # 6 s
+    result = network.completed(network.start("run", file, "--out", network.directory, "--domain", domain, "--json"))
+    assert result["strangers"] == []
+    printed = end(watching)
+    graphs = re.findall(r"^steps (\d+) to (\d+): (line|ring), (\d+) arcs$", printed, re.M)
+    assert (graphs[0][0], graphs[-1][1]) == ("0", "299")
+    assert all(arcs == {"line": "8", "ring": "10"}[name] for _, _, name, arcs in graphs)
+    states = re.findall(r"^agent (\d): (\d+) states$", printed, re.M)
+    assert [agent for agent, _ in states] == list("12345")
+    assert all(0 < int(count) <= 301 for _, count in states)
+    assert (network.directory / "states.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_guest_gets_everything(network: Any, domain: int) -> None:
+    """A reader that is no recorder of ours, named to the agents, gets every state, the last one too."""
+    record = run_record(network)
+    guest = start("python", "-P", "-c", GUEST)
+    ros = ["--ros-args", "-p", f"run:={record}", "-p", "await:=[rosbag2_recorder]"]
+    nodes = [start("switcher", *ros), start("agent", *ros, "-p", "agents:=[1, 2, 3, 4, 5]")]
+    for node in nodes:
+        end(node)
+    assert json.loads(end(guest)) == [[i, step] for i in range(1, 6) for step in range(301)]
+
+
+GUEST = """
+import json
+import rclpy
+from msg_agents_interfaces.msg import AgentState
+from rclpy.qos import HistoryPolicy, QoSProfile
+rclpy.init()
+node = rclpy.create_node("rosbag2_recorder")
+seen = set()
+for i in range(1, 6):
+    qos = QoSProfile(history=HistoryPolicy.KEEP_ALL)
+    node.create_subscription(AgentState, f"agent_{i}/state", lambda m: seen.add((m.agent, m.step)), qos)
+while not node.count_publishers("agent_1/state"):
+    rclpy.spin_once(node, timeout_sec=0.2)
+while len(seen) < 5 * 301 and node.count_publishers("agent_1/state"):
+    rclpy.spin_once(node, timeout_sec=0.2)
+for _ in range(20):
+    rclpy.spin_once(node, timeout_sec=0.05)
+print(json.dumps(sorted(seen)))
+"""
