@@ -57,6 +57,10 @@ class Live(Watcher):
     reliable : whether to miss no state, and so hold the network back where this node does not keep up
     on_report : told of every estimate, with the number of steps per second
     on_note : told what somebody should know
+
+    Attributes
+    ----------
+    outcome : what was seen, in the end; None: no network
     """
 
     def __init__(
@@ -67,6 +71,7 @@ class Live(Watcher):
         on_note: Callable[[str], None],
     ) -> None:
         super().__init__("live", on_note=on_note)
+        self.outcome: Watched | None = None
         self._qos = STREAM if reliable else LISTEN
         self._on_report = on_report
         self._estimate: LiveEstimate | None = None
@@ -136,8 +141,12 @@ class Live(Watcher):
         if over and not self.done.done():
             self.done.set_result(None)
 
+    def conclude(self) -> None:
+        """See Watcher."""
+        self.outcome = self.watched()
+
     def farewell(self) -> None:
-        """Stay until whoever reads the estimates has the last one."""
+        """See Watcher."""
         self._writer.wait_for_all_acked(Duration(seconds=FAREWELL))
 
     def _message(self, watched: Watched) -> EstimateMsg:
@@ -188,4 +197,4 @@ def watch(
     node = run_watcher(
         lambda: Live(reliable=reliable, on_report=on_report, on_note=on_note), timeout=timeout, on_note=on_note
     )
-    return node and node.watched()
+    return node and node.outcome

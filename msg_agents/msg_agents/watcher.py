@@ -72,6 +72,9 @@ class Watcher(QuietNode):
         """Stay until whoever reads what this node says has the last of it."""
         raise NotImplementedError
 
+    def conclude(self) -> None:
+        """Work out what is to be said in the end, as far as it has come: leaving is given little time."""
+
     def _receive_experiment(self, data: bytes) -> None:
         try:
             record = RunRecord.from_json(decode_string(data), f"topic {self.resolve_topic_name(EXPERIMENT_TOPIC)}")
@@ -143,6 +146,8 @@ def run_watcher(
     except (KeyboardInterrupt, SystemExit):
         pass
     finally:
+        for node in nodes:
+            node.conclude()
         # When the run is over nobody waits for this node, and leaving while others leave can deadlock: see ``leave``.
         if not all(node.done.done() for node in nodes):
             leave(nodes, complete=False)

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from msg_agents.domain import free_domain
+from msg_analysis.bags.store import write_trajectory
+from msg_analysis.twin import simulate
 
 LISTENER = """
 import json
@@ -36,7 +38,7 @@ while not found or last not in "".join(marker.text for marker in found[-1].marke
     rclpy.spin_once(node, timeout_sec=1.0)
 print(json.dumps([plain(array) for array in found]))
 """
-STEPS = 4000
+STEPS = 20000  # long enough to be found by who watches
 
 
 def by_space(array: dict[str, Any], namespace: str) -> list[dict[str, Any]]:
@@ -67,7 +69,7 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
     (agents,), (links,), (title,) = (by_space(pictures[-1], name) for name in ("agents", "links", "title"))
     trajectory = result.trajectory
     mode = trajectory.modes[-1]
-    assert title["text"] == f"net  step {STEPS}  t = 200  {('line', 'ring')[mode]}"
+    assert title["text"] == f"net  step {STEPS}  t = 1000  {('line', 'ring')[mode]}"
     places = [(point["x"], point["y"]) for point in agents["points"]]
     assert len(set(places)) == 5
     ends = [places.index((point["x"], point["y"])) for point in links["points"]]
@@ -81,12 +83,16 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
     assert [marker["text"] for marker in by_space(pictures[-1], "names")] == list("12345")
 
 
-def test_no_such_replica(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_such_replica(network: Any) -> None:
+    """Said once the experiment is known, which a bag that is being played keeps there."""
+    bag = network.directory / "bag"
+    write_trajectory(simulate(network.experiment()), bag)
     with free_domain() as domain:
+        play = network.start("play", bag, "--rate", "0.1", "--domain", str(domain))
         markers = network.start("markers", "--replica", "3", "--domain", str(domain))
-        assert "waiting for one" in markers.stderr.readline()
-        network.run(network.experiment(), domain=domain)
         stderr = markers.communicate(timeout=60)[1]
+        play.terminate()
+        play.communicate(timeout=60)
     assert markers.returncode == 2
     assert "--replica: 3: expected a number from 1 to 2" in stderr
     assert "Traceback" not in stderr
