@@ -27,7 +27,7 @@ setup(
             "msg-agents = msg_agents.cli:main",
             *(
                 f"{node} = msg_agents.executables:{node}"
-                for node in ("agent", "switcher", "recorder", "player", "live")
+                for node in ("agent", "switcher", "recorder", "player", "live", "markers")
             ),
         ]
     },

@@ -16,7 +16,7 @@ import click
 
 import msg_agents
 from msg_agents import cli_nodes, cli_replay
-from msg_agents.environment import RESTARTS
+from msg_agents.environment import LAST_DOMAIN, RESTARTS
 from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, result_console
 
@@ -61,7 +61,9 @@ def main() -> None:
     show_default=True,
     help="How often, in all, agents or the switcher are started again when they were killed.",
 )
-@click.option("--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own.")
+@click.option(
+    "--domain", type=click.IntRange(0, LAST_DOMAIN), help="ROS_DOMAIN_ID. Default: a free one of the run's own."
+)
 @cli_nodes.use_sim_time
 @click.option(
     "--pin/--no-pin",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from msg_agents.environment import LAST_DOMAIN
 from msg_agents.ros_command import RosCommand
 from msg_analysis.console import examples, print_json, result_console
 
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
     from msg_agents.player import Played
 
 INCOMPLETE = 3
-_domain = click.option("--domain", type=click.IntRange(0, 232), help="Instead of the environment's ROS_DOMAIN_ID.")
+_domain = click.option(
+    "--domain", type=click.IntRange(0, LAST_DOMAIN), help="Instead of the environment's ROS_DOMAIN_ID."
+)
 
 
 def _positive(_: click.Context, __: click.Parameter, value: float | None) -> float | None:

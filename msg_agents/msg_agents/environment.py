@@ -5,12 +5,28 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from msg_analysis.errors import InputError
+
 LOOPBACK_PROFILE = Path(__file__).with_name("loopback.xml")
 MOST_PARTICIPANTS = 100  # of a domain that find each other on one machine: maxInitialPeersRange of loopback.xml
+TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
 RESTARTS = 3  # of killed processes in a run, if nothing else is said
+LAST_DOMAIN = 231  # the ports of 232, the last that ROS knows, end after some 60 participants
 DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other, in small networks
 PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts of a run, where there are several
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
+
+
+def check_domain() -> None:
+    """See to it that the environment's ROS_DOMAIN_ID can be used, before the middleware is asked.
+
+    Raises
+    ------
+    InputError : it cannot
+    """
+    value = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not value.isdecimal() or int(value) > LAST_DOMAIN:
+        raise InputError(f"ROS_DOMAIN_ID: {value}: expected a number from 0 to {LAST_DOMAIN}")
 
 
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
@@ -36,3 +52,16 @@ def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str,
         environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SYSTEM_DEFAULT"  # as the profile says
         environment.update(dict.fromkeys(PROFILE_VARIABLES, str(profile)))
     return environment
+
+
+def without_shared_memory() -> dict[str, str]:
+    """Changes to our environment by which the middleware uses none, so that a process that ends at once leaves none.
+
+    Where the user has chosen a profile or transports, these stay. Others, who may use it, are reached by UDP.
+    """
+    if any(os.environ.get(name) for name in (*PROFILE_VARIABLES, TRANSPORTS_VARIABLE)):
+        return {}
+    if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST":  # the variable has no effect then
+        profile = dict.fromkeys(PROFILE_VARIABLES, str(LOOPBACK_PROFILE))
+        return {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT", **profile}
+    return {TRANSPORTS_VARIABLE: "UDPv4"}

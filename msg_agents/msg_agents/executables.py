@@ -33,6 +33,11 @@ def live() -> None:
     _run("live")
 
 
+def markers() -> None:
+    """``msg-agents markers``."""
+    _run("markers")
+
+
 def _run(command: str) -> None:
     try:
         from msg_agents.cli import main

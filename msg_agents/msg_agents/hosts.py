@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from msg_agents.environment import LOOPBACK_PROFILE, MOST_PARTICIPANTS, PEERS_VARIABLE, node_environment
+from msg_agents.environment import LAST_DOMAIN, LOOPBACK_PROFILE, MOST_PARTICIPANTS, PEERS_VARIABLE, node_environment
 from msg_agents.network import Share, most_processes
 from msg_analysis.errors import InputError
 from msg_analysis.model.document import read_yaml
@@ -69,7 +69,7 @@ class HostsSpec(BaseModel):
     """The hosts file as data."""
 
     model_config = ConfigDict(extra="forbid")
-    domain: int = Field(0, strict=True, ge=0, le=232, description="ROS_DOMAIN_ID of the run", examples=[42])
+    domain: int = Field(0, strict=True, ge=0, le=LAST_DOMAIN, description="ROS_DOMAIN_ID of the run", examples=[42])
     recorder: str = Field(description="the host that records, and that has the switcher", examples=["lab1"])
     hosts: dict[str, HostSpec] = Field(
         min_length=1, description="the hosts, by name", examples=[{"lab1": {"address": "192.0.2.1", "agents": ["1-5"]}}]

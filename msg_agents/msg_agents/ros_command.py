@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from msg_agents.environment import check_domain
 from msg_agents.parameters import GIVES_PARAMETERS, PROCESS, given, mention_qos, merge, name_of, options_of
 
 
@@ -32,6 +33,12 @@ class RosCommand(click.Command):
             rest = self._parse_with_parameters(ctx, ours, ros)
         PROCESS.options, PROCESS.values = options_of(self), dict(ctx.params)
         return rest
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """See click.Command."""
+        if ctx.params.get("domain") is None:
+            check_domain()
+        return super().invoke(ctx)
 
     def _parse_with_parameters(self, ctx: click.Context, ours: list[str], ros: list[str]) -> list[str]:
         # Whether something is missing turns out only when the parameters have been read.

@@ -17,6 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_msgs.msg import String
 
+from msg_agents.environment import without_shared_memory
 from msg_agents.node import END_TOPIC, EXPERIMENT_TOPIC, OTHER_RUN, UNDECODABLE
 from msg_agents.parameters import ros_arguments
 from msg_agents.process import SPIN_SLICE, leave, make_executor
@@ -124,6 +125,8 @@ def run_watcher(
     ------
     InputError : no network came in time, or it cannot be followed
     """
+    nobody = _nobody()
+    os.environ.update(without_shared_memory())
     with ros_arguments():
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Kind] = []
@@ -136,10 +139,10 @@ def run_watcher(
             executor.spin_until_future_complete(node.known, timeout_sec=SPIN_SLICE)
             waited = time.monotonic() - began
             if timeout is not None and waited > timeout and not node.known.done():
-                raise InputError(f"after {timeout:g} s {_nobody()}: is one running there, or being played?")
+                raise InputError(f"after {timeout:g} s {nobody}: is one running there, or being played?")
             if waited > PATIENCE and not noted and not node.known.done():
                 noted = True
-                on_note(f"{_nobody()} yet: waiting for one")
+                on_note(f"{nobody} yet: waiting for one")
         node.follow()
         _spin(executor, node.done)
         node.farewell()

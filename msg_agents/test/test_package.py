@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 
-EXECUTABLES = ("msg-agents", "agent", "switcher", "recorder", "player", "live")
+EXECUTABLES = ("msg-agents", "agent", "switcher", "recorder", "player", "live", "markers")
 LIBEXEC = Path(get_package_prefix("msg_agents")) / "lib" / "msg_agents"
 
 

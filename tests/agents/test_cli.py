@@ -165,6 +165,14 @@ def test_damaged_run_record(tmp_path: Path, run_file: Path, change: dict[str, An
     refused(call("agent", run_file, "--agent", "1"), "run.json", word)
 
 
+@pytest.mark.parametrize("value", ["232", "lab", "-1", "1.5"])
+@pytest.mark.parametrize("command", [["live"], ["switcher", "run.json"]], ids=" ".join)
+def test_no_domain(run_file: Path, command: list[str], value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """232 is the last that ROS knows, with ports for half of a large run; the middleware fails without saying why."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", value)
+    refused(call(*command, directory=run_file.parent), f"ROS_DOMAIN_ID: {value}: expected a number from 0 to 231")
+
+
 @pytest.mark.parametrize(
     ("numbers", "words"),
     [

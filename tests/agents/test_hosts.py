@@ -116,7 +116,7 @@ def with_host(name: str, **host: Any) -> dict[str, Any]:
         ([1], "expected the keys domain, recorder and hosts"),
         (document(recorder="bass"), "recorder: bass: expected one of the hosts, base, left, right"),
         ({"hosts": HOSTS}, "recorder: missing: expected the host that records"),
-        (document(domain=500), "domain: 500: expected a number <= 232"),
+        (document(domain=500), "domain: 500: expected a number <= 231"),
         (document(host={}), "host: unknown key: expected one of domain, recorder, hosts: did you mean 'hosts'?"),
         (with_host("left", agents=[1, 4]), "hosts.left.address: missing"),
         (

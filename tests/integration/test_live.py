@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -119,13 +120,18 @@ def wait_for_steps(live: subprocess.Popen[str]) -> None:
         assert line, live.communicate()
 
 
-def test_interrupted_it_says_what_it_has(network: Any, domain: int) -> None:
-    """Exit code 3: not seen to the end. Without any network too."""
+@pytest.mark.parametrize("reach", ["SUBNET", "LOCALHOST"])
+def test_interrupted_it_says_what_it_has(
+    network: Any, domain: int, monkeypatch: pytest.MonkeyPatch, reach: str
+) -> None:
+    """Exit code 3: not seen to the end. Without any network too. It uses no shared memory, so it leaves none."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", reach)
     bag = network.directory / "bag"
     write_trajectory(simulate(network.experiment()), bag)
     live, play = network.start("live"), network.start("play", bag, "--rate", "0.5", "--await", "live")
-    alone = network.start("live", "--domain", "232")
+    alone = network.start("live", "--domain", "231")
     wait_for_steps(live)
+    assert "/dev/shm/fastrtps_" not in Path(f"/proc/{live.pid}/maps").read_text()
     live.send_signal(signal.SIGINT)
     ended(live, 3)
     play.send_signal(signal.SIGINT)
@@ -133,4 +139,7 @@ def test_interrupted_it_says_what_it_has(network: Any, domain: int) -> None:
     assert "waiting for one" in alone.stderr.readline()
     alone.send_signal(signal.SIGTERM)
     assert "no network was seen" in ended(alone, 3)[1]
-    assert "after 1 s no network in ROS_DOMAIN_ID" in ended(network.start("live", "--timeout", "1"), 2)[1]
+    said = ended(network.start("live", "--timeout", "1"), 2)[1]
+    assert re.search(
+        f"after 1 s no network in ROS_DOMAIN_ID {domain}, within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}", said
+    )
