@@ -125,6 +125,21 @@ def test_who_comes_late_expects_what_is_left(start: str) -> None:
     assert report.system.predicted == pytest.approx(wanted, rel=1e-9)
 
 
+@pytest.mark.parametrize("steps", [slice(100, 101), slice(100, None)], ids=["one step", "from a step on"])
+def test_numbers_too_large_to_compute_with(steps: slice) -> None:
+    """The square of 1e200 is no number: what is shown is huge, and still a number, the standard errors too."""
+    trajectory = simulate(experiment())
+    trajectory.states[steps, 1] = 1e200
+    live = LiveEstimate(trajectory.record)
+    with np.errstate(all="raise"):
+        for message in messages(trajectory):
+            live.add(*message)
+        report = live.report()
+    assert np.isfinite(numbers(report.system)[:, :5]).all()
+    assert np.isfinite(numbers(*report.nodes)).all()
+    assert min(estimate.measured or 0.0 for estimate in (report.system, *report.nodes)) > 1e100
+
+
 def test_many_agents() -> None:
     """Looked at in one step of two: standard errors of the nodes a little off, all else to the last digits."""
     numbers_of_agents = list(range(1, 26))
