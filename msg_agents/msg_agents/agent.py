@@ -13,7 +13,7 @@ from rclpy.publisher import Publisher
 
 from msg_agents.checkpoint import Checkpoint, longest_heard
 from msg_agents.network import RECORDER
-from msg_agents.node import FAREWELL, NetworkNode, agent_name, state_topic, truth_topic
+from msg_agents.node import NetworkNode, agent_name, state_topic, truth_topic
 from msg_agents.pace import Pace
 from msg_agents.qos import STREAM
 from msg_analysis.bags.cdr import ActiveGraph, StateCodec, StateFrame, with_state
@@ -74,7 +74,6 @@ class Agent(NetworkNode):
         self._near = [j for j in peers if j in near]
         self._listeners: list[Callable[[int, int, Any], None]] = []
         self._expected = [*map(agent_name, self._far), *readers]
-        self._has_guests = any(name != RECORDER for name in readers)
         self._next_progress = 0.0
         self._pace = Pace()
         self._states = self.create_publisher(AgentStateMsg, state_topic(agent), STREAM)
@@ -105,10 +104,11 @@ class Agent(NetworkNode):
             missing += self.missing_readers(self._truth, self._awaits_truth)
         return missing
 
-    def finish(self, *, complete: bool) -> None:
-        """See NetworkNode. The recorder has said that it has all; of others nobody knows."""
-        if complete and self._has_guests:
-            self._states.wait_for_all_acked(Duration(seconds=FAREWELL))
+    def finish(self, *, complete: bool, deadline: float) -> None:
+        """See NetworkNode. Who belongs to the run has said that it has all; of others nobody knows."""
+        for writer in (self._states, self._truth):
+            if complete and writer is not None and self.has_guests(writer):
+                writer.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
 
     def begin(self) -> None:
         """Publish x(0), or, after another process, all that may have been under way when that one went."""

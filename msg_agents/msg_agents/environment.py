@@ -9,6 +9,7 @@ from msg_analysis.errors import InputError
 
 LOOPBACK_PROFILE = Path(__file__).with_name("loopback.xml")
 MOST_PARTICIPANTS = 100  # of a domain that find each other on one machine: maxInitialPeersRange of loopback.xml
+UDP_PROFILE = Path(__file__).with_name("udp.xml")
 TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
 RESTARTS = 3  # of killed processes in a run, if nothing else is said
 LAST_DOMAIN = 231  # the ports of 232, the last that ROS knows, end after some 60 participants
@@ -61,7 +62,9 @@ def without_shared_memory() -> dict[str, str]:
     """
     if any(os.environ.get(name) for name in (*PROFILE_VARIABLES, TRANSPORTS_VARIABLE)):
         return {}
-    if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST":  # the variable has no effect then
-        profile = dict.fromkeys(PROFILE_VARIABLES, str(LOOPBACK_PROFILE))
-        return {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT", **profile}
-    return {TRANSPORTS_VARIABLE: "UDPv4"}
+    if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST":  # adds it, whatever a profile says
+        return {
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
+            **dict.fromkeys(PROFILE_VARIABLES, str(LOOPBACK_PROFILE)),
+        }
+    return dict.fromkeys(PROFILE_VARIABLES, str(UDP_PROFILE))

@@ -1,11 +1,19 @@
-"""The nodes as executables of the ROS 2 package: ``ros2 run msg_agents agent --ros-args -p run:=... -p agents:=[1,2]``.
+"""What is installed to be run: the command line, and the nodes as executables of the ROS 2 package.
 
-Each is the command of that name of ``msg-agents``.
+Each node is the command of that name of ``msg-agents``: ``ros2 run msg_agents agent --ros-args -p run:=... -p agents:=[1]``.
 """
 
 from __future__ import annotations
 
+import os
 import sys
+
+INTERRUPTED = 130
+
+
+def msg_agents() -> None:
+    """The command line."""
+    _run()
 
 
 def agent() -> None:
@@ -38,9 +46,23 @@ def markers() -> None:
     _run("markers")
 
 
-def _run(command: str) -> None:
+def _run(*command: str) -> None:
     try:
         from msg_agents.cli import main
+
+        main([*command, *sys.argv[1:]], prog_name="msg-agents")
     except KeyboardInterrupt:  # what is being imported cannot be asked to see to it
-        sys.exit(130)
-    main([command, *sys.argv[1:]], prog_name="msg-agents")
+        code: object = INTERRUPTED
+    except SystemExit as end:
+        code = end.code
+    else:
+        code = 0
+    if "rclpy" not in sys.modules or not isinstance(code, int):
+        sys.exit(code)  # type: ignore[arg-type]
+    # All has been given to whom it is due. Fast DDS has threads of its own, which may hold up an interpreter that ends.
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            code = code or 1  # what could not be written was wanted
+    os._exit(code)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.task import Future
 from rclpy.time_source import CLOCK_TOPIC
 
@@ -151,8 +151,14 @@ class NetworkNode(QuietNode):
     def begin(self) -> None:
         """Everyone has been found: start."""
 
-    def finish(self, *, complete: bool) -> None:
-        """The process is about to end: the node has done its part, or (not complete) was interrupted."""
+    def finish(self, *, complete: bool, deadline: float) -> None:
+        """The process is about to end: the node has done its part, or (not complete) was interrupted.
+
+        Parameters
+        ----------
+        complete : whether it has done its part
+        deadline : until when it may wait for others, by the monotonic clock [s]
+        """
 
     def fail(self, error: Exception) -> None:
         """End the process with an error."""
@@ -197,6 +203,14 @@ class NetworkNode(QuietNode):
         """Whether all the expected nodes read a topic of ours."""
         # Names come out of a look at every endpoint of the network: not before they can all be there.
         return publisher.get_subscription_count() >= len(expected) and not self.missing_readers(publisher, expected)
+
+    def has_guests(self, publisher: Publisher) -> bool:
+        """Whether somebody who does not belong to the run wants all of a topic of ours."""
+        own = {RECORDER, *map(agent_name, range(self.record.experiment.agents))}
+        return any(
+            reader.node_name not in own and reader.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+            for reader in self.get_subscriptions_info_by_topic(publisher.topic_name)
+        )
 
     def missing_readers(self, publisher: Publisher, expected: Sequence[str]) -> list[str]:
         """Names of the expected nodes that do not read a topic of ours yet."""

@@ -20,6 +20,7 @@ from rosgraph_msgs.msg import Clock
 from msg_agents.audience import Audience
 from msg_agents.bagtypes import check_definitions, message_classes
 from msg_agents.errors import RCLError
+from msg_agents.interruption import Interruption
 from msg_agents.jobcontrol import JobControl
 from msg_agents.keyboard import Keyboard
 from msg_agents.parameters import ros_arguments
@@ -113,6 +114,7 @@ class Player(QuietNode):
     options : how
     keyboard : for pause, step and rate
     jobs : says when the process had been stopped
+    interruption : says when it is to end
     on_progress : told a few times a second how far it is
     on_note : told what somebody should know
     """
@@ -124,12 +126,13 @@ class Player(QuietNode):
         options: PlayOptions,
         keyboard: Keyboard,
         jobs: JobControl,
+        interruption: Interruption,
         on_progress: Callable[[Played], None],
         on_note: Callable[[str], None],
     ) -> None:
         super().__init__("player")
         self._bag, self._options, self._keyboard, self._jobs = bag, options, keyboard, jobs
-        self._on_progress, self._on_note = on_progress, on_note
+        self._interruption, self._on_progress, self._on_note = interruption, on_progress, on_note
         self._first = bag.start + round(options.start_offset * SECOND)
         self._last = bag.end
         if options.duration is not None:
@@ -170,6 +173,7 @@ class Player(QuietNode):
         Raises
         ------
         InputError : readers that were to be waited for did not come
+        KeyboardInterrupt, SystemExit : by Ctrl-C or another signal
         """
         early = self._publish_early()
         self._on_progress(self.played)
@@ -198,6 +202,7 @@ class Player(QuietNode):
 
     def _bide(self) -> None:
         """Take some time, before it begins."""
+        self._interruption.check()
         self._press(self._keyboard.wait(POLL), self._first)
         self._on_progress(self.played)
 
@@ -209,6 +214,7 @@ class Player(QuietNode):
         count = 0
         if self._latched:
             for message in self._bag.messages(self._latched, self._first):
+                self._interruption.check()
                 self._send(message)
                 count += 1
         self.played.messages += count
@@ -217,6 +223,7 @@ class Player(QuietNode):
     def _play_once(self, early: int) -> None:
         """Play the bag, without so many messages of latched topics at the beginning, which have been published."""
         for message in self._bag.messages(self._writers.keys(), self._last):
+            self._interruption.check()
             latched = message.topic in self._latched
             if latched and early:
                 early -= 1
@@ -249,6 +256,7 @@ class Player(QuietNode):
                         f"topic {message.topic}: a message of {len(message.data)} bytes is no {kind} "
                         f"({error}): leave the topic out with --exclude"
                     ) from error
+            self._interruption.check()
 
     def _wait_for(self, message: Message) -> None:
         """Until it is its turn, see to everything else."""
@@ -267,6 +275,7 @@ class Player(QuietNode):
                 return
             soonest = min(wait, LOOK) if self._ticker is None else min(wait, LOOK, self._next_tick() - now)
             self._press(self._keyboard.wait(soonest), message.time)
+            self._interruption.check()
 
     def _look_around(self, now: float, next_time: int) -> None:
         if self._jobs.continued():  # nothing is hurried through afterwards
@@ -310,6 +319,7 @@ class Player(QuietNode):
         waiting = list(self._writers.values())
         began, noted = time.monotonic(), False
         while waiting:
+            self._interruption.check()
             each_waits = Duration(seconds=ACK_SLICE / len(waiting))
             waiting = [writer for writer in waiting if not writer.wait_for_all_acked(each_waits)]
             if waiting and not noted and time.monotonic() > began + PATIENCE:
@@ -346,13 +356,12 @@ def play(
     for line in bag.damage:
         on_note(line)
     known = len(bag.damage)
-    # Python's own handlers: this process only sleeps and publishes, and can end anywhere.
     with ros_arguments():
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Player] = []
     complete = False
     try:
-        with Keyboard() as keyboard:
+        with Keyboard() as keyboard, Interruption() as interruption:
 
             def before() -> None:
                 on_stop()
@@ -364,7 +373,13 @@ def play(
 
             with JobControl(before=before, after=after) as jobs:
                 player = Player(
-                    bag=bag, options=options, keyboard=keyboard, jobs=jobs, on_progress=on_progress, on_note=on_note
+                    bag=bag,
+                    options=options,
+                    keyboard=keyboard,
+                    jobs=jobs,
+                    interruption=interruption,
+                    on_progress=on_progress,
+                    on_note=on_note,
                 )
                 nodes = [player]
                 player.play()

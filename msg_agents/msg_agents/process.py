@@ -19,7 +19,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.node import Node
 
 from msg_agents.health import Reporter
-from msg_agents.node import NetworkNode
+from msg_agents.node import FAREWELL, NetworkNode
 from msg_agents.parameters import ros_arguments
 from msg_agents.presence import Presence
 from msg_analysis.errors import InputError
@@ -143,8 +143,9 @@ def run_nodes(
         if rclpy.ok():
             raise
     finally:
+        deadline = time.monotonic() + FAREWELL
         for node in nodes:
-            node.finish(complete=complete)
+            node.finish(complete=complete, deadline=deadline)
         if reporter:
             reporter.keep_account()
         leave(nodes, complete=complete)

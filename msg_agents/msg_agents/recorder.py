@@ -98,7 +98,7 @@ class Recorder(NetworkNode):
         values = {"messages": str(self.bag.messages), "topics without their last message": str(len(self._awaiting))}
         return Health(f"{self.bag.messages} messages recorded", values=values)
 
-    def finish(self, *, complete: bool) -> None:  # noqa: ARG002  an interrupted bag is closed just as well
+    def finish(self, *, complete: bool, deadline: float) -> None:  # noqa: ARG002  an interrupted bag is closed just as well
         """Close the bag: it is complete only if the recorder saw the end of the run."""
         self._guarded(self._write_states)()
         self.bag.close(complete=not self._awaiting)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -16,6 +16,7 @@ from msg_agents.checkpoint import longest_heard, room_for
 from msg_agents.cores import available_cores, place
 from msg_agents.domain import free_domain
 from msg_agents.environment import RESTARTS, node_environment
+from msg_agents.interruption import Interruption
 from msg_agents.network import Share, count_processes, plan_network
 from msg_agents.pace import Pace
 from msg_agents.supervisor import ACCOUNTS, CRASHED, Supervisor
@@ -134,7 +135,7 @@ def run_network(
             run_file.write_text(record.to_json(), encoding="utf-8")
             with (
                 free_domain() if domain is None else nullcontext(domain) as chosen,
-                _interruptible() as interrupted,
+                Interruption() as interruption,
                 Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
             ):
                 plans = plan_network(
@@ -149,9 +150,9 @@ def run_network(
                 if pin and experiment.run.pace == "lockstep":
                     supervisor.cores = place(plans, available_cores(), first=chosen)
                 supervisor.start(plans)
-                _watch(supervisor, experiment.steps, result, restarts, interrupted, on_progress, on_note)
+                _watch(supervisor, experiment.steps, result, restarts, interruption, on_progress, on_note)
                 # Before the others are ended: what ends because we end it has not failed.
-                _collect_failures(supervisor, result, interrupted, restarts)
+                _collect_failures(supervisor, result, interruption, restarts)
             result.strangers = supervisor.account().strangers()
             if bag is not None:
                 _settle(bag, result)
@@ -169,14 +170,14 @@ def _watch(
     steps: int,
     result: RunResult,
     restarts: int,
-    interrupted: list[int],
+    interruption: Interruption,
     on_progress: Callable[[int], None],
     on_note: Callable[[str], None],
 ) -> None:
     """Until all have done their part, one has failed for good, or the user has had enough."""
     began: float | None = None
     pace = Pace()
-    while not interrupted and _revive(supervisor, result, restarts, on_note) and supervisor.awaited:
+    while interruption.caught is None and _revive(supervisor, result, restarts, on_note) and supervisor.awaited:
         time.sleep(POLL)
         supervisor.read_status()
         reached = min(supervisor.steps, default=-1)
@@ -219,10 +220,10 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, on_note: C
     return True
 
 
-def _collect_failures(supervisor: Supervisor, result: RunResult, interrupted: list[int], restarts: int) -> None:
-    if interrupted:
+def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: Interruption, restarts: int) -> None:
+    if interruption.caught is not None:
         result.interrupted = True
-        result.failures.append(f"ended by {signal.Signals(interrupted[0]).name}")
+        result.failures.append(f"ended by {signal.Signals(interruption.caught).name}")
     for child in supervisor.failures:
         words = child.last_words()
         line = f"{child.plan.name}: {child.failure}" + (f": {words}" if words else "")
@@ -265,21 +266,6 @@ def _settle(bag: Path, result: RunResult) -> None:
         result.failures.append(
             "last recorded step: " + ", ".join(f"agent {i + 1}: {k if k >= 0 else 'none'}" for i, k in enumerate(last))
         )
-
-
-@contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM instead of dying of them, so that the run can be ended in order."""
-    received: list[int] = []
-    previous = {
-        number: signal.signal(number, lambda signum, _: received.append(signum))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def conclude(result: RunResult) -> None:

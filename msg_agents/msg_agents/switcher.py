@@ -140,7 +140,7 @@ class Switcher(NetworkNode):
     def _moved(self) -> None:
         """The slowest agent has got further."""
 
-    def finish(self, *, complete: bool) -> None:
+    def finish(self, *, complete: bool, deadline: float) -> None:  # noqa: ARG002  it has a patience of its own
         """See NetworkNode. Nobody needs anything but the end any more, and who has left has had it."""
         if complete:
             self._end.wait_for_all_acked(Duration(seconds=self._farewell))

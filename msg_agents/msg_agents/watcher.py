@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from rclpy.task import Future
 from std_msgs.msg import String
 
 from msg_agents.environment import without_shared_memory
+from msg_agents.interruption import Interruption
 from msg_agents.node import END_TOPIC, EXPERIMENT_TOPIC, OTHER_RUN, UNDECODABLE
 from msg_agents.parameters import ros_arguments
 from msg_agents.process import SPIN_SLICE, leave, make_executor
@@ -158,23 +158,17 @@ def run_watcher(
 
 
 def _spin(executor: Executor, done: Future) -> None:
-    """Spin until something is done; a signal ends it between two callbacks: in one, the executor would complain of it.
+    """Spin until something is done.
 
     Raises
     ------
-    KeyboardInterrupt : by Ctrl-C or another signal
+    KeyboardInterrupt, SystemExit : by Ctrl-C or another signal, between two callbacks: in one, the executor would
+        complain of it
     """
-    caught: list[int] = []
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(number, lambda number, _: caught.append(number)) for number in numbers]
-    try:
-        while not done.done() and not caught:
+    with Interruption() as interruption:
+        while not done.done():
+            interruption.check()
             executor.spin_until_future_complete(done, timeout_sec=SPIN_SLICE)
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-    if caught:
-        raise KeyboardInterrupt
 
 
 def _nobody() -> str:

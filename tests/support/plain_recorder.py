@@ -1,4 +1,6 @@
-"""A subscriber that knows nothing of us and writes what comes into an MCAP file, until so many messages have come.
+"""A subscriber that knows nothing of us and writes what comes into an MCAP file.
+
+It ends when so many messages have come, some on every topic.
 
 python plain_recorder.py FILE COUNT TOPIC...
 """
@@ -24,16 +26,17 @@ def main(file: str, count: int, topics: list[str]) -> None:
     """Record, and say so at the end."""
     rclpy.init()
     node = rclpy.create_node("plain")
-    left = count
+    left, silent = count, set(topics)
     with Path(file).open("wb") as stream:
         writer = Writer(stream)
         writer.start()
         schema = writer.register_schema("any", "", b"")
 
-        def taker(channel: int) -> Callable[[bytes], None]:
+        def taker(channel: int, topic: str) -> Callable[[bytes], None]:
             def take(data: bytes) -> None:
                 nonlocal left
                 left -= 1
+                silent.discard(topic)
                 now = node.get_clock().now().nanoseconds
                 writer.add_message(channel, now, bytes(data), now)
 
@@ -48,10 +51,10 @@ def main(file: str, count: int, topics: list[str]) -> None:
                 durability=QoSDurabilityPolicy.TRANSIENT_LOCAL if latched else QoSDurabilityPolicy.VOLATILE,
             )
             channel = writer.register_channel(topic, "cdr", schema)
-            node.create_subscription(kind, topic, taker(channel), qos, raw=True)
+            node.create_subscription(kind, topic, taker(channel, topic), qos, raw=True)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        while left > 0:
+        while left > 0 or silent:
             executor.spin_once()
         writer.finish()
     print("finished")

@@ -11,6 +11,8 @@ from msg_analysis.types import FloatArray, IntArray
 
 SPREAD = 64
 """Steps that neighbours can be apart in lockstep."""
+LOST = 5_000
+"""States of an agent that a reliable reader may get only when they are sent again: the history of a writer."""
 MOST_WAITING = 20_000
 """Steps that are kept while states of them are missing, at most."""
 
@@ -51,7 +53,7 @@ class StepCollector:
 
     def __init__(self, agents: int, modes: int, last: int, *, lockstep: bool) -> None:
         self._agents, self._modes, self._last, self._lockstep = agents, modes, last, lockstep
-        self._window = min(SPREAD * (agents + 1), MOST_WAITING)
+        self._window = min(SPREAD * (agents + 1) + LOST, MOST_WAITING)
         self._rows: dict[int, _Row] = {}
         self._low = 0  # steps before it are gone
         self._ready: list[tuple[int, int, bytes, bytes]] = []  # step, mode, states, those after it
@@ -136,7 +138,9 @@ class StepCollector:
         here.used = True
 
     def _forget(self, low: int) -> None:
-        if low > self._low:
-            for step in [step for step in self._rows if step < low] if self._rows else ():
-                del self._rows[step]
-            self._low = low
+        if low - self._low > len(self._rows):  # after a jump: who comes late begins in the middle
+            self._rows = {step: row for step, row in self._rows.items() if step >= low}
+        else:
+            for step in range(self._low, low):
+                self._rows.pop(step, None)
+        self._low = max(self._low, low)

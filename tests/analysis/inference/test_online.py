@@ -244,10 +244,31 @@ def test_repetitions_and_strangers_are_counted() -> None:
 def test_waiting_is_bounded() -> None:
     """One agent is never heard: what waits for it is forgotten after a while."""
     collector = StepCollector(2, 2, 10**6, lockstep=True)
+    for step in range(20_000):
+        collector.add(0, step, 1, bytes(8))
+    assert len(collector._rows) < 5500
+    assert collector.newest == 19_999
+    for step in range(19_990, 19_995):
+        collector.add(1, step, 1, bytes(8))
+    assert collector.take()[0].tolist() == [19_990, 19_991, 19_992, 19_993]
+    collector.add(1, 10, 1, bytes(8))
+    assert collector.refused["too late"] == 1
+
+
+def test_what_was_lost_and_sent_again_counts() -> None:
+    """The middleware repairs what was lost on the way, and meanwhile hands on what others send."""
+    collector = StepCollector(2, 2, 10**6, lockstep=True)
     for step in range(5000):
         collector.add(0, step, 1, bytes(8))
-    assert len(collector._rows) < 500
-    assert collector.newest == 4999
-    for step in range(4990, 4995):
+    for step in range(5000):
         collector.add(1, step, 1, bytes(8))
-    assert collector.take()[0].tolist() == [4990, 4991, 4992, 4993]
+    assert collector.take()[0].tolist() == list(range(4999))
+    assert not collector.refused["too late"]
+
+
+def test_who_comes_in_the_middle_of_a_long_run() -> None:
+    collector = StepCollector(2, 2, 10**12, lockstep=True)
+    for step in range(10**11, 10**11 + 3):
+        for agent in (0, 1):
+            collector.add(agent, step, 1, bytes(8))
+    assert collector.take()[0].tolist() == [10**11, 10**11 + 1]
