@@ -262,14 +262,18 @@ def write_transient_csv(document: dict[str, Any], path: Path) -> None:
     header = ["time", *(f"probability of {name}" for name in document["modes"])]
     header += [*(f"mean of agent {i}" for i in agents), system.replace("_", " ")]
     header += [f"{nodes.removesuffix('s').replace('_', ' ')} of agent {i}" for i in agents]
+    keys = ("times", "graph_law", "mean", system, nodes)
+    rows = zip(*(document[key] for key in keys), strict=True)
     temporary = path.with_name(path.name + ".part")
-    with temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        keys = ("times", "graph_law", "mean", system, nodes)
-        for time, law, mean, error, errors in zip(*(document[key] for key in keys), strict=True):
-            writer.writerow([time, *law, *mean, error, *errors])
-    temporary.replace(path)
+    try:
+        with temporary.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            writer.writerows([time, *law, *mean, error, *errors] for time, law, mean, error, errors in rows)
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
 
 
 def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:
