@@ -21,8 +21,10 @@ class IdealTimers:
 
     Parameters
     ----------
-    experiment : of pace realtime
-    model : its step model
+    experiment
+        of pace realtime
+    model
+        its step model
     """
 
     def __init__(self, experiment: Experiment, model: StepModel) -> None:
@@ -36,9 +38,17 @@ class IdealTimers:
 
         Parameters
         ----------
-        modes : (N,)
-        start : (m, R) x(0)
-        drives : for every step, (m, R) noise plus offset
+        modes
+            (N,)
+        start
+            (m, R) x(0)
+        drives
+            for every step, (m, R) noise plus offset
+
+        Yields
+        ------
+        FloatArray
+            (m, R) each, one for each step
         """
         m = len(start)
         both = np.concatenate([start, start])  # x(k) above x(k+1)
@@ -49,7 +59,13 @@ class IdealTimers:
             yield both[m:].copy()
 
     def log(self, modes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-        """``Trajectory.agent_modes``, ``Trajectory.used`` and ``Trajectory.made`` of a run with these graphs (N,)."""
+        """``Trajectory.agent_modes``, ``Trajectory.used`` and ``Trajectory.made`` of a run with these graphs (N,).
+
+        Parameters
+        ----------
+        modes
+            (N,) graph of every step, from 0
+        """
         model, phase, steps = self._model, self._phase, len(modes)
         agent_modes = np.repeat(np.concatenate([[-1], modes])[:, None], model.agents, axis=1)
         ahead = ideal_uses(model, phase)[modes]

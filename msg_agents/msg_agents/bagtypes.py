@@ -16,9 +16,15 @@ from msg_analysis.errors import InputError
 def message_class(type_name: str) -> Any:
     """Class of a message type, ``package/msg/Name``.
 
+    Parameters
+    ----------
+    type_name
+        such as std_msgs/msg/String
+
     Raises
     ------
-    ImportError, AttributeError, ValueError : there is none of this name here
+    ImportError, AttributeError, ValueError
+        there is none of this name here
     """
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
@@ -29,13 +35,17 @@ def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Ca
 
     Parameters
     ----------
-    topics : of the bag
-    all_wanted : whether somebody asked for just these, so that none may be left out
-    on_note : told which are left out
+    topics
+        of the bag
+    all_wanted
+        whether somebody asked for just these, so that none may be left out
+    on_note
+        told which are left out
 
     Raises
     ------
-    InputError : one cannot be played that must be, or none can
+    InputError
+        one cannot be played that must be, or none can
     """
     found, unplayable = {}, []
     for topic in topics:
@@ -58,13 +68,17 @@ def check_definitions(node: Node, writers: Mapping[str, Publisher], topics: Mapp
 
     Parameters
     ----------
-    node : that publishes
-    writers : its publishers, by name of the topic in the bag
-    topics : of the bag, by name
+    node
+        that publishes
+    writers
+        its publishers, by name of the topic in the bag
+    topics
+        of the bag, by name
 
     Raises
     ------
-    InputError : a topic was recorded with another definition
+    InputError
+        a topic was recorded with another definition
     """
     for name, publisher in writers.items():
         recorded = topics[name].type_hash

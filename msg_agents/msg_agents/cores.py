@@ -27,13 +27,17 @@ def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) ->
 
     Parameters
     ----------
-    plans : in the order of ``plan_network``, in which neighbours are next to each other: they share a core
-    cores : numbers of the cores
-    first : any number; networks that are given successive ones begin at different cores, and so share them evenly
+    plans
+        in the order of ``plan_network``, in which neighbours are next to each other: they share a core
+    cores
+        numbers of the cores
+    first
+        any number; networks that are given successive ones begin at different cores, and so share them evenly
 
     Returns
     -------
-    core by name of the process; the switcher, which has hardly anything to do, is not in it
+    dict[str, int]
+        core by name of the process; the switcher, which has hardly anything to do, is not in it
     """
     agents = sum(len(plan.agents) for plan in plans)
     loads = {
@@ -48,7 +52,15 @@ def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) ->
 
 
 def keep_to(process: int, core: int) -> None:
-    """Keep a process that has just been started, and what it starts, to a core; not if the system will not have it."""
+    """Keep a process that has just been started, and what it starts, to a core; not if the system will not have it.
+
+    Parameters
+    ----------
+    process
+        its id
+    core
+        number of the core, as the system has it
+    """
     try:
         os.sched_setaffinity(process, {core})
     except OSError:  # it has ended already, or the core has been taken from us

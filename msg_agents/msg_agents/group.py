@@ -35,18 +35,25 @@ class AgentGroup:
 
     Parameters
     ----------
-    record : of the run
-    model : its step model, or wiring
-    agents : indices from 0, at least one
-    readers : names of the nodes, besides the other agents, that must read the states before the run starts
-    checkpoints : directory that keeps what the agents have published, from which they go on if they have been there
-        before
+    record
+        of the run
+    model
+        its step model, or wiring
+    agents
+        indices from 0, at least one
+    readers
+        names of the nodes, besides the other agents, that must read the states before the run starts
+    checkpoints
+        directory that keeps what the agents have published, from which they go on if they have been there before
 
     Attributes
     ----------
-    nodes : the agents, in this order
-    turns : of the agents
-    progress_period : s of wall time between two Progress messages of an agent
+    nodes
+        the agents, in this order
+    turns
+        of the agents
+    progress_period
+        s of wall time between two Progress messages of an agent
     """
 
     def __init__(
@@ -91,16 +98,38 @@ class AgentGroup:
         self._host.executor.create_task(callback)
 
     def fail(self, error: Exception) -> None:
-        """End the process because an agent cannot go on."""
+        """End the process because an agent cannot go on.
+
+        Parameters
+        ----------
+        error
+            that the agent ended with
+        """
         for agent in self.nodes:
             agent.fail(error)
 
     def report(self, agent: int, step: int) -> None:
-        """Tell the switcher how far an agent is."""
+        """Tell the switcher how far an agent is.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        step
+            that it has reached
+        """
         self._host.publish(self._progress, self._host.progress(agent + 1, step))
 
     def ask_again(self, agent: int, step: int) -> None:
-        """Ask an agent of another process for its states from a step on."""
+        """Ask an agent of another process for its states from a step on.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        step
+            first step that is wanted
+        """
         if self._resend is None:  # hardly ever needed; latched, so that it does not matter when it is matched
             self._resend = self._host.create_publisher(ProgressMsg, RESEND_TOPIC, LATCHED)
         self._host.publish(self._resend, self._host.progress(agent + 1, step))

@@ -22,9 +22,12 @@ class Health:
 
     Attributes
     ----------
-    message : one line
-    waiting : whether it cannot go on, or not keep up, for the time being
-    values : facts, by name
+    message
+        one line
+    waiting
+        whether it cannot go on, or not keep up, for the time being
+    values
+        facts, by name
     """
 
     message: str
@@ -32,7 +35,17 @@ class Health:
     values: dict[str, str] = field(default_factory=dict)
 
     def to_status(self, node: Node, refused: Mapping[tuple[str, str], int], repeated: int) -> DiagnosticStatus:
-        """The message. Refused messages are a warning: somebody else is on our topics."""
+        """The message. Refused messages are a warning: somebody else is on our topics.
+
+        Parameters
+        ----------
+        node
+            that it is about
+        refused
+            number of messages by topic and reason
+        repeated
+            messages that came again
+        """
         warn = self.waiting or bool(refused)
         counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in refused.items()}
         values = self.values | counts
@@ -52,8 +65,10 @@ class Reporter:
 
     Parameters
     ----------
-    nodes : at least one; with a method ``health() -> Health`` and counters ``refused`` and ``repeated``
-    account : file for whoever started the process: what its nodes have refused, and what they wait for
+    nodes
+        at least one; with a method ``health() -> Health`` and counters ``refused`` and ``repeated``
+    account
+        file for whoever started the process: what its nodes have refused, and what they wait for
     """
 
     def __init__(self, nodes: Sequence[Node], account: Path | None = None) -> None:

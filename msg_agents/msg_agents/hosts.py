@@ -82,10 +82,14 @@ class Hosts:
 
     Attributes
     ----------
-    domain : ROS_DOMAIN_ID
-    recorder : name of the host with recorder and switcher
-    addresses : of the hosts, by name, as numbers
-    agents : indices from 0 of the agents on each host, ascending, by name
+    domain
+        ROS_DOMAIN_ID
+    recorder
+        name of the host with recorder and switcher
+    addresses
+        of the hosts, by name, as numbers
+    agents
+        indices from 0 of the agents on each host, ascending, by name
     """
 
     domain: int
@@ -97,15 +101,38 @@ class Hosts:
     def load(cls, path: Path, experiment: Experiment) -> Hosts:
         """Read a hosts file (YAML).
 
+        Parameters
+        ----------
+        path
+            of the file
+        experiment
+            whose agents are spread
+
         Raises
         ------
-        InputError : it cannot be read, or does not fit the experiment; names every mistake
+        InputError
+            it cannot be read, or does not fit the experiment; names every mistake
         """
         return cls.parse(read_yaml(path), experiment, source=str(path))
 
     @classmethod
     def parse(cls, document: Any, experiment: Experiment, source: str = "hosts") -> Hosts:
-        """Check a document and make it hosts. See ``load``."""
+        """Check a document and make it hosts. See ``load``.
+
+        Parameters
+        ----------
+        document
+            as a YAML reader gives it
+        experiment
+            whose agents are spread
+        source
+            where it came from, for messages
+
+        Raises
+        ------
+        ExperimentError
+            names every mistake in the document
+        """
         if not isinstance(document, dict):
             raise ExperimentError(
                 source, ["expected the keys domain, recorder and hosts: see `msg-agents host --help`"]
@@ -145,13 +172,17 @@ class Hosts:
 
         Parameters
         ----------
-        name : of the host
-        discovery_timeout : s to wait for the other hosts
-        patience : s after which the others are left alone when a host has left them
+        name
+            of the host
+        discovery_timeout
+            s to wait for the other hosts
+        patience
+            s after which the others are left alone when a host has left them
 
         Raises
         ------
-        InputError : there is no such host, or nothing to do on it
+        InputError
+            there is no such host, or nothing to do on it
         """
         if name not in self.agents:
             known = ", ".join(self.agents)
@@ -161,12 +192,24 @@ class Hosts:
         return Share(self.agents[name], name == self.recorder, discovery_timeout, patience)
 
     def participants(self, experiment: Experiment) -> int:
-        """Places per host where participants are looked for: more than are on any."""
+        """Places per host where participants are looked for: more than are on any.
+
+        Parameters
+        ----------
+        experiment
+            that is run
+        """
         most = max(most_processes(experiment, len(agents)) for agents in self.agents.values())
         return min(most + 2 + VISITORS, MOST_PARTICIPANTS)
 
     def profile(self, experiment: Experiment) -> str:
-        """The profile of Fast DDS with which the processes of all hosts find each other."""
+        """The profile of Fast DDS with which the processes of all hosts find each other.
+
+        Parameters
+        ----------
+        experiment
+            that is run
+        """
         ET.register_namespace("", _NAMESPACE)
         tree = ET.parse(LOOPBACK_PROFILE)  # drops its comments, which are about another profile
         addresses = list(dict.fromkeys(("127.0.0.1", *self.addresses.values())))
@@ -194,8 +237,10 @@ class Hosts:
 
         Parameters
         ----------
-        experiment : of the run
-        folder : in which the profile is written
+        experiment
+            of the run
+        folder
+            in which the profile is written
         """
         profile = folder / "hosts.xml"
         profile.write_text(self.profile(experiment), encoding="utf-8")

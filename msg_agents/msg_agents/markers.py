@@ -38,14 +38,26 @@ LOW, MIDDLE, HIGH = (0.13, 0.40, 0.67), (0.97, 0.97, 0.97), (0.70, 0.09, 0.17)
 
 
 def circle(agents: int) -> list[tuple[float, float]]:
-    """Places of the agents [m], on a circle, the first at the top, clockwise; neighbours ``SPACING`` apart."""
+    """Places of the agents [m], on a circle, the first at the top, clockwise; neighbours ``SPACING`` apart.
+
+    Parameters
+    ----------
+    agents
+        m
+    """
     radius = SPACING / (2 * math.sin(math.pi / agents)) if agents > 1 else 0.0
     angles = [math.pi / 2 - 2 * math.pi * i / agents for i in range(agents)]
     return [(radius * math.cos(angle), radius * math.sin(angle)) for angle in angles]
 
 
 def colour(value: float) -> Colour:
-    """From blue (-1 and less) over white (0) to red (1 and more)."""
+    """From blue (-1 and less) over white (0) to red (1 and more).
+
+    Parameters
+    ----------
+    value
+        how far, in units of what is usual
+    """
     end, part = (HIGH, value) if value > 0 else (LOW, -value)
     part = min(part, 1.0)
     red, green, blue = (middle + part * (full - middle) for middle, full in zip(MIDDLE, end, strict=True))
@@ -57,10 +69,14 @@ class Markers(Watcher):
 
     Parameters
     ----------
-    rate : pictures a second of the wall
-    replica : index from 0 of the replica that is drawn
-    frame : of reference, for the header
-    on_note : told what somebody should know
+    rate
+        pictures a second of the wall
+    replica
+        index from 0 of the replica that is drawn
+    frame
+        of reference, for the header
+    on_note
+        told what somebody should know
     """
 
     def __init__(self, *, rate: float, replica: int, frame: str, on_note: Callable[[str], None]) -> None:
@@ -79,7 +95,8 @@ class Markers(Watcher):
 
         Raises
         ------
-        InputError : there is no such replica
+        InputError
+            there is no such replica
         """
         assert self.record is not None
         experiment = self.record.experiment
@@ -213,16 +230,20 @@ def show_markers(
 
     Parameters
     ----------
-    rate, replica, frame, on_note : see ``Markers``
-    timeout : s to wait for a network; None: for ever
+    rate, replica, frame, on_note
+        see ``Markers``
+    timeout
+        s to wait for a network; None: for ever
 
     Returns
     -------
-    Whether the run was seen to be over; the node is then still there: end the process at once
+    bool
+        Whether the run was seen to be over; the node is then still there: end the process at once
 
     Raises
     ------
-    InputError : no network came in time, or it has no such replica
+    InputError
+        no network came in time, or it has no such replica
     """
     node = run_watcher(
         lambda: Markers(rate=rate, replica=replica, frame=frame, on_note=on_note), timeout=timeout, on_note=on_note

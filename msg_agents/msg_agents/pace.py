@@ -12,8 +12,10 @@ class Pace:
 
     Attributes
     ----------
-    rate : steps per second between the last two looks
-    stalled : s for which there has been no step; 0.0 if there was one since the last look
+    rate
+        steps per second between the last two looks
+    stalled
+        s for which there has been no step; 0.0 if there was one since the last look
     """
 
     def __init__(self) -> None:
@@ -22,7 +24,13 @@ class Pace:
         self.rate = self.stalled = 0.0
 
     def look(self, step: int) -> bool:
-        """Whether it is time to complain: after ``PATIENCE`` s without a step, and then ever more rarely."""
+        """Whether it is time to complain: after ``PATIENCE`` s without a step, and then ever more rarely.
+
+        Parameters
+        ----------
+        step
+            that everybody has reached
+        """
         now = time.monotonic()
         elapsed, made = now - self._time, step - self._step
         self._step, self._time = step, now

@@ -49,16 +49,26 @@ class PlayOptions:
 
     Attributes
     ----------
-    rate : seconds of the bag per second; inf: as fast as the readers take it
-    start_offset, duration : s of the bag left out at the beginning, and played (None: all of the rest)
-    loop : whether to begin again at the end
-    paused : whether to stand at first
-    clock : Hz at which ``/clock`` is published; None: not
-    topics, exclude : see ``select_topics``
-    remaps : see ``parse_remaps``
-    subscribers : how many readers every topic must have before it begins
-    readers : names of nodes that must read every topic before it begins
-    wait_timeout : s to wait for them
+    rate
+        seconds of the bag per second; inf: as fast as the readers take it
+    start_offset, duration
+        s of the bag left out at the beginning, and played (None: all of the rest)
+    loop
+        whether to begin again at the end
+    paused
+        whether to stand at first
+    clock
+        Hz at which ``/clock`` is published; None: not
+    topics, exclude
+        see ``select_topics``
+    remaps
+        see ``parse_remaps``
+    subscribers
+        how many readers every topic must have before it begins
+    readers
+        names of nodes that must read every topic before it begins
+    wait_timeout
+        s to wait for them
     """
 
     rate: float = 1.0
@@ -81,14 +91,22 @@ class Played:
 
     Attributes
     ----------
-    messages : published
-    seconds : of the wall, since the first
-    held_back : s of them in which readers did not take what was published
-    now : time of the bag, s from its start
-    length : s of the bag, all of it
-    rate : at which it is played
-    paused : whether it stands
-    begun : whether the readers who are waited for were there
+    messages
+        published
+    seconds
+        of the wall since the first message [s]
+    held_back
+        s of them in which readers did not take what was published
+    now
+        time of the bag, s from its start
+    length
+        s of the bag, all of it
+    rate
+        at which it is played [s of the bag per second]
+    paused
+        whether it stands
+    begun
+        whether the readers who are waited for were there
     """
 
     messages: int = 0
@@ -110,13 +128,26 @@ class Player(QuietNode):
 
     Parameters
     ----------
-    bag : to be played
-    options : how
-    keyboard : for pause, step and rate
-    jobs : says when the process had been stopped
-    interruption : says when it is to end
-    on_progress : told a few times a second how far it is
-    on_note : told what somebody should know
+    bag
+        to be played
+    options
+        how
+    keyboard
+        for pause, step and rate
+    jobs
+        says when the process had been stopped
+    interruption
+        says when it is to end
+    on_progress
+        told a few times a second how far it is
+    on_note
+        told what somebody should know
+
+    Raises
+    ------
+    InputError
+        it begins behind the end of the bag, nothing is left to play, or a topic is to have a name that ROS 2 does not
+        take
     """
 
     def __init__(
@@ -172,8 +203,10 @@ class Player(QuietNode):
 
         Raises
         ------
-        InputError : readers that were to be waited for did not come
-        KeyboardInterrupt, SystemExit : by Ctrl-C or another signal
+        InputError
+            readers that were to be waited for did not come
+        KeyboardInterrupt, SystemExit
+            by Ctrl-C or another signal
         """
         early = self._publish_early()
         self._on_progress(self.played)
@@ -341,16 +374,23 @@ def play(
 
     Parameters
     ----------
-    path : of the bag, or of one of its files
-    options : how
-    on_progress : told a few times a second how far it is
-    on_note : told what somebody should know
-    on_stop, on_continue : called before the process is stopped by Ctrl-Z, and when it goes on
+    path
+        of the bag, or of one of its files
+    options
+        how
+    on_progress
+        told a few times a second how far it is
+    on_note
+        told what somebody should know
+    on_stop, on_continue
+        called before the process is stopped by Ctrl-Z, and when it goes on
 
     Raises
     ------
-    BagError, InputError : no bag, or it cannot be played like that
-    KeyboardInterrupt, SystemExit : by Ctrl-C or another signal
+    BagError, InputError
+        no bag, or it cannot be played like that
+    KeyboardInterrupt, SystemExit
+        by Ctrl-C or another signal
     """
     bag = Playback(path)
     for line in bag.damage:

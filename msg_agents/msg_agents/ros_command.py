@@ -17,7 +17,12 @@ class RosCommand(click.Command):
 
     Parameters
     ----------
-    node_name : by which parameters are found, where they are given to a certain node; the command's name by default
+    *args
+        see click.Command
+    node_name
+        by which parameters are found, where they are given to a certain node; the command's name by default
+    **options
+        see click.Command
     """
 
     def __init__(self, *args: Any, node_name: str | None = None, **options: Any) -> None:
@@ -27,6 +32,10 @@ class RosCommand(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """See click.Command."""
         ours, ros = split_arguments(args)
+        if ctx.resilient_parsing:  # a shell asks how the line could go on, perhaps behind an option without its value
+            while ours and ours[-1].startswith("-"):
+                ours.pop()
+            return super().parse_args(ctx, ours)
         if not GIVES_PARAMETERS.intersection(ros):
             rest = super().parse_args(ctx, ours)
         else:
@@ -64,7 +73,13 @@ class RosCommand(click.Command):
 
 
 def split_arguments(args: list[str]) -> tuple[list[str], list[str]]:
-    """Arguments of the command, and those for ROS 2 with their ``--ros-args``."""
+    """Arguments of the command, and those for ROS 2 with their ``--ros-args``.
+
+    Parameters
+    ----------
+    args
+        as the user has typed them
+    """
     ours, ros = list(args), list[str]()
     while "--ros-args" in ours:
         start = ours.index("--ros-args")

@@ -39,15 +39,18 @@ class Succession:
 
     Parameters
     ----------
-    path : of a file that names the process; made if there is none
+    path
+        of a file that names the process; made if there is none
 
     Attributes
     ----------
-    predecessor : prefix of the GUIDs of the process before; empty if there was none
+    predecessor
+        prefix of the GUIDs of the process before; empty if there was none
 
     Raises
     ------
-    InputError : another process is running the node
+    InputError
+        another process is running the node
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,7 +65,13 @@ class Succession:
         self.predecessor = os.read(self._descriptor, PREFIX_SIZE)
 
     def enter(self, prefix: bytes) -> None:
-        """Note whom the next process will follow."""
+        """Note whom the next process will follow.
+
+        Parameters
+        ----------
+        prefix
+            of the identifiers of this process's endpoints
+        """
         os.pwrite(self._descriptor, prefix, 0)
 
 
@@ -71,12 +80,15 @@ def succeed(directory: Path | None, names: Iterable[str]) -> list[Succession]:
 
     Parameters
     ----------
-    directory : where every node has a file of its name; None: nobody will follow
-    names : of the nodes
+    directory
+        where every node has a file of its name; None: nobody will follow
+    names
+        of the nodes
 
     Raises
     ------
-    InputError : another process is running one of the nodes
+    InputError
+        another process is running one of the nodes
     """
     if directory is None:
         return []
@@ -88,7 +100,15 @@ def succeed(directory: Path | None, names: Iterable[str]) -> list[Succession]:
 
 
 def enter(successions: Sequence[Succession], node: Node) -> None:
-    """Note the name of this process, which the endpoints of its nodes bear, for the one that will follow."""
+    """Note the name of this process, which the endpoints of its nodes bear, for the one that will follow.
+
+    Parameters
+    ----------
+    successions
+        of the nodes of this process
+    node
+        one of them
+    """
     if not successions:
         return
     own = (node.get_name(), node.get_namespace())
@@ -104,8 +124,10 @@ def farewell(prefix: bytes, number: int = _LATE) -> bytes:
 
     Parameters
     ----------
-    prefix : of its GUIDs, 12 bytes
-    number : sequence number of the message
+    prefix
+        of its GUIDs, 12 bytes
+    number
+        sequence number of the message
     """
     parameters = (
         struct.pack("<HH", _KEY_HASH, 16)
@@ -127,8 +149,10 @@ def bury(prefix: bytes, domain: int) -> None:
 
     Parameters
     ----------
-    prefix : of its GUIDs, 12 bytes
-    domain : ROS_DOMAIN_ID
+    prefix
+        of its GUIDs, 12 bytes
+    domain
+        ROS_DOMAIN_ID
     """
     base = PORT_BASE + PORTS_PER_DOMAIN * domain + 10  # the RTPS rule for the ports of discovery
     addresses = {"127.0.0.1", *os.environ.get(PEERS_VARIABLE, "").split()}

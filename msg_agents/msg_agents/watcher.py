@@ -38,14 +38,19 @@ class Watcher(QuietNode):
 
     Parameters
     ----------
-    name : of the node
-    on_note : told what somebody should know
+    name
+        of the node
+    on_note
+        told what somebody should know
 
     Attributes
     ----------
-    record : of the run, once it is known; None before
-    known : set when the run is known
-    done : set when the run is over
+    record
+        of the run, once it is known; None before
+    known
+        set when the run is known
+    done
+        set when the run is over
     """
 
     def __init__(self, name: str, *, on_note: Callable[[str], None]) -> None:
@@ -65,7 +70,8 @@ class Watcher(QuietNode):
 
         Raises
         ------
-        InputError : that cannot be done with this run
+        InputError
+            that cannot be done with this run
         """
         raise NotImplementedError
 
@@ -112,18 +118,23 @@ def run_watcher(
 
     Parameters
     ----------
-    make_node : called once ROS is up
-    timeout : s to wait for a network; None: for ever
-    on_note : told what somebody should know
+    make_node
+        called once ROS is up
+    timeout
+        s to wait for a network; None: for ever
+    on_note
+        told what somebody should know
 
     Returns
     -------
-    The node; None: it was interrupted before there was one. Where the run was seen to be over, it is still on the
-    network: end the process at once
+    Kind | None
+        The node; None: it was interrupted before there was one. Where the run was seen to be over, it is still on the
+        network: end the process at once
 
     Raises
     ------
-    InputError : no network came in time, or it cannot be followed
+    InputError
+        no network came in time, or it cannot be followed
     """
     nobody = _nobody()
     os.environ.update(without_shared_memory())
@@ -162,8 +173,8 @@ def _spin(executor: Executor, done: Future) -> None:
 
     Raises
     ------
-    KeyboardInterrupt, SystemExit : by Ctrl-C or another signal, between two callbacks: in one, the executor would
-        complain of it
+    KeyboardInterrupt, SystemExit
+        by Ctrl-C or another signal, between two callbacks: in one, the executor would complain of it
     """
     with Interruption() as interruption:
         while not done.done():

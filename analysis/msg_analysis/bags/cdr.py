@@ -34,9 +34,15 @@ _LENGTH = struct.Struct("<I4x")  # of the state, before it
 def stamp_ns(data: bytes) -> int:
     """Time stamp [ns] of any message that begins with a std_msgs/Header.
 
+    Parameters
+    ----------
+    data
+        CDR bytes of the message
+
     Raises
     ------
-    CdrError : too short, or of an unknown encapsulation
+    CdrError
+        too short, or of an unknown encapsulation
     """
     try:
         seconds, nanoseconds = _STAMP[data[:2]].unpack_from(data)
@@ -50,10 +56,19 @@ class StateCodec:
 
     Parameters
     ----------
-    run : the 16 bytes of the run id
-    agent : number of the agent, from 1
-    replicas : length of every state
-    dt : length of a step [units of simulated time]
+    run
+        the 16 bytes of the run id
+    agent
+        number of the agent, from 1
+    replicas
+        length of every state
+    dt
+        length of a step [units of simulated time]
+
+    Raises
+    ------
+    ValueError
+        a run id that is not 16 bytes
     """
 
     def __init__(self, run: bytes, agent: int, replicas: int, dt: float) -> None:
@@ -68,19 +83,34 @@ class StateCodec:
 
         Parameters
         ----------
-        step, mode, state : int, int, FloatArray
-            k; graph of the step that led here, from 1 (0 at step 0); (replicas,) x(k), float64
+        step, mode, state
+            int, int, FloatArray k; graph of the step that led here, from 1 (0 at step 0); (replicas,) x(k), float64
 
         Raises
         ------
-        ValueError : state of another shape or type (its bytes would be a different message)
+        ValueError
+            state of another shape or type (its bytes would be a different message)
         """
         if state.shape != self._shape or state.dtype != np.float64:
             raise ValueError(f"state: {state.dtype} of shape {state.shape}, expected float64 of shape {self._shape}")
         return self.wrap(step, mode, to_payload(state))
 
     def wrap(self, step: int, mode: int, payload: bytes, heard: Sequence[int] = (), stamp: int | None = None) -> bytes:
-        """One AgentState of a state that is bytes already, of the right length; by default stamped k dt [ns]."""
+        """One AgentState of a state that is bytes already, of the right length; by default stamped k dt [ns].
+
+        Parameters
+        ----------
+        step
+            k
+        mode
+            graph used in the step that led here, from 1; 0 at step 0
+        payload
+            the state, 8 bytes for each replica
+        heard
+            steps of the neighbours' values; empty: all of k - 1
+        stamp
+            of the header [ns]; None: that of step k
+        """
         seconds, nanoseconds = divmod(self._nanoseconds(step) if stamp is None else stamp, SECOND)
         fixed = (1, 0, self._run, self._agent, step, mode, len(heard), self._replicas)
         data = _STATE.pack(LITTLE_ENDIAN, seconds, nanoseconds, *fixed)
@@ -95,14 +125,19 @@ class StateFrame:
 
     Parameters
     ----------
-    run : the 16 bytes of the run id
-    replicas : length of every state
-    most_heard : largest length of ``heard``
+    run
+        the 16 bytes of the run id
+    replicas
+        length of every state
+    most_heard
+        largest length of ``heard``
 
     Attributes
     ----------
-    replicas : as given
-    size : bytes of the longest message
+    replicas
+        as given
+    size
+        bytes of the longest message
     """
 
     def __init__(self, run: bytes, replicas: int, most_heard: int = 0) -> None:
@@ -115,6 +150,11 @@ class StateFrame:
         """(agent, step, mode, state as a payload), or None where the bytes are not of this run and layout.
 
         None means: ask :meth:`AgentState.decode`, which tells what it is.
+
+        Parameters
+        ----------
+        data
+            CDR bytes of an AgentState
         """
         if len(data) != self._least:
             return self._unwrap_heard(data)
@@ -139,8 +179,10 @@ def with_state(data: bytes, payload: bytes, size: int | None = None) -> bytes:
 
     Parameters
     ----------
-    data, payload : the message, and the bytes of the new state
-    size : bytes of the old state; as many as those of the new one if not given
+    data, payload
+        the message, and the bytes of the new state
+    size
+        bytes of the old state; as many as those of the new one if not given
     """
     if size is None or size == len(payload):
         return data[: len(data) - len(payload)] + payload
@@ -153,14 +195,22 @@ class AgentState:
 
     Attributes
     ----------
-    stamp : simulated time of the step [ns]
-    run : 16 bytes
-    agent : from 1
-    step : k
-    mode : from 1; 0 at step 0
-    state : (replicas,)
-    heard : (neighbours,) steps of the values used; empty: all of k - 1
-    frame_id : of the header
+    stamp
+        simulated time of the step [ns]
+    run
+        16 bytes
+    agent
+        from 1
+    step
+        k
+    mode
+        from 1; 0 at step 0
+    state
+        (replicas,)
+    heard
+        (neighbours,) steps of the values used; empty: all of k - 1
+    frame_id
+        of the header
     """
 
     stamp: int
@@ -185,7 +235,18 @@ class AgentState:
 
     @classmethod
     def decode(cls, data: bytes) -> AgentState:
-        """From CDR; raises CdrError."""
+        """From CDR.
+
+        Parameters
+        ----------
+        data
+            CDR bytes
+
+        Raises
+        ------
+        CdrError
+            they are no such message
+        """
         reader = CdrReader(data, "AgentState")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run, agent = reader.raw(RUN_SIZE, "run"), reader.number("I", "agent")
@@ -201,14 +262,22 @@ class ActiveGraph:
 
     Attributes
     ----------
-    stamp : simulated time at which it begins [ns]
-    run : 16 bytes
-    sequence : number of the sojourn, from 0
-    mode : from 1
-    name : of the graph
-    first_step, last_step : the steps k -> k+1 with first_step <= k <= last_step use it
-    arcs : (source, target, weight), agents from 1: target listens to source
-    frame_id : of the header
+    stamp
+        simulated time at which it begins [ns]
+    run
+        16 bytes
+    sequence
+        number of the sojourn, from 0
+    mode
+        from 1
+    name
+        of the graph
+    first_step, last_step
+        the steps k -> k+1 with first_step <= k <= last_step use it
+    arcs
+        (source, target, weight), agents from 1: target listens to source
+    frame_id
+        of the header
     """
 
     stamp: int
@@ -237,7 +306,18 @@ class ActiveGraph:
 
     @classmethod
     def decode(cls, data: bytes) -> ActiveGraph:
-        """From CDR; raises CdrError, also where the three lists of the arcs are not equally long."""
+        """From CDR.
+
+        Parameters
+        ----------
+        data
+            CDR bytes
+
+        Raises
+        ------
+        CdrError
+            they are no such message, or its three lists of arcs are not equally long
+        """
         reader = CdrReader(data, "ActiveGraph")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run, sequence = reader.raw(RUN_SIZE, "run"), reader.number("I", "sequence")
@@ -278,11 +358,16 @@ class Progress:
 
     Attributes
     ----------
-    stamp : simulated time of the step [ns]
-    run : 16 bytes
-    agent : from 1
-    step : newest step that it has published
-    frame_id : of the header
+    stamp
+        simulated time of the step [ns]
+    run
+        16 bytes
+    agent
+        from 1
+    step
+        newest step that it has published
+    frame_id
+        of the header
     """
 
     stamp: int
@@ -301,7 +386,18 @@ class Progress:
 
     @classmethod
     def decode(cls, data: bytes) -> Progress:
-        """From CDR; raises CdrError."""
+        """From CDR.
+
+        Parameters
+        ----------
+        data
+            CDR bytes
+
+        Raises
+        ------
+        CdrError
+            they are no such message
+        """
         reader = CdrReader(data, "Progress")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run = reader.raw(RUN_SIZE, "run")
@@ -311,14 +407,31 @@ class Progress:
 
 
 def encode_string(text: str) -> bytes:
-    """A std_msgs/String as CDR."""
+    """A std_msgs/String as CDR.
+
+    Parameters
+    ----------
+    text
+        to be sent
+    """
     out = CdrWriter()
     out.string(text)
     return out.bytes()
 
 
 def decode_string(data: bytes) -> str:
-    """Text of a std_msgs/String; raises CdrError."""
+    """Text of a std_msgs/String.
+
+    Parameters
+    ----------
+    data
+        CDR bytes
+
+    Raises
+    ------
+    CdrError
+        they are no such message
+    """
     reader = CdrReader(data, "String")
     text = reader.string("data")
     reader.end()

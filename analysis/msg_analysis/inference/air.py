@@ -23,9 +23,12 @@ class LossTest:
 
     Attributes
     ----------
-    lost : messages
-    expected : number of messages times the probability
-    p : None where there was no message
+    lost
+        messages
+    expected
+        number of messages times the probability
+    p
+        None where there was no message
     """
 
     lost: int
@@ -40,6 +43,11 @@ def loss_test(observation: Observation | Measurement) -> LossTest | None:
     the products of (lost - p) of successive messages of one link, and of pairs of messages in one step. What is too
     rare for a chi-square law is left out, links too rare for it are taken together; where these are too rare as
     well, their number is held against the binomial law itself.
+
+    Parameters
+    ----------
+    observation
+        of a run with ``noise.loss``, or without
     """
     tally = LossTally.of(observation)
     return tally.test() if tally else None
@@ -48,13 +56,23 @@ def loss_test(observation: Observation | Measurement) -> LossTest | None:
 class LossTally:
     """Sums over the messages of a run; xi = lost - p.
 
+    Parameters
+    ----------
+    observation
+        of a run with ``noise.loss``
+
     Attributes
     ----------
-    probability : p
-    pairs : (links, 2) receiver and sender of every link that is in any graph
-    messages, lost : (links,) messages of each, and how many of them were lost
-    successive, successive_pairs : sum of xi xi' of successive messages of a link, and their number
-    same_step, same_step_pairs : sum of xi xi' of pairs of messages in one step, and their number
+    probability
+        p
+    pairs
+        (links, 2) receiver and sender of every link that is in any graph
+    messages, lost
+        (links,) messages of each, and how many of them were lost
+    successive, successive_pairs
+        sum of xi xi' of successive messages of a link, and their number
+    same_step, same_step_pairs
+        sum of xi xi' of pairs of messages in one step, and their number
     """
 
     def __init__(self, observation: Observation | Measurement) -> None:
@@ -76,11 +94,23 @@ class LossTally:
 
     @classmethod
     def of(cls, observation: Observation | Measurement) -> LossTally | None:
-        """Of a run; None where no message can be lost, or none was logged."""
+        """Of a run; None where no message can be lost, or none was logged.
+
+        Parameters
+        ----------
+        observation
+            of any run
+        """
         return cls(observation) if observation.step.loss and observation.lost is not None else None
 
     def merge(self, other: LossTally) -> None:
-        """Take what another run of the same experiment adds up to."""
+        """Take what another run of the same experiment adds up to.
+
+        Parameters
+        ----------
+        other
+            of another run, with another seed
+        """
         self.messages += other.messages
         self.lost += other.lost
         self.successive, self.same_step = self.successive + other.successive, self.same_step + other.same_step
@@ -143,10 +173,17 @@ def _block(
 class BroadcastSums:
     """What the noise in what was published adds up to, in units of what it should be.
 
+    Parameters
+    ----------
+    observation
+        of a run with ``noise.broadcast``
+
     Attributes
     ----------
-    scatter : (m, m) sum of the products of the agents' noise
-    samples : number of published values, replicas counted
+    scatter
+        (m, m) sum of the products of the agents' noise
+    samples
+        number of published values, replicas counted
     """
 
     def __init__(self, observation: Observation) -> None:
@@ -163,12 +200,24 @@ class BroadcastSums:
 
     @classmethod
     def of(cls, observation: Observation) -> BroadcastSums | None:
-        """Of a run; None without broadcast noise."""
+        """Of a run; None without broadcast noise.
+
+        Parameters
+        ----------
+        observation
+            of any run
+        """
         noisy = observation.prediction.experiment.noise.broadcast
         return cls(observation) if noisy and observation.published is not None else None
 
     def merge(self, other: BroadcastSums) -> None:
-        """Take what another run of the same experiment adds up to."""
+        """Take what another run of the same experiment adds up to.
+
+        Parameters
+        ----------
+        other
+            of another run, with another seed
+        """
         self.scatter += other.scatter
         self.samples += other.samples
 
@@ -179,6 +228,12 @@ class BroadcastSums:
 
 
 def broadcast_p(observation: Observation) -> float | None:
-    """p-value of what was published, less the states: N(0, s^2 I) of agents; None without broadcast noise."""
+    """p-value of what was published, less the states: N(0, s^2 I) of agents; None without broadcast noise.
+
+    Parameters
+    ----------
+    observation
+        of any run
+    """
     sums = BroadcastSums.of(observation)
     return sums.p_value() if sums else None

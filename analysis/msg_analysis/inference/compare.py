@@ -25,9 +25,10 @@ from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.order import Order, order_of_nodes
 from msg_analysis.inference.switching import SwitchingTest, switching_test
 from msg_analysis.inference.timing import Timing
+from msg_analysis.markdown import markdown_table, number_text
 from msg_analysis.model.sequential import step_law
 from msg_analysis.model.trajectory import Trajectory
-from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.prediction import SHOWN_AGENTS, Prediction, predict
 from msg_analysis.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -43,7 +44,19 @@ RUNNING_POINTS = 400
 
 @dataclass(frozen=True, slots=True)
 class Test:
-    """One member of the family that the verdict is about; ``p_adjusted`` is Holm's, over the family."""
+    """One member of the family that the verdict is about; ``p_adjusted`` is Holm's, over the family.
+
+    Attributes
+    ----------
+    name
+        what is tested
+    p
+        of this test alone
+    p_adjusted
+        Holm's, over the family
+    rejected
+        whether ``p_adjusted`` is at most the level
+    """
 
     name: str
     p: float
@@ -51,30 +64,48 @@ class Test:
     rejected: bool
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Comparison:
     """What ``msg-analysis compare`` says.
 
     Attributes
     ----------
-    trajectory : what was compared
-    level : chance of a false "disagrees"
-    steps : steps used: all, or those before the first gap
-    system_error, node_errors, covariance, innovations, switching : one test or several each
-    continuous_error : the paper's continuous-time system error; None where it has none
-    batch : model-free interval for the system error
-    tests : the family, in the order of the report
-    running : "time" [simulated time], "system_error" and "standard_error" of the mean up to then (400 points)
-    loss : of the messages that were lost; None where none can be
-    p_broadcast : of the noise in what was published; None without
-    unpredicted : why there is no prediction; None where there is one
-    transient : steps at the start that are left out of the measured errors; None with a prediction, which knows them
-    timing, laws : in real time: how time was kept, and which laws the log supports; None in lockstep. The errors and
-        the covariance are then held against the first of the laws that there is
-    given : errors given the path of the graphs; None where they are not had
-    order : which agents are more certain than which; None where that is not known
-    blame : what is wrong, where the verdict is "disagrees"
-    pool : the runs, where they are several; ``trajectory`` has then no data, but the account of what is missing
+    trajectory
+        what was compared
+    level
+        chance of a false "disagrees"
+    steps
+        steps used: all, or those before the first gap
+    system_error, node_errors, covariance, innovations, switching
+        one test or several each
+    continuous_error
+        the paper's continuous-time system error; None where it has none
+    batch
+        model-free interval for the system error
+    tests
+        the family, in the order of the report
+    running
+        "time" [units of simulated time], "system_error" and "standard_error" of the mean up to then, (400,) each, fewer
+        for short runs
+    loss
+        of the messages that were lost; None where none can be
+    p_broadcast
+        of the noise in what was published; None without
+    unpredicted
+        why there is no prediction; None where there is one
+    transient
+        steps at the start that are left out of the measured errors; None with a prediction, which knows them
+    timing, laws
+        in real time: how time was kept, and which laws the log supports; None in lockstep. The errors and the
+        covariance are then held against the first of the laws that there is
+    given
+        errors given the path of the graphs; None where they are not had
+    order
+        which agents are more certain than which; None where that is not known
+    blame
+        what is wrong, where the verdict is "disagrees"
+    pool
+        the runs, where they are several; ``trajectory`` has then no data, but the account of what is missing
     """
 
     trajectory: Trajectory
@@ -99,6 +130,30 @@ class Comparison:
     order: Order | None = None
     blame: Sequence[Cause] = ()
     pool: Pool | None = None
+
+    def __repr__(self) -> str:
+        total, runs = self.system_error, f"{len(self.pool.members)} runs" if self.pool else "run"
+        numbers = f"measured {number_text(total.measured)} +- {number_text(total.standard_error)}"
+        numbers += f", predicted {number_text(total.predicted)}"
+        name = self.trajectory.record.experiment.name
+        return f"<Comparison, {runs} of {name!r}: {self.verdict}; system error {numbers}>"
+
+    def _repr_markdown_(self) -> str:
+        rows = [
+            (
+                name,
+                *map(number_text, (error.measured, error.standard_error, error.predicted)),
+                "-" if error.z is None else f"{error.z:+.2f}",
+            )
+            for name, error in [
+                ("**system**", self.system_error),
+                *((f"agent {i}", node) for i, node in enumerate(self.node_errors[:SHOWN_AGENTS], start=1)),
+            ]
+        ]
+        rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
+        table = markdown_table(("mean-square error", "measured", "standard error", "predicted", "z"), rows)
+        blame = "".join(f"- {cause.words}\n" for cause in self.blame)
+        return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
 
     @property
     def verdict(self) -> Verdict:
@@ -182,18 +237,20 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     probability at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In
     real time, the family is what is exact whatever the timing was.
 
-    Parameters
-    ----------
-    trajectory : from a bag or from the twin. If something is missing, the numbers are those of the complete
-        beginning
-    level : chance of calling a run that follows its law one that disagrees
-
     Where the law has no prediction (a protocol that is not linear, or not here), the run is measured, and only its
     graphs and losses are tested.
 
+    Parameters
+    ----------
+    trajectory
+        from a bag or from the twin. If something is missing, the numbers are those of the complete beginning
+    level
+        chance of calling a run that follows its law one that disagrees
+
     Raises
     ------
-    InputError : no prediction (too large, unbounded), or a log that does not say what is needed
+    InputError
+        no prediction (too large, unbounded), or a log that does not say what is needed
     """
     protocol = trajectory.record.experiment.protocol
     unpredicted = protocol.unpredictable() if protocol else None
@@ -219,11 +276,16 @@ def judge(
 
     Parameters
     ----------
-    trajectory : of the run; of several runs, one that has the account of what is missing
-    prediction : of their experiment
-    evidence : of all of them
-    level : chance of a false "disagrees"
-    more : names and p-values of further tests of the same law
+    trajectory
+        of the run; of several runs, one that has the account of what is missing
+    prediction
+        of their experiment
+    evidence
+        of all of them
+    level
+        chance of a false "disagrees"
+    more
+        names and p-values of further tests of the same law
     """
     means = evidence.means
     system_error, node_errors = estimates(means, prediction.system)
@@ -324,7 +386,19 @@ def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Compari
 
 
 def without_numbers(trajectory: Trajectory, level: float, prediction: Prediction, steps: int) -> Comparison:
-    """Too little came: only what was expected."""
+    """Too little came: only what was expected.
+
+    Parameters
+    ----------
+    trajectory
+        with the account of what is missing
+    level
+        chance of a false "disagrees"
+    prediction
+        of its experiment
+    steps
+        that came whole
+    """
     predicted = prediction.emulated
     return Comparison(
         trajectory=trajectory,

@@ -36,10 +36,14 @@ class InnovationTests:
 
     Attributes
     ----------
-    p_covariance : covariance of the innovations against N_g; 0 if anything moves where there is no noise
-    p_whiteness : correlation in time (lags 1..10) and between replicas
-    p_gain : regression on what the agents heard: wrong gains, references, offsets
-    p_common_gain : the same for one factor of all gains: messages that are ignored
+    p_covariance
+        covariance of the innovations against N_g; 0 if anything moves where there is no noise
+    p_whiteness
+        correlation in time (lags 1..10) and between replicas
+    p_gain
+        regression on what the agents heard: wrong gains, references, offsets
+    p_common_gain
+        the same for one factor of all gains: messages that are ignored
     """
 
     p_covariance: float | None
@@ -54,8 +58,10 @@ class _Directions:
 
     Attributes
     ----------
-    whitener : (r, m)
-    quiet : (m, m - r) orthonormal basis of the directions without noise
+    whitener
+        (r, m)
+    quiet
+        (m, m - r) orthonormal basis of the directions without noise
     """
 
     whitener: FloatArray
@@ -65,18 +71,35 @@ class _Directions:
 class InnovationSums:
     """What the innovations of runs of one experiment add up to: enough for the tests, and for what is wrong.
 
+    Parameters
+    ----------
+    observation
+        of the first run
+    position
+        (N, m) in real time, when the states were made (``events.Order.position``)
+
     Attributes
     ----------
-    noises : (n, m, m) what their covariance should be
-    samples : (n,) number of innovations, replicas counted, of each graph
-    scatter : (n, m, m) sum of e e^T
-    still : (n, m) steps in which no replica of an agent changed
-    quiet : largest |e| in directions without noise
-    largest : largest |x|
-    replicas : of a run
-    terms : what the innovations were regressed on
-    score, covariance : (K,), (K, K) of that regression
-    gram : (K, K) see ``StateRegression.gram``; None where it cannot be had
+    noises
+        (n, m, m) what their covariance should be
+    samples
+        (n,) number of innovations, replicas counted, of each graph
+    scatter
+        (n, m, m) sum of e e^T
+    still
+        (n, m) steps in which no replica of an agent changed
+    quiet
+        largest |e| in directions without noise
+    largest
+        largest |x|
+    replicas
+        of a run
+    terms
+        what the innovations were regressed on
+    score, covariance
+        (K,), (K, K) of that regression
+    gram
+        (K, K) see ``StateRegression.gram``; None where it cannot be had
     """
 
     def __init__(self, observation: Observation, position: IntArray | None = None) -> None:
@@ -111,7 +134,13 @@ class InnovationSums:
         return self.samples // self.replicas
 
     def merge(self, other: InnovationSums) -> None:
-        """Take what another run of the same experiment adds up to."""
+        """Take what another run of the same experiment adds up to.
+
+        Parameters
+        ----------
+        other
+            of another run, with another seed
+        """
         self.samples += other.samples
         self.scatter += other.scatter
         self.still += other.still
@@ -200,13 +229,28 @@ def innovation_tests(observation: Observation, position: IntArray | None = None)
 
     Parameters
     ----------
-    position : (N, m) in real time, when the states were made (``events.Order.position``)
+    observation
+        of a run
+    position
+        (N, m) in real time, when the states were made (``events.Order.position``)
     """
     return InnovationSums(observation, position).tests()
 
 
 def innovations(observation: Observation, first: int, last: int, reception: Reception | None = None) -> FloatArray:
-    """(last - first, m, R): e of the steps first..last-1, given what was heard, if that was not the states."""
+    """(last - first, m, R): e of the steps first..last-1, given what was heard, if that was not the states.
+
+    Parameters
+    ----------
+    observation
+        of the run
+    first
+        step
+    last
+        step behind the last one
+    reception
+        of these steps; None: everybody heard the states of the step before
+    """
     step, now = observation.step, observation.states[first:last]
     after = observation.states[first + 1 : last + 1].copy()
     if reception is not None:
@@ -232,7 +276,13 @@ def _directions(noise: FloatArray) -> _Directions:
 
 
 class Whiteness:
-    """Portmanteau test of iid N(0, I) vectors: lags 1..LAGS, and lag 0 between replicas."""
+    """Portmanteau test of iid N(0, I) vectors: lags 1..LAGS, and lag 0 between replicas.
+
+    Parameters
+    ----------
+    rank
+        length of the vectors
+    """
 
     def __init__(self, rank: int) -> None:
         self.rank = rank
@@ -244,7 +294,13 @@ class Whiteness:
         self._steps, self._replicas = 0, 1
 
     def add(self, white: FloatArray) -> None:
-        """Take the next (b, rank, R) block."""
+        """Take the next (b, rank, R) block.
+
+        Parameters
+        ----------
+        white
+            (b, rank, R) standard normal, if the law holds
+        """
         self._steps += len(white)
         self._replicas = white.shape[2]
         squares = (white**2).sum(axis=2)
@@ -262,7 +318,13 @@ class Whiteness:
         self._tail = joined[-LAGS:]
 
     def merge(self, other: Whiteness) -> None:
-        """Take what another run adds up to; nothing is said of pairs of steps of different runs."""
+        """Take what another run adds up to; nothing is said of pairs of steps of different runs.
+
+        Parameters
+        ----------
+        other
+            of another run, with another seed
+        """
         self._products += other._products
         self._counts += other._counts
         self._squares += other._squares
@@ -289,8 +351,10 @@ def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, i
 
     Parameters
     ----------
-    vector : (q,)
-    covariance : (q, q)
+    vector
+        (q,)
+    covariance
+        (q, q)
     """
     variances = np.diag(covariance)
     alive = np.flatnonzero(variances > 1e-24 * variances.max(initial=0.0))

@@ -25,9 +25,12 @@ class Timers:
 
     Attributes
     ----------
-    graphs : (N, m) index of the graph that the agent used
-    used : (N, m, D) see ``Trajectory.used``
-    made : (N + 1, m) [ns of simulated time] see ``Trajectory.made``
+    graphs
+        (N, m) index of the graph that the agent used
+    used
+        (N, m, D) see ``Trajectory.used``
+    made
+        (N + 1, m) [ns of simulated time] see ``Trajectory.made``
     """
 
     graphs: IntArray
@@ -41,13 +44,20 @@ class Observation:
 
     Attributes
     ----------
-    prediction : of the experiment that the record says was run
-    states : (N + 1, m, R) x(0..N), as of ``bounded``
-    modes : (N,) g(0..N-1)
-    start : (m, R) x(0) of the record
-    published : (N + 1, m, R) what others heard of x(0..N), where that is not the truth; else None
-    lost : (N, m, D) see ``Trajectory.lost``
-    timers : in real time; None in lockstep
+    prediction
+        of the experiment that the record says was run
+    states
+        (N + 1, m, R) x(0..N), as of ``bounded``
+    modes
+        (N,) g(0..N-1)
+    start
+        (m, R) x(0) of the record
+    published
+        (N + 1, m, R) what others heard of x(0..N), where that is not the truth; else None
+    lost
+        (N, m, D) see ``Trajectory.lost``
+    timers
+        in real time; None in lockstep
     """
 
     prediction: Prediction
@@ -62,9 +72,17 @@ class Observation:
     def of(cls, trajectory: Trajectory, prediction: Prediction) -> Observation:
         """Everything before the first gap.
 
+        Parameters
+        ----------
+        trajectory
+            of a bag or of the twin
+        prediction
+            of its experiment
+
         Raises
         ------
-        InputError : a run in real time whose log does not say what the agents used
+        InputError
+            a run in real time whose log does not say what the agents used
         """
         real_time = trajectory.record.experiment.run.pace == "realtime"
         steps = _known_steps(trajectory) if real_time else trajectory.prefix
@@ -107,7 +125,8 @@ class Observation:
 
         Parameters
         ----------
-        numbers_per_step : size of the largest temporary array, per step
+        numbers_per_step
+            size of the largest temporary array, per step
         """
         length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
         for first in range(0, self.steps, length):
@@ -115,7 +134,18 @@ class Observation:
 
 
 def bounded(states: FloatArray) -> FloatArray:
-    """The same, and what is beyond ``LARGEST`` as large as that: wrong all the same, and it can be computed with."""
+    """The same, and what is beyond ``LARGEST`` as large as that: wrong all the same, and it can be computed with.
+
+    Parameters
+    ----------
+    states
+        of any shape
+
+    Returns
+    -------
+    FloatArray
+        of the same shape
+    """
     if not states.size or (states.max() <= LARGEST and states.min() >= -LARGEST):
         return states
     return np.clip(states, -LARGEST, LARGEST)

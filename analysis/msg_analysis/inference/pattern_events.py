@@ -31,8 +31,10 @@ class Period:
 
     Attributes
     ----------
-    matrix : (S', S)
-    noise : (S', S') covariance
+    matrix
+        (S', S), of a shape that may change from period to period
+    noise
+        (S', S') covariance, of the shape that the stack has after the period
     """
 
     matrix: FloatArray
@@ -44,8 +46,10 @@ class Periods:
 
     Parameters
     ----------
-    observation : in real time
-    position : (N, m) order in which the states were made
+    observation
+        in real time
+    position
+        (N, m) order in which the states were made
     """
 
     def __init__(self, observation: Observation, position: IntArray) -> None:
@@ -99,7 +103,13 @@ class Periods:
         """Most entries of a stack."""
 
     def entries(self, number: int) -> int:
-        """Entries of the stack at a sampling time."""
+        """Entries of the stack at a sampling time.
+
+        Parameters
+        ----------
+        number
+            K of the sampling time, from 0
+        """
         return self._step.agents + int(self._extra_ends[number + 1] - self._extra_ends[number])
 
     def __getitem__(self, number: int) -> Period:
@@ -157,8 +167,10 @@ class _Live:
 
     Parameters
     ----------
-    entries : of the stack
-    agents : m; keys from there on are numbers of the noise, fresh and of variance 1 where they are not known yet
+    entries
+        of the stack
+    agents
+        m; keys from there on are numbers of the noise, fresh and of variance 1 where they are not known yet
     """
 
     def __init__(self, entries: int, agents: int) -> None:

@@ -22,11 +22,16 @@ class Term:
 
     Attributes
     ----------
-    kind : "constant"; "link": x_j - x_i; "lead": x_i less the reference; "pull": all that pulls the agent, together
-    agent : i
-    graph : the graph in whose steps it is not 0; None for all of them
-    sender : j of a link
-    weight : what multiplies it in the law, so that a gain that is wrong by a share s has the coefficient s * weight
+    kind
+        "constant"; "link": x_j - x_i; "lead": x_i less the reference; "pull": all that pulls the agent, together
+    agent
+        i
+    graph
+        the graph in whose steps it is not 0; None for all of them
+    sender
+        j of a link
+    weight
+        what multiplies it in the law, so that a gain that is wrong by a share s has the coefficient s * weight
     """
 
     kind: Literal["constant", "link", "lead", "pull"]
@@ -42,6 +47,13 @@ class StateRegression:
     The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a
     phi_b given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated
     noise too. All regressors are linear in z, the deviations of the agents and a constant 1.
+
+    Parameters
+    ----------
+    observation
+        whose graphs and sizes it is for
+    most
+        largest number of terms; when there would be more, fewer kinds of them are tested
     """
 
     def __init__(self, observation: Observation, most: int = MAX_REGRESSORS) -> None:
@@ -58,7 +70,17 @@ class StateRegression:
         return 0
 
     def add(self, modes: IntArray, states: FloatArray, innovations: FloatArray) -> None:
-        """Take a block of steps: graphs (b,), states and innovations (b, m, R)."""
+        """Take a block of steps: graphs (b,), states and innovations (b, m, R).
+
+        Parameters
+        ----------
+        modes
+            (b,) graph of each step, from 0
+        states
+            (b, m, R) x(k)
+        innovations
+            (b, m, R) of the steps
+        """
         m = self._step.agents
         z = np.ones((len(modes), m + 1, states.shape[2]))
         z[:, :m] = states - (states.mean(axis=1, keepdims=True) if self._centred else self._step.reference)
@@ -98,12 +120,15 @@ def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[T
 
     Parameters
     ----------
-    step : whose law it is
-    most : largest number of regressors K
+    step
+        whose law it is
+    most
+        largest number of regressors K
 
     Returns
     -------
-    rows (K,), inputs (n, K, m + 1), and what each of them is
+    tuple[IntArray, FloatArray, list[Term]]
+        rows (K,), inputs (n, K, m + 1), and what each of them is
     """
     n, m = step.modes, step.agents
     terms = [Term("constant", i) for i in range(m)]

@@ -19,7 +19,19 @@ BINS = 60
 
 @dataclass(frozen=True, slots=True)
 class Quantiles:
-    """How a measure is spread; None where there was nothing to measure."""
+    """How a measure is spread; None where there was nothing to measure.
+
+    Attributes
+    ----------
+    p50
+        median
+    p95
+        95th percentile
+    p99
+        99th percentile
+    max
+        the largest
+    """
 
     p50: float | None
     p95: float | None
@@ -28,7 +40,13 @@ class Quantiles:
 
     @classmethod
     def of(cls, values: AnyArray) -> Quantiles:
-        """Of all entries."""
+        """Of all entries.
+
+        Parameters
+        ----------
+        values
+            of any shape
+        """
         if not values.size:
             return cls(None, None, None, None)
         return cls(*(float(value) for value in (*np.quantile(values, (0.5, 0.95, 0.99)), values.max())))
@@ -42,17 +60,28 @@ class Timing:
 
     Attributes
     ----------
-    period_ms : between two steps of an agent, as it should be
-    lateness_ms : of a step after it was due
-    steps, missed : steps of all agents, and how many of them were made more than a period after they were due
-    jitter_ms : how far the time between two successive steps of an agent is from the period, either way
-    staleness_ms : age of the values that were used, when they were used
-    staleness_steps : the same, in steps of the new state less that of the value; 0 or 1 with ideal timers
-    uses : values of neighbours that were used
-    ideal_uses : how many of them were the ones that ideal timers would have used
-    never_heard : how often nothing had been heard yet of a neighbour
-    outdated_graphs : steps for which an agent used another graph than the network's of that time
-    histogram : of lateness: edges [ms] (BINS + 1,) and counts (BINS,); beyond the last edge there is nothing
+    period_ms
+        between two steps of an agent, as it should be
+    lateness_ms
+        of a step after it was due
+    steps, missed
+        steps of all agents, and how many of them were made more than a period after they were due
+    jitter_ms
+        how far the time between two successive steps of an agent is from the period, either way
+    staleness_ms
+        age of the values that were used, when they were used
+    staleness_steps
+        the same, in steps of the new state less that of the value; 0 or 1 with ideal timers
+    uses
+        values of neighbours that were used
+    ideal_uses
+        how many of them were the ones that ideal timers would have used
+    never_heard
+        how often nothing had been heard yet of a neighbour
+    outdated_graphs
+        steps for which an agent used another graph than the network's of that time
+    histogram
+        of lateness: edges [ms] (BINS + 1,) and counts (BINS,); beyond the last edge there is nothing
     """
 
     period_ms: float
@@ -101,7 +130,13 @@ class Timing:
 
 
 def measure_timing(observation: Observation) -> Timing:
-    """Measure the timing of a run in real time."""
+    """Measure the timing of a run in real time.
+
+    Parameters
+    ----------
+    observation
+        of a run in real time
+    """
     timers, step = observation.timers, observation.step
     assert timers is not None
     experiment = observation.prediction.experiment

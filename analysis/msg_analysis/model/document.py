@@ -54,9 +54,15 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
 def read_yaml(path: Path) -> Any:
     """The content of a YAML (or JSON) file.
 
+    Parameters
+    ----------
+    path
+        of the file, in UTF-8
+
     Raises
     ------
-    InputError : the file cannot be read, is not YAML in UTF-8, or has a key twice; names file and line
+    InputError
+        the file cannot be read, is not YAML in UTF-8, or has a key twice; names file and line
     """
     try:
         text = path.read_text(encoding="utf-8")

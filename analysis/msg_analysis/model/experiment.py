@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from msg_analysis.errors import NotAvailableError
+from msg_analysis.markdown import markdown_table, number_text
 from msg_analysis.model import protocols, validation
 from msg_analysis.model.chain import MarkovChain, Time
 from msg_analysis.model.document import read_yaml
@@ -27,27 +28,36 @@ from msg_analysis.types import FloatArray
 
 __all__ = ["Experiment", "ExperimentError", "json_schema"]
 
+SHOWN_GRAPHS = 4
+"""Most graphs that are named in a line."""
 
-@dataclass(frozen=True, slots=True, eq=False)
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Experiment:
     """A valid experiment. Two are equal if their documents are, the order of the graphs included.
 
     Attributes
     ----------
-    spec : the document, normalised: defaults written out, number of agents known, GraphML files read
-    graph_list : the n graphs, in the order of the modes
-    chain : the Markov chain that switches between them
-    noise_gain : (n, m, m) F_i; Q_i = F_i F_i^T
-    source : where it came from, for messages
-    protocol : what the agents do instead of the built-in law, if anything
+    spec
+        the document, normalised: defaults written out, number of agents known, GraphML files read
+    graph_list
+        the n graphs, in the order of the modes
+    chain
+        the Markov chain that switches between them
+    noise_gain
+        (n, m, m) F_i; Q_i = F_i F_i^T
+    source
+        where it came from, for messages
+    protocol
+        what the agents do instead of the built-in law, if anything
     """
 
     spec: ExperimentSpec
-    graph_list: tuple[Graph, ...] = field(repr=False)
-    chain: MarkovChain = field(repr=False)
-    noise_gain: FloatArray = field(repr=False)
+    graph_list: tuple[Graph, ...]
+    chain: MarkovChain
+    noise_gain: FloatArray
     source: str = "experiment"
-    protocol: ChosenProtocol | None = field(default=None, repr=False)
+    protocol: ChosenProtocol | None = None
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -58,14 +68,40 @@ class Experiment:
 
     __hash__ = None  # type: ignore[assignment]  # the document has lists in it
 
+    def __repr__(self) -> str:
+        graphs = ", ".join(graph.name for graph in self.graph_list[:SHOWN_GRAPHS])
+        more = ", ..." if len(self.graph_list) > SHOWN_GRAPHS else ""
+        kind = f"{self.problem} of {self.agents} agents in {self.time} time"
+        return f"<Experiment {self.name!r}: {kind}, graphs {graphs}{more}; {self.steps} steps of {self.step_length:g}>"
+
+    def _repr_markdown_(self) -> str:
+        shares = self.chain.stationary
+        rows = [
+            (graph.name, str(len(graph.edges if graph.symmetric else graph.arcs)), number_text(share))
+            for graph, share in zip(self.graph_list, shares, strict=True)
+        ]
+        run = self.run
+        return (
+            f"**{self.name}**: {self.problem} of {self.agents} agents in {self.time} time; {self.steps} steps of "
+            f"{self.step_length:g}, {run.replicas} replicas, seed {run.seed}, {run.pace}\n\n"
+            + markdown_table(("graph", "links", "share of time"), rows)
+        )
+
     @classmethod
-    def load(cls, path: str | Path) -> Experiment:
+    def load(cls, path: str | Path) -> Self:
         """Read an experiment file (YAML; JSON is YAML too).
+
+        Parameters
+        ----------
+        path
+            of the file; paths in it are relative to its directory
 
         Raises
         ------
-        InputError : the file cannot be read or is not YAML
-        ExperimentError : the experiment is not valid; names every mistake
+        InputError
+            the file cannot be read or is not YAML
+        ExperimentError
+            the experiment is not valid; names every mistake
         """
         path = Path(path)
         return cls.parse(read_yaml(path), source=str(path), directory=path.parent)
@@ -78,19 +114,24 @@ class Experiment:
         source: str = "experiment",
         directory: Path | None = None,
         recorded: ProtocolInfo | None = None,
-    ) -> Experiment:
+    ) -> Self:
         """Check a document and make it an experiment.
 
         Parameters
         ----------
-        mapping : the document, as a YAML or JSON reader gives it
-        source : where it came from, for messages
-        directory : what the paths in it are relative to; by default the current directory
-        recorded : of a recorded run, the protocol that was used, which need not be installed
+        mapping
+            the document, as a YAML or JSON reader gives it
+        source
+            where it came from, for messages
+        directory
+            what the paths in it are relative to; by default the current directory
+        recorded
+            of a recorded run, the protocol that was used, which need not be installed
 
         Raises
         ------
-        ExperimentError : names every mistake in the document
+        ExperimentError
+            names every mistake in the document
         """
         if not isinstance(mapping, Mapping):
             raise ExperimentError(
@@ -108,7 +149,7 @@ class Experiment:
         )
         return experiment._with_protocol(sections.protocol, recorded) if sections.protocol else experiment
 
-    def _with_protocol(self, protocol: ChosenProtocol, recorded: ProtocolInfo | None) -> Experiment:
+    def _with_protocol(self, protocol: ChosenProtocol, recorded: ProtocolInfo | None) -> Self:
         """The same with a protocol that knows its network."""
         bound, found = protocols.bind(protocol, self, recorded)
         experiment = replace(self, protocol=bound)
@@ -126,27 +167,30 @@ class Experiment:
             document["protocol"] = self.spec.protocol.model_dump(mode="json")
         return document
 
-    def with_run(self, **changes: Any) -> Experiment:
+    def with_run(self, **changes: Any) -> Self:
         """The same experiment with other values of ``run``, checked again.
 
         Parameters
         ----------
-        changes : keys of ``run`` (seed, duration, pace, ...) and their new values
+        changes
+            keys of ``run`` (seed, duration, pace, ...) and their new values
 
         Raises
         ------
-        ExperimentError : names the key
+        ExperimentError
+            names the key
         """
         document = self.to_document()
         document["run"].update(changes)
-        return Experiment.parse(document, source=self.source)
+        return self.parse(document, source=self.source)
 
     def unavailable(self, purpose: Purpose = "run") -> list[str]:
         """What the experiment asks for that this version does not do yet, one line each.
 
         Parameters
         ----------
-        purpose : "run" (simulate or run it) or "predict" (exact for any noise)
+        purpose
+            "run" (simulate or run it) or "predict" (exact for any noise)
         """
         lines = []
         if self.run.pace == "realtime":
@@ -172,9 +216,15 @@ class Experiment:
     def require_available(self, purpose: Purpose = "run") -> None:
         """Refuse what this version does not do yet.
 
+        Parameters
+        ----------
+        purpose
+            "run" (simulate or run it) or "predict"
+
         Raises
         ------
-        NotAvailableError : lists it
+        NotAvailableError
+            lists it
         """
         lines = self.unavailable(purpose)
         if lines and self.protocol and lines == self.protocol.unavailable(purpose):

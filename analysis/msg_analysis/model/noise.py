@@ -18,9 +18,12 @@ class ProcessNoise:
 
     Parameters
     ----------
-    seed : the experiment's seed
-    noise_gain : (n, m, m) B_g of the step model
-    replicas : entries of each state
+    seed
+        the experiment's seed
+    noise_gain
+        (n, m, m) B_g of the step model
+    replicas
+        entries of each state
     """
 
     def __init__(self, seed: int, noise_gain: FloatArray, replicas: int) -> None:
@@ -40,6 +43,13 @@ class ProcessNoise:
         """For each mode, the noise of one agent in the steps of one block, (STEPS_PER_BLOCK, replicas).
 
         Modes with the same noise share one array.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        block
+            number of the block of steps, from 0
         """
         rows = self._gain[:, agent]
         drawn = {key: self._combined(row, block) for key, row in {row.tobytes(): row for row in rows}.items()}

@@ -22,9 +22,12 @@ class Sojourn:
 
     Attributes
     ----------
-    sequence : number of the sojourn from 0
-    mode : index of the graph from 0
-    first_step, last_step : the steps k -> k+1 with first_step <= k <= last_step use it
+    sequence
+        number of the sojourn from 0
+    mode
+        index of the graph from 0
+    first_step, last_step
+        the steps k -> k+1 with first_step <= k <= last_step use it
     """
 
     sequence: int
@@ -41,7 +44,10 @@ def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
 
     Parameters
     ----------
-    initial : (n,) law of g(0)
+    experiment
+        whose chain, seed and duration
+    initial
+        (n,) law of g(0)
     """
     steps = experiment.steps
     time = 0.0
@@ -59,7 +65,15 @@ def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
 
 
 def mode_path(experiment: Experiment, initial: FloatArray) -> IntArray:
-    """(N,) index of the graph of each step k -> k+1."""
+    """(N,) index of the graph of each step k -> k+1.
+
+    Parameters
+    ----------
+    experiment
+        whose chain, seed and duration
+    initial
+        (n,) law of g(0)
+    """
     modes = np.empty(experiment.steps, dtype=np.int64)
     for sojourn in sojourns(experiment, initial):
         modes[sojourn.first_step : sojourn.last_step + 1] = sojourn.mode

@@ -23,8 +23,10 @@ class ExperimentError(InputError):
 
     Attributes
     ----------
-    source : file or topic that it came from
-    problems : one line each
+    source
+        file or topic that it came from
+    problems
+        one line each
     """
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
@@ -46,16 +48,26 @@ def problem(key: str, value: object, wanted: str, remedy: str) -> str:
 
     Parameters
     ----------
-    key : dotted key
-    value : what stands there; a text is taken as it is
-    wanted : what was expected
-    remedy : what to do
+    key
+        dotted key
+    value
+        what stands there; a text is taken as it is
+    wanted
+        what was expected
+    remedy
+        what to do
     """
     return f"{key}: {value if isinstance(value, str) else show(value)}: {wanted}: {remedy}"
 
 
 def show(value: object) -> str:
-    """A value as the file would have it, on one line, shortened."""
+    """A value as the file would have it, on one line, shortened.
+
+    Parameters
+    ----------
+    value
+        of a key of the file, or what a key was given
+    """
     try:
         text = json.dumps(value, ensure_ascii=False)
     except (TypeError, ValueError):
@@ -65,7 +77,13 @@ def show(value: object) -> str:
 
 
 def dotted(location: Sequence[int | str]) -> str:
-    """The key of a place in the document: names joined by dots, list entries in brackets, counted from 1."""
+    """The key of a place in the document: names joined by dots, list entries in brackets, counted from 1.
+
+    Parameters
+    ----------
+    location
+        keys and list indices from 0, as pydantic has them
+    """
     key = ""
     for part in location:
         if isinstance(part, int):
@@ -101,9 +119,12 @@ def translate(error: ErrorDetails, root: type[BaseModel] = ExperimentSpec, secti
 
     Parameters
     ----------
-    error : of the validation of ``root``
-    root : model of the whole document, or of a section
-    section : key of that section
+    error
+        of the validation of ``root``
+    root
+        model of the whole document, or of a section
+    section
+        key of that section
     """
     kind, location, value = error["type"], error["loc"], error["input"]
     if not location:

@@ -33,11 +33,16 @@ class ProtocolInfo:
 
     Attributes
     ----------
-    name : in the experiment, and of the entry point
-    package, version : that offers it
-    linear : whether it declares the matrix of a step
-    states : numbers S of an agent's state, for each replica
-    hidden : whether others hear something else than the whole state
+    name
+        in the experiment, and of the entry point
+    package, version
+        that offers it
+    linear
+        whether it declares the matrix of a step
+    states
+        numbers S of an agent's state, for each replica
+    hidden
+        whether others hear something else than the whole state
     """
 
     name: str
@@ -56,7 +61,18 @@ class ProtocolInfo:
 
     @classmethod
     def from_json(cls, document: Any) -> ProtocolInfo:
-        """Read it back; ValueError, KeyError or TypeError where it is something else."""
+        """Read it back.
+
+        Parameters
+        ----------
+        document
+            what ``to_json`` gave
+
+        Raises
+        ------
+        ValueError
+            it is something else (KeyError and TypeError, too)
+        """
         if int(document["states"]) < 1:
             raise ValueError(f"protocol: states {document['states']}, expected a number >= 1")
         return cls(
@@ -75,10 +91,14 @@ class ChosenProtocol:
 
     Attributes
     ----------
-    info : what it is; of a recorded run, what it was
-    kind, parameters : its class and its own parameters; None where it is not here
-    absent : that it is not here and why, for people; None where it is
-    network : that it is for, once that is known
+    info
+        what it is; of a recorded run, what it was
+    kind, parameters
+        its class and its own parameters; None where it is not here
+    absent
+        that it is not here and why, for people; None where it is
+    network
+        that it is for, once that is known
     """
 
     info: ProtocolInfo
@@ -99,7 +119,13 @@ class ChosenProtocol:
         return None if self.info.linear else f"{self.info} is not linear, and runs without a prediction"
 
     def unavailable(self, purpose: Purpose) -> list[str]:
-        """What stands in the way of a purpose, one line each: see ``Experiment.unavailable``."""
+        """What stands in the way of a purpose, one line each: see ``Experiment.unavailable``.
+
+        Parameters
+        ----------
+        purpose
+            "run" or "predict"
+        """
         name, reason = show(self.info.name), self.unpredictable()
         if self.absent:
             remedy = f"install {self.info.package} {self.info.version}"
@@ -114,7 +140,8 @@ class ChosenProtocol:
 
         Raises
         ------
-        InputError : it is not here, or not linear; it fails, or what it says is wrong
+        InputError
+            it is not here, or not linear; it fails, or what it says is wrong
         """
         reason = self.unpredictable()
         if reason:
@@ -155,9 +182,17 @@ class ChosenProtocol:
     def guard(self, where: str, call: Callable[[], Result]) -> Result:
         """What a call of the protocol's own code gives; whatever it raises becomes an error that says where.
 
+        Parameters
+        ----------
+        where
+            the method, for the message
+        call
+            of the protocol's code
+
         Raises
         ------
-        ProtocolError : with ``where`` ("" for nowhere in particular) and what was raised
+        ProtocolError
+            with ``where`` ("" for nowhere in particular) and what was raised
         """
         try:
             return call()
@@ -172,12 +207,15 @@ class AgentProtocol:
 
     Parameters
     ----------
-    chosen : a protocol that is not linear
-    agent : index from 0
+    chosen
+        a protocol that is not linear
+    agent
+        index from 0
 
     Raises
     ------
-    InputError : it is not here, or fails
+    InputError
+        it is not here, or fails
     """
 
     def __init__(self, chosen: ChosenProtocol, agent: int) -> None:
@@ -225,7 +263,13 @@ def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def network_of(experiment: Experiment) -> Network:
-    """What a protocol is told of an experiment's network."""
+    """What a protocol is told of an experiment's network.
+
+    Parameters
+    ----------
+    experiment
+        checked
+    """
     return Network(
         graphs=experiment.graph_list,
         dt=experiment.step_length,
@@ -251,8 +295,10 @@ def find(spec: ProtocolSpec, recorded: ProtocolInfo | None = None) -> tuple[Chos
 
     Parameters
     ----------
-    spec : of the experiment
-    recorded : of a run that was recorded, what was used then: need not be here
+    spec
+        of the experiment
+    recorded
+        of a run that was recorded, what was used then: need not be here
     """
     chosen, found = _find(spec)
     if recorded is None:
@@ -313,9 +359,12 @@ def bind(
 
     Parameters
     ----------
-    chosen : found by ``find``
-    experiment : which may not know it yet
-    recorded : see ``find``
+    chosen
+        found by ``find``
+    experiment
+        which may not know it yet
+    recorded
+        see ``find``
     """
     if chosen.absent:
         return chosen, []
@@ -368,5 +417,11 @@ def _problems(check: Callable[[], object]) -> list[str]:
 
 
 def info_of(document: Mapping[str, Any]) -> ProtocolInfo | None:
-    """Of a run record; None where the built-in law was run."""
+    """Of a run record; None where the built-in law was run.
+
+    Parameters
+    ----------
+    document
+        of the run record
+    """
     return ProtocolInfo.from_json(document["protocol"]) if document.get("protocol") is not None else None

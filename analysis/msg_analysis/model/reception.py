@@ -12,7 +12,15 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
 def padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
-    """(d, m): the d-th input of every agent, ascending, and which of these entries there are; others are 0."""
+    """(d, m): the d-th input of every agent, ascending, and which of these entries there are; others are 0.
+
+    Parameters
+    ----------
+    model
+        of the experiment
+    mode
+        graph, from 0
+    """
     inputs = [model.inputs(mode, i) for i in range(model.agents)]
     columns = np.zeros((max(len(row) for row in inputs), model.agents), dtype=np.int64)
     there = np.zeros(columns.shape, dtype=np.bool_)
@@ -27,8 +35,10 @@ class Reception:
 
     Parameters
     ----------
-    experiment : with its noise on the air
-    model : its step model
+    experiment
+        with its noise on the air
+    model
+        its step model
     """
 
     def __init__(self, experiment: Experiment, model: StepModel) -> None:
@@ -45,9 +55,12 @@ class Reception:
 
         Parameters
         ----------
-        k : of the step; must not go back to an earlier block of steps
-        mode : of g(k)
-        state : (m, replicas) x(k)
+        k
+            of the step; must not go back to an earlier block of steps
+        mode
+            of g(k)
+        state
+            (m, replicas) x(k)
         """
         within = self._draw(k)
         air, (columns, _), used = self._air, self._padded[mode], self._used[mode]
@@ -61,8 +74,10 @@ class Reception:
 
         Parameters
         ----------
-        states : (N + 1, m, replicas)
-        modes : (N,)
+        states
+            (N + 1, m, replicas)
+        modes
+            (N,)
         """
         air, agents = self._air, self._model.agents
         published = None

@@ -24,13 +24,17 @@ class Sections:
 
     Parameters
     ----------
-    mapping : the document
-    recorded : of a recorded run, the protocol that was used, which need not be installed
+    mapping
+        the document
+    recorded
+        of a recorded run, the protocol that was used, which need not be installed
 
     Attributes
     ----------
-    problems : the mistakes found so far
-    values, agents, graphs, chain, noise_gain, protocol : what is known so far
+    problems
+        the mistakes found so far
+    values, agents, graphs, chain, noise_gain, protocol
+        what is known so far
     """
 
     def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
@@ -64,7 +68,13 @@ class Sections:
         self.protocol: ChosenProtocol | None = None
 
     def resolve(self, directory: Path) -> None:
-        """Find everything that several keys say together, and every mistake in it."""
+        """Find everything that several keys say together, and every mistake in it.
+
+        Parameters
+        ----------
+        directory
+            what the paths in the file are relative to
+        """
         time, run, leaders = self.values["time"], self.values["run"], self.values["leaders"]
         self._find_protocol()
         self._count_agents(directory)

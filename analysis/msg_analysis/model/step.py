@@ -24,11 +24,16 @@ class Wiring:
 
     Attributes
     ----------
-    links : (n, m, m) whether agent i uses what agent j publishes; the diagonal means nothing
-    chain : the Markov chain that switches between the graphs
-    initial : (n,) law of g(0)
-    dt : simulated time of a step
-    loss : probability that a directed message is ignored in a step
+    links
+        (n, m, m) whether agent i uses what agent j publishes; the diagonal means nothing
+    chain
+        the Markov chain that switches between the graphs
+    initial
+        (n,) law of g(0)
+    dt
+        simulated time of a step
+    loss
+        probability that a directed message is ignored in a step
     """
 
     links: BoolArray
@@ -58,13 +63,39 @@ class Wiring:
         return self.chain.stationary
 
     def inputs(self, mode: int, agent: int) -> IntArray:
-        """Agents, ascending, whose values an agent uses under a mode; the agent itself always among them."""
+        """Agents, ascending, whose values an agent uses under a mode; the agent itself always among them.
+
+        Parameters
+        ----------
+        mode
+            graph, from 0
+        agent
+            index from 0
+
+        Returns
+        -------
+        IntArray
+            (d,) indices from 0
+        """
         used = self.links[mode, agent].copy()
         used[agent] = True
         return np.flatnonzero(used)
 
     def neighbours(self, mode: int, agent: int) -> IntArray:
-        """The other agents, ascending, whose values an agent uses under a mode."""
+        """The other agents, ascending, whose values an agent uses under a mode.
+
+        Parameters
+        ----------
+        mode
+            graph, from 0
+        agent
+            index from 0
+
+        Returns
+        -------
+        IntArray
+            (d,) indices from 0
+        """
         used = self.inputs(mode, agent)
         return np.asarray(used[used != agent])
 
@@ -89,17 +120,26 @@ class StepModel(Wiring):
 
     Attributes
     ----------
-    weights : (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
-    nominal : (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time), or
-        what a linear protocol says; rows of grounded leaders are zero
-    offsets : (n, m) what the reference adds, so that the reference is a fixed point
-    noise_gain : (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
-    noise : (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
-    delay : age d, in steps, of the states of others that a step uses
-    loss_variance : (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and
-        their spread adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
-    grounded : (m,) True for leaders of infinite gain
-    reference : what tracking agents should hold; 0 for consensus
+    weights
+        (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
+    nominal
+        (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time), or what a
+        linear protocol says; rows of grounded leaders are zero
+    offsets
+        (n, m) what the reference adds, so that the reference is a fixed point
+    noise_gain
+        (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
+    noise
+        (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
+    delay
+        age d, in steps, of the states of others that a step uses
+    loss_variance
+        (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and their spread
+        adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
+    grounded
+        (m,) True for leaders of infinite gain
+    reference
+        what tracking agents should hold; 0 for consensus
     """
 
     weights: FloatArray
@@ -122,7 +162,13 @@ def _transition(chain: MarkovChain, dt: float) -> FloatArray:
 
 
 def build_model(experiment: Experiment) -> Wiring:
-    """What a run needs to know of its network: a ``StepModel`` where the law is linear, else its wiring alone."""
+    """What a run needs to know of its network: a ``StepModel`` where the law is linear, else its wiring alone.
+
+    Parameters
+    ----------
+    experiment
+        with a protocol or without
+    """
     if experiment.protocol is None or experiment.protocol.linear:
         return build_step_model(experiment)
     return Wiring(
@@ -140,9 +186,15 @@ def build_step_model(experiment: Experiment) -> StepModel:
     One thread of linear algebra: the matrix exponential of a discrete-time experiment must come out the same, to the
     last bit, in every process of a run, whatever number of threads it was given.
 
+    Parameters
+    ----------
+    experiment
+        whose law is linear
+
     Raises
     ------
-    InputError : the experiment has a protocol that is not linear, not here, or fails
+    InputError
+        the experiment has a protocol that is not linear, not here, or fails
     """
     agents, dt = experiment.agents, experiment.step_length
     grounded = np.isinf(experiment.leader_gains)

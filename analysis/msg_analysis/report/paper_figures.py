@@ -70,20 +70,22 @@ def write_figures(numbers: Sequence[int], directory: str | Path, formats: Sequen
 
     Parameters
     ----------
-    numbers : Sequence[int]
-        1, 2, 3
-    directory : str | Path
+    numbers
+        Sequence[int] 1, 2, 3
+    directory
         made where it does not exist
-    formats : Sequence[str]
-        "png", "svg", "pdf"
+    formats
+        Sequence[str] "png", "svg", "pdf"
 
     Returns
     -------
-    the files
+    list[Path]
+        the files
 
     Raises
     ------
-    InputError : a file cannot be written
+    InputError
+        a file cannot be written
     """
     directory = Path(directory)
     written = []
@@ -104,7 +106,13 @@ def write_figures(numbers: Sequence[int], directory: str | Path, formats: Sequen
 
 
 def csv_text(example: Example) -> str:
-    """The numbers: comment lines that begin with ``#``, a header with units, one row per point."""
+    """The numbers: comment lines that begin with ``#``, a header with units, one row per point.
+
+    Parameters
+    ----------
+    example
+        of the paper
+    """
     text = io.StringIO()
     for line in (f"Example {example.number}: {example.title}", "agent 0 is the system", *example.remarks):
         text.write(f"# {line}\n")
@@ -119,7 +127,7 @@ def draw(example: Example) -> Figure:
 
     Parameters
     ----------
-    example : Example
+    example
         of ``msg_analysis.report.paper``
     """
     figure = {1: _draw_1, 2: _draw_2, 3: _draw_3}[example.number](example)

@@ -18,7 +18,8 @@ from scipy import stats
 
 from msg_analysis.errors import InputError
 from msg_analysis.inference.order import Order, order_of
-from msg_analysis.report.tables import number_table, number_text
+from msg_analysis.markdown import markdown_table, number_text
+from msg_analysis.report.tables import number_table
 from msg_analysis.report.verdict_text import order_statements
 
 RESULT_FILE = "result.json"
@@ -30,16 +31,26 @@ class Result:
 
     Attributes
     ----------
-    file : where it came from
-    experiment, seeds : of the run, or of all runs: "1 2"
-    bags : number of runs it is about
-    leaders : numbers of the leaders, "3" or "1 4"; empty without
-    verdict : of the comparison
-    simulated_time : of all runs
-    measured, standard_error, low, high, predicted, z : of the system error; low to high is the 95 % interval
-    least_p : least adjusted p of the tests
-    blame : what is wrong, in words; empty where nothing is
-    identity : the same for runs of the same law
+    file
+        where it came from
+    experiment, seeds
+        of the run, or of all runs: "1 2"
+    bags
+        number of runs it is about
+    leaders
+        numbers of the leaders, "3" or "1 4"; empty without
+    verdict
+        of the comparison
+    simulated_time
+        of all runs [units of simulated time]
+    measured, standard_error, low, high, predicted, z
+        of the system error; low to high is the 95 % interval
+    least_p
+        least adjusted p of the tests
+    blame
+        what is wrong, in words; empty where nothing is
+    identity
+        the same for runs of the same law
     """
 
     file: str
@@ -65,11 +76,13 @@ def read_result(path: Path) -> Result:
 
     Parameters
     ----------
-    path : file, or directory of a run with such a file in it
+    path
+        file, or directory of a run with such a file in it
 
     Raises
     ------
-    InputError : not there, or not a result of a comparison
+    InputError
+        not there, or not a result of a comparison
     """
     file = path / RESULT_FILE if path.is_dir() else path
     wanted = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
@@ -130,10 +143,14 @@ class Merged:
 
     Attributes
     ----------
-    experiment : name of the first
-    files : where they came from
-    simulated_time : of all
-    measured, standard_error, predicted, z, p : of the system error; every unit of time counts the same
+    experiment
+        name of the first
+    files
+        where they came from
+    simulated_time
+        of all [units of simulated time]
+    measured, standard_error, predicted, z, p
+        of the system error; every unit of time counts the same
     """
 
     experiment: str
@@ -147,7 +164,13 @@ class Merged:
 
 
 def merge_results(rows: Sequence[Result]) -> list[Merged]:
-    """System errors of results of the same law, as one; without those that have no number, or an earlier one's seed."""
+    """System errors of results of the same law, as one; without those that have no number, or an earlier one's seed.
+
+    Parameters
+    ----------
+    rows
+        results, whose order decides which of two with one seed counts
+    """
     groups: dict[str, list[Result]] = {}
     for row in rows:
         if row.identity is None or row.measured is None or row.predicted is None or not row.standard_error:
@@ -176,6 +199,13 @@ def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
 
     Where every row has a leader, or leaders, of infinite gain, that is the order of their joint robustness centrality.
     None where not all rows have a measured error, or there is only one.
+
+    Parameters
+    ----------
+    rows
+        results of independent runs
+    level
+        chance of telling any two apart wrongly
     """
     errors = [(row.measured, row.standard_error) for row in rows]
     known = [(measured, error) for measured, error in errors if measured is not None and error is not None]
@@ -189,7 +219,15 @@ def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
 
 
 def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
-    """The document: ``results``, ``merged``, and ``order``, whose numbers are places among the results, from 1."""
+    """The document: ``results``, ``merged``, and ``order``, whose numbers are places among the results, from 1.
+
+    Parameters
+    ----------
+    rows
+        results
+    level
+        chance of telling any two apart wrongly
+    """
     order = order_of_results(rows, level)
     return {
         "results": [asdict(row) for row in rows],
@@ -199,7 +237,13 @@ def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
 
 
 def to_csv(rows: Sequence[Result]) -> str:
-    """A line for each result, under the names of the columns; all digits."""
+    """A line for each result, under the names of the columns; all digits.
+
+    Parameters
+    ----------
+    rows
+        results
+    """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([field.name for field in fields(Result)])
@@ -209,10 +253,15 @@ def to_csv(rows: Sequence[Result]) -> str:
 
 
 def to_markdown(rows: Sequence[Result]) -> str:
-    """A table for a text."""
+    """A table for a text.
+
+    Parameters
+    ----------
+    rows
+        results
+    """
     heads, body = _shown(rows)
-    lines = [heads, ["---"] * 4 + ["---:"] * (len(heads) - 4), *body]
-    return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
+    return markdown_table(heads, body, names=4)
 
 
 def print_results(rows: Sequence[Result], level: float, console: Console) -> None:
@@ -220,9 +269,12 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
 
     Parameters
     ----------
-    rows : results
-    level : chance of telling any two apart wrongly
-    console : where to print
+    rows
+        results
+    level
+        chance of telling any two apart wrongly
+    console
+        where to print
     """
     heads, body = _shown(rows)
     kept = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -19,20 +20,31 @@ from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.system import JumpSystem
-from msg_analysis.theory.transient import point_start, start_of, transient, unreduced_consensus
+from msg_analysis.theory.transient import Transient, point_start, start_of, transient, unreduced_consensus
 from msg_analysis.theory.two_topology import two_topology
 from msg_analysis.types import FloatArray
 
-Law = Literal["emulated", "continuous"]
+TransientLaw = Literal["emulated", "continuous"]
 Result = TypeVar("Result")
 
 
 def parse_times(text: str) -> FloatArray:
     """Times from ``START:STOP:STEP`` (STOP included) or ``t1,t2,...``.
 
+    Parameters
+    ----------
+    text
+        as on the command line
+
+    Returns
+    -------
+    FloatArray
+        (T,) [units of simulated time]
+
     Raises
     ------
-    InputError : neither of them
+    InputError
+        neither of them
     """
     wanted = "expected START:STOP:STEP or t1,t2,..., ascending numbers >= 0: for example 0:10:0.5"
     try:
@@ -54,7 +66,7 @@ def describe_transient(
     experiment: Experiment,
     times: FloatArray,
     *,
-    law: Law = "emulated",
+    law: TransientLaw = "emulated",
     unreduced: bool = False,
     moments: bool = False,
     fraction: float = 0.05,
@@ -63,30 +75,26 @@ def describe_transient(
 
     Parameters
     ----------
-    experiment : with its start in ``run.start`` and ``switching.initial``
-    times : (T,) ascending [units of time]
-    law : "emulated" (the steps of the run; "discrete" in discrete time) or "continuous"
-    unreduced : consensus only: the states themselves, whose second moments grow without bound
-    moments : whether nu(t) and c(t) of every mode are in the document too
-    fraction : of the steady system error, for the settling time
+    experiment
+        with its start in ``run.start`` and ``switching.initial``
+    times
+        (T,) ascending [units of time]
+    law
+        "emulated" (the steps of the run; "discrete" in discrete time) or "continuous"
+    unreduced
+        consensus only: the states themselves, whose second moments grow without bound
+    moments
+        whether nu(t) and c(t) of every mode are in the document too
+    fraction
+        of the steady system error, for the settling time
 
     Raises
     ------
-    InputError : times that are no whole steps, a law that does not exist here, or too large
+    InputError
+        times that are no whole steps, a law that does not exist here, or too large
     """
-    system, unit = _system(experiment, law)
-    steady = MomentSolver(system).steady()
-    if unreduced:
-        if experiment.problem != "consensus":
-            raise InputError("--unreduced: expected problem: consensus, since tracking reduces nothing: leave it out")
-        if unit is None:
-            whole = unreduced_consensus(experiment)
-        else:
-            whole = systems.emulated(build_run_model(experiment), "tracking")
-        start = start_of(experiment, whole, system.lift @ steady @ system.lift.T)
-        found = transient(whole, start, _steps(times, unit))
-    else:
-        found = transient(system, start_of(experiment, system, steady), _steps(times, unit), steady)
+    solved = solve_transient(experiment, times, law=law, unreduced=unreduced)
+    found = solved.course
     document: dict[str, Any] = {
         "law": "discrete" if experiment.time == "discrete" else law,
         "unreduced": unreduced,
@@ -99,14 +107,72 @@ def describe_transient(
     document |= dict(
         zip(_mean_squares(document), (found.system_error.tolist(), found.node_errors.tolist()), strict=True)
     )
-    document |= _settling(experiment, system, steady, unit or 1.0, fraction)
+    document |= _settling(experiment, solved.system, solved.steady, solved.unit or 1.0, fraction)
     if moments:
         document["mode_means"] = found.mode_means.tolist()
         document["mode_second_moments"] = found.mode_second_moments.tolist()
     return document
 
 
-def _system(experiment: Experiment, law: Law) -> tuple[JumpSystem, float | None]:
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedTransient:
+    """Moments over time, and what they were computed with.
+
+    Attributes
+    ----------
+    course
+        the moments
+    system
+        the reduced system of the law
+    steady
+        (n, d, d) its steady second moments
+    unit
+        time of a step [units of simulated time]; None in continuous time
+    """
+
+    course: Transient
+    system: JumpSystem
+    steady: FloatArray
+    unit: float | None
+
+
+def solve_transient(
+    experiment: Experiment, times: FloatArray, *, law: TransientLaw = "emulated", unreduced: bool = False
+) -> SolvedTransient:
+    """Moments over time from the experiment's start.
+
+    Parameters
+    ----------
+    experiment
+        with its start in ``run.start`` and ``switching.initial``
+    times
+        (T,) ascending [units of simulated time]
+    law
+        "emulated" (the steps of the run) or "continuous"
+    unreduced
+        consensus only: the states themselves, whose second moments grow without bound
+
+    Raises
+    ------
+    InputError
+        times that are no whole steps, a law that does not exist here, or too large
+    """
+    system, unit = _system(experiment, law)
+    steady = MomentSolver(system).steady()
+    if not unreduced:
+        found = transient(system, start_of(experiment, system, steady), _steps(times, unit), steady)
+        return SolvedTransient(found, system, steady, unit)
+    if experiment.problem != "consensus":
+        raise InputError("--unreduced: expected problem: consensus, since tracking reduces nothing: leave it out")
+    if unit is None:
+        whole = unreduced_consensus(experiment)
+    else:
+        whole = systems.emulated(build_run_model(experiment), "tracking")
+    start = start_of(experiment, whole, system.lift @ steady @ system.lift.T)
+    return SolvedTransient(transient(whole, start, _steps(times, unit)), system, steady, unit)
+
+
+def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, float | None]:
     """The reduced system of a law, and the time of a step (None in continuous time)."""
     if law == "emulated":
         return systems.emulated(build_run_model(experiment), experiment.problem), experiment.step_length
@@ -167,11 +233,17 @@ def _settling(
 def describe_facts(experiment: Experiment) -> dict[str, Any]:
     """The lemmas on eigenvalues checked, bounds of the error, indices of the graphs, two graphs in closed form.
 
+    Parameters
+    ----------
+    experiment
+        to check
+
     Returns
     -------
-    ``facts`` (list), ``bounds``, ``graphs`` (list; None for directed or disconnected graphs), ``two_topology``
-    (``continuous``, ``emulated`` or ``discrete``; None unless there are two graphs that can each be held for ever).
-    What the network is too large for is None, and ``notes`` say so.
+    dict[str, Any]
+        ``facts`` (list), ``bounds``, ``graphs`` (list; None for directed or disconnected graphs), ``two_topology``
+        (``continuous``, ``emulated`` or ``discrete``; None unless there are two graphs that can each be held for ever).
+        What the network is too large for is None, and ``notes`` say so.
     """
     prediction = predict(experiment)
     laws = {"discrete" if experiment.time == "discrete" else "emulated": prediction.system}
@@ -206,22 +278,33 @@ def write_transient_csv(document: dict[str, Any], path: Path) -> None:
 
     Parameters
     ----------
-    document : of ``describe_transient``
-    path : of the CSV file
+    document
+        of ``describe_transient``
+    path
+        of the CSV file
+
+    Raises
+    ------
+    InputError
+        the file cannot be written
     """
     system, nodes = _mean_squares(document)
     agents = range(1, document["agents"] + 1)
     header = ["time", *(f"probability of {name}" for name in document["modes"])]
     header += [*(f"mean of agent {i}" for i in agents), system.replace("_", " ")]
     header += [f"{nodes.removesuffix('s').replace('_', ' ')} of agent {i}" for i in agents]
+    keys = ("times", "graph_law", "mean", system, nodes)
+    rows = zip(*(document[key] for key in keys), strict=True)
     temporary = path.with_name(path.name + ".part")
-    with temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        keys = ("times", "graph_law", "mean", system, nodes)
-        for time, law, mean, error, errors in zip(*(document[key] for key in keys), strict=True):
-            writer.writerow([time, *law, *mean, error, *errors])
-    temporary.replace(path)
+    try:
+        with temporary.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            writer.writerows([time, *law, *mean, error, *errors] for time, law, mean, error, errors in rows)
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
 
 
 def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:

@@ -45,11 +45,23 @@ class SetFunction(Protocol):
         ...
 
     def unreached(self, leaders: Leaders) -> int:
-        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0."""
+        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0.
+
+        Parameters
+        ----------
+        leaders
+            set S of agents, from 0
+        """
         ...
 
     def system_error(self, leaders: Leaders) -> float:
-        """E(S) of a set that reaches everybody."""
+        """E(S) of a set that reaches everybody.
+
+        Parameters
+        ----------
+        leaders
+            set S of agents, from 0
+        """
         ...
 
 
@@ -62,12 +74,15 @@ class LeaderSearch:
 
     Parameters
     ----------
-    function : what is minimised
-    watch : told of progress
+    function
+        what is minimised
+    watch
+        told of progress
 
     Attributes
     ----------
-    evaluations : number of solves so far
+    evaluations
+        number of solves so far
     """
 
     def __init__(self, function: SetFunction, watch: Watch = ignore) -> None:
@@ -83,12 +98,15 @@ class LeaderSearch:
 
         Parameters
         ----------
-        count : agents in a set
-        top : how many sets
+        count
+            agents in a set
+        top
+            how many sets
 
         Returns
         -------
-        (E, set), best first; infinite ones are left out
+        list[tuple[float, Leaders]]
+            (E, set), best first; infinite ones are left out
         """
         self._begin("all sets", math.comb(self._function.agents, count))
         least = math.inf
@@ -114,8 +132,10 @@ class LeaderSearch:
 
         Parameters
         ----------
-        count : how many
-        first : agent to begin with; by default the best one
+        count
+            how many
+        first
+            agent to begin with; by default the best one
         """
         self._begin("greedy" if first is None else f"greedy after agent {first + 1}", count * self._function.agents)
         chosen = [] if first is None else [first]
@@ -134,11 +154,13 @@ class LeaderSearch:
 
         Parameters
         ----------
-        count : how many
+        count
+            how many
 
         Returns
         -------
-        agents; if no set of this size reaches everybody, one that reaches as many as possible
+        list[int]
+            agents; if no set of this size reaches everybody, one that reaches as many as possible
         """
         best = self.greedy(count)
         if self._function.unreached(frozenset(best)):
@@ -155,11 +177,13 @@ class LeaderSearch:
 
         Parameters
         ----------
-        chosen : a set that reaches everybody
+        chosen
+            a set that reaches everybody
 
         Returns
         -------
-        as many agents, each the best beside the others
+        list[int]
+            as many agents, each the best beside the others
         """
         count = len(chosen)
         current = list(chosen)
@@ -193,7 +217,8 @@ class LeaderSearch:
 
         Parameters
         ----------
-        leaders : the result of the search
+        leaders
+            the result of the search
         """
         count = len(leaders)
         self._begin("bound", self._function.agents)
@@ -223,8 +248,10 @@ class LeaderSearch:
 
         Parameters
         ----------
-        count : agents in a set
-        top : how many sets
+        count
+            agents in a set
+        top
+            how many sets
         """
         sets = [(value, key) for key, value in self._known.items() if len(key) == count and math.isfinite(value)]
         return _ranked(sets)[:top]

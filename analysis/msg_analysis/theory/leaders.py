@@ -1,4 +1,7 @@
-"""Leaders: what a set of them is worth (joint robustness centrality), and which set is best."""
+"""Leaders: what a set of them is worth (joint robustness centrality), and which set is best.
+
+After the paper's section on robustness and leadership indices; docs/leaders.md has the bounds.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import numpy as np
 import scipy.sparse.csgraph
 
 from msg_analysis.errors import InputError
+from msg_analysis.markdown import markdown_table, number_text
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.sequential import build_run_model
 from msg_analysis.model.spec import LeadersSpec
@@ -39,9 +43,12 @@ class LeaderProblem:
 
     Attributes
     ----------
-    experiment : consensus or tracking
-    law : "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
-    gain : kappa of the leaders [1 / unit of time]; inf holds them at the reference
+    experiment
+        consensus or tracking
+    law
+        "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
+    gain
+        kappa of the leaders [1 / unit of time]; inf holds them at the reference
     """
 
     experiment: Experiment
@@ -88,11 +95,23 @@ class LeaderProblem:
         return np.asarray(np.isfinite(distances))
 
     def unreached(self, leaders: Leaders) -> int:
-        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0."""
+        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0.
+
+        Parameters
+        ----------
+        leaders
+            set S of agents, from 0
+        """
         return int((~self._reach[sorted(leaders)].any(axis=0)).sum())
 
     def system(self, leaders: Leaders) -> JumpSystem:
-        """The reduced system with these leaders: for infinite gain their rows and columns are deleted."""
+        """The reduced system with these leaders: for infinite gain their rows and columns are deleted.
+
+        Parameters
+        ----------
+        leaders
+            set S of agents, from 0
+        """
         return self._system(leaders, self.gain)
 
     def system_error(self, leaders: Leaders) -> float:
@@ -101,11 +120,13 @@ class LeaderProblem:
 
         Parameters
         ----------
-        leaders : agents from 0
+        leaders
+            agents from 0
 
         Raises
         ------
-        InputError : no steady state, or too large
+        InputError
+            no steady state, or too large
         """
         if not leaders or self.unreached(leaders):
             return math.inf
@@ -124,18 +145,24 @@ class LeaderProblem:
         return systems.emulated(build_run_model(led), "tracking")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Selection:
     """Result of a leader selection.
 
     Attributes
     ----------
-    problem : what was asked
-    method : "exhaustive", "greedy" or "swap"
-    sets : (E, agents from 0), best first; of greedy and swap, the best of those that were evaluated
-    order : agents in the order of the greedy choice, each replaced in its place by exchanges; () for enumeration
-    evaluations : number of system errors that were solved for
-    bound : no set of this size has a smaller system error; None where that is not known
+    problem
+        what was asked
+    method
+        "exhaustive", "greedy" or "swap"
+    sets
+        (E, agents from 0), best first; of greedy and swap, the best of those that were evaluated
+    order
+        agents in the order of the greedy choice, each replaced in its place by exchanges; () for enumeration
+    evaluations
+        number of system errors that were solved for
+    bound
+        no set of this size has a smaller system error; None where that is not known
     """
 
     problem: LeaderProblem
@@ -144,6 +171,15 @@ class Selection:
     order: tuple[int, ...]
     evaluations: int
     bound: float | None
+
+    def __repr__(self) -> str:
+        error, agents = self.sets[0]
+        best = f"agents {', '.join(str(agent + 1) for agent in agents)} with system error {error:.6g}"
+        return f"<Selection for {self.problem.experiment.name!r}: {best}; {self.method}, {self.evaluations} evaluated>"
+
+    def _repr_markdown_(self) -> str:
+        rows = [(", ".join(str(agent + 1) for agent in agents), number_text(error)) for error, agents in self.sets]
+        return markdown_table(("leaders", "system error"), rows)
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis leaders --json``."""
@@ -176,11 +212,15 @@ def resolve_law(experiment: Experiment, law: Law | None = None) -> Law:
 
     Parameters
     ----------
-    law : None for the paper's where the experiment has it, else that of the run's steps
+    experiment
+        in continuous or discrete time
+    law
+        None for the paper's where the experiment has it, else that of the run's steps
 
     Raises
     ------
-    InputError : the experiment does not have this law
+    InputError
+        the experiment does not have this law
     """
     if experiment.time == "discrete":
         possible: list[Law] = ["discrete"]
@@ -203,14 +243,19 @@ def system_error(experiment: Experiment, agents: list[int], *, law: Law | None =
 
     Parameters
     ----------
-    experiment : consensus or tracking; its own leaders do not count
-    agents : the leaders S, from 0
-    law : see ``resolve_law``
-    gain : kappa [1 / unit of time]
+    experiment
+        consensus or tracking; its own leaders do not count
+    agents
+        the leaders S, from 0
+    law
+        see ``resolve_law``
+    gain
+        kappa [1 / unit of time]
 
     Returns
     -------
-    inf where S does not reach everybody
+    float
+        inf where S does not reach everybody
     """
     return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(frozenset(agents))
 
@@ -220,7 +265,8 @@ def joint_robustness_centrality(experiment: Experiment, agents: list[int], *, la
 
     Parameters
     ----------
-    experiment, agents, law : see ``system_error``
+    experiment, agents, law
+        see ``system_error``
     """
     error = system_error(experiment, agents, law=law)
     return 1.0 / error if error > 0.0 else math.inf
@@ -240,19 +286,27 @@ def select_leaders(
 
     Parameters
     ----------
-    experiment : consensus or tracking; its own leaders do not count
-    count : number of leaders
-    method : "exhaustive" evaluates every set; "greedy" takes the best agent beside those taken before; "swap"
-        exchanges single leaders, from three starts, until that helps no more; "auto" is exhaustive up to
-        ``AUTO_SETS`` sets, else swap
-    law : see ``resolve_law``
-    gain : kappa of the leaders [1 / unit of time]; inf holds them at the reference
-    top : most sets in the result
-    watch : told of progress
+    experiment
+        consensus or tracking; its own leaders do not count
+    count
+        number of leaders
+    method
+        "exhaustive" evaluates every set; "greedy" takes the best agent beside those taken before; "swap" exchanges
+        single leaders, from three starts, until that helps no more; "auto" is exhaustive up to ``AUTO_SETS`` sets, else
+        swap
+    law
+        see ``resolve_law``
+    gain
+        kappa of the leaders [1 / unit of time]; inf holds them at the reference
+    top
+        most sets in the result
+    watch
+        told of progress
 
     Raises
     ------
-    InputError : impossible count, gain or law; no set of this size reaches everybody; too many sets
+    InputError
+        impossible count, gain or law; no set of this size reaches everybody; too many sets
     """
     _check(method in get_args(Method), f"method {method}: expected one of {', '.join(get_args(Method))}")
     _check(gain > 0.0, f"--gain {gain}: expected a number > 0, or inf for leaders held at the reference")

@@ -35,14 +35,19 @@ class RationalFlow(Flow):
 
     Parameters
     ----------
-    system : continuous time
-    start : (n, p + 1) packed second moments and probability of every mode, or their distance from the steady state
-    slow : slowest rate, or 1 / longest time, of interest
-    decays : whether the start is a distance from the steady state, of which nothing stays
+    system
+        continuous time
+    start
+        (n, p + 1) packed second moments and probability of every mode, or their distance from the steady state
+    slow
+        slowest rate, or 1 / longest time, of interest
+    decays
+        whether the start is a distance from the steady state, of which nothing stays
 
     Raises
     ------
-    InputError : too large, or the space does not become accurate
+    InputError
+        too large, or the space does not become accurate
     """
 
     def __init__(self, system: JumpSystem, start: FloatArray, slow: float, *, decays: bool) -> None:
@@ -170,7 +175,15 @@ def _course(matrix: FloatArray, first: float, last: float) -> FloatArray:
 
 
 def slowest_rate(system: JumpSystem, steady: FloatArray) -> float:
-    """Rate of the slowest part of second moments and graph, roughly: inverse iteration from the steady state."""
+    """Rate of the slowest part of second moments and graph, roughly: inverse iteration from the steady state.
+
+    Parameters
+    ----------
+    system
+        in continuous time
+    steady
+        (n, d, d) steady second moments
+    """
     moments, rate = steady, math.inf
     for _ in range(4):
         before = np.linalg.norm(moments)

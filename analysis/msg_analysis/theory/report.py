@@ -1,4 +1,7 @@
-"""How a solve went, and what is said if it did not go well."""
+"""How a solve went, and what is said if it did not go well.
+
+docs/accuracy.md says what the numbers mean.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,20 @@ class SolverReport:
 
     Attributes
     ----------
-    method : "cg" (reversible chain, symmetric graphs, continuous time) or "gmres", "direct" for one graph alone,
-        "dense" (LU of the half-vectorised equations)
-    preconditioner : "two-level" (every graph alone, then their average), "averaged" (the average in place of every
-        graph), "none"
-    iterations : applications of the preconditioner; for "dense", steps of refinement
-    residual : largest norm of a graph's residual, over that of its right-hand side
-    backward_error : largest norm of a graph's residual, over the sum of the norms of the terms that it consists of
-    error : estimated relative error: size of the correction that one more step would make; for "dense", the backward
-        error times the condition number
+    method
+        "cg" (reversible chain, symmetric graphs, continuous time) or "gmres", "direct" for one graph alone, "dense" (LU
+        of the half-vectorised equations)
+    preconditioner
+        "two-level" (every graph alone, then their average), "averaged" (the average in place of every graph), "none"
+    iterations
+        applications of the preconditioner; for "dense", steps of refinement
+    residual
+        largest norm of a graph's residual, over that of its right-hand side
+    backward_error
+        largest norm of a graph's residual, over the sum of the norms of the terms that it consists of
+    error
+        estimated relative error: size of the correction that one more step would make; for "dense", the backward error
+        times the condition number
     """
 
     method: Method
@@ -43,7 +51,13 @@ class SolverReport:
 
 
 def singular_message(reason: str = "") -> str:
-    """What is said of equations that have no solution, or none that can be trusted."""
+    """What is said of equations that have no solution, or none that can be trusted.
+
+    Parameters
+    ----------
+    reason
+        what is known of it, put behind "singular"
+    """
     return (
         f"second moments: the equations are (nearly) singular{reason}, so the errors grow without bound or cannot be "
         "computed: check that the union of the graphs connects everybody and that the rates do not differ by many "

@@ -1,4 +1,8 @@
-"""Reduced Markov jump linear systems: the states in which second moments stay finite."""
+"""Reduced Markov jump linear systems: the states in which second moments stay finite.
+
+The paper's sections III (consensus) and IV (tracking), and its appendix in discrete time; for the steps of a run,
+docs/theory.md.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +32,22 @@ class JumpSystem:
 
     Attributes
     ----------
-    time : "continuous" or "discrete"
-    matrices : (n, d, d) Z_i [1 / unit of time] or W_i
-    noise : (n, d, d) covariance of the noise, per unit of time or per step
-    chain : (n, n) Gamma or P
-    stationary : (n,) pi
-    lift : (len(s), d), columns orthonormal, so that y = lift^T (s - what s should be)
-    loss_variance : (n, len(s), len(s)) or None; see ``StepModel.loss_variance``. Discrete time only
-    readout : (m, d) with a delay; None without, where ``lift`` is what it would be
+    time
+        "continuous" or "discrete"
+    matrices
+        (n, d, d) Z_i [1 / unit of time] or W_i
+    noise
+        (n, d, d) covariance of the noise, per unit of time or per step
+    chain
+        (n, n) Gamma or P
+    stationary
+        (n,) pi
+    lift
+        (k, d) for k numbers s, columns orthonormal, so that y = lift^T (s - what s should be)
+    loss_variance
+        (n, len(s), len(s)) or None; see ``StepModel.loss_variance``. Discrete time only
+    readout
+        (m, d) with a delay; None without, where ``lift`` is what it would be
     """
 
     time: Time
@@ -63,19 +75,46 @@ class JumpSystem:
         return self.lift if self.readout is None else self.readout
 
     def lifted(self, moments: FloatArray) -> FloatArray:
-        """(..., m, m) of (..., d, d): second moments of the agents from those of the reduced coordinates."""
+        """(..., m, m) of (..., d, d): second moments of the agents from those of the reduced coordinates.
+
+        Parameters
+        ----------
+        moments
+            (..., d, d) of y y^T
+
+        Returns
+        -------
+        FloatArray
+            (..., m, m)
+        """
         return np.asarray(self.output @ moments @ self.output.T)
 
     def reduced(self, deviations: FloatArray) -> FloatArray:
         """(..., d) of (..., m): reduced coordinates of deviations; in consensus, of the states.
 
         With a delay, the earlier states are taken to be the same.
+
+        Parameters
+        ----------
+        deviations
+            (..., m) of the agents from what they should be
+
+        Returns
+        -------
+        FloatArray
+            (..., d)
         """
         lift = self.lift.reshape(-1, deviations.shape[-1], self.dimension).sum(axis=0)
         return np.asarray(deviations @ lift)
 
     def propagate(self, moments: FloatArray) -> FloatArray:
-        """(n, d, d): K_j[C_j] = E[W C_j W^T | mode j] for every mode. Discrete time."""
+        """(n, d, d): K_j[C_j] = E[W C_j W^T | mode j] for every mode. Discrete time.
+
+        Parameters
+        ----------
+        moments
+            (n, d, d) C_j
+        """
         after = self.matrices @ moments @ self.matrices.transpose(0, 2, 1)
         if self.loss_variance is not None:
             full = self.lift @ moments @ self.lift.T
@@ -92,8 +131,15 @@ class JumpSystem:
 
         Parameters
         ----------
-        moments : (n, d, d) C_i(k) = E[y y^T; mode i]
-        law : (n,) of g(k)
+        moments
+            (n, d, d) C_i(k) = E[y y^T; mode i]
+        law
+            (n,) of g(k)
+
+        Returns
+        -------
+        tuple[FloatArray, FloatArray]
+            moments (n, d, d) and law (n,) one step later
         """
         after = self.propagate(moments) + law[:, None, None] * self.noise
         return np.tensordot(self.chain, after, axes=(0, 0)), law @ self.chain
@@ -112,8 +158,10 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
 
     Parameters
     ----------
-    step : the compiled experiment
-    problem : "consensus" or "tracking"
+    step
+        the compiled experiment
+    problem
+        "consensus" or "tracking"
     """
     m, delay = step.agents, step.delay
     size = m * (delay + 1)
@@ -147,6 +195,11 @@ def continuous(experiment: Experiment) -> JumpSystem:
 
     Leaders of infinite gain are the exact limit: their rows and columns are deleted, ``lift`` puts the zeros
     back. Noise on the air, lost and late messages belong to steps; they have no place here.
+
+    Parameters
+    ----------
+    experiment
+        in continuous time, without protocol, loss, delay or noise on the air
     """
     gains = experiment.leader_gains
     follows = np.isfinite(gains)
@@ -165,7 +218,15 @@ def continuous(experiment: Experiment) -> JumpSystem:
 
 
 def held(system: JumpSystem, mode: int) -> JumpSystem:
-    """The same system with one graph held for ever."""
+    """The same system with one graph held for ever.
+
+    Parameters
+    ----------
+    system
+        continuous or discrete
+    mode
+        graph, from 0
+    """
     return JumpSystem(
         time=system.time,
         matrices=system.matrices[mode : mode + 1],

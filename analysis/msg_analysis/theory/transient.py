@@ -4,6 +4,8 @@
     discrete:   nu(k+1) = H nu(k), C_i(k+1) = sum_j P_ji (K_j[C_j] + pi_j(k) N_j),   pi(k+1) = P^T pi(k)
 
 Where there is a steady state, the distance to it is what moves: so it is reached exactly, however long the time.
+
+Proposition 1 of the paper for the means, and its discrete twin; docs/theory.md, "Transients", has the rest.
 """
 
 from __future__ import annotations
@@ -41,9 +43,12 @@ class Snapshot:
 
     Attributes
     ----------
-    law : (n,) pi_i = P(g = i)
-    means : (n, d) E[y; mode i]
-    moments : (n, d, d) C_i = E[y y^T; mode i]
+    law
+        (n,) pi_i = P(g = i)
+    means
+        (n, d) E[y; mode i]
+    moments
+        (n, d, d) C_i = E[y y^T; mode i]
     """
 
     law: FloatArray
@@ -51,17 +56,22 @@ class Snapshot:
     moments: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Transient:
     """Moments over time.
 
     Attributes
     ----------
-    system : whose they are
-    times : (T,) ascending; units of time, or numbers of steps
-    laws : (T, n) pi(t)
-    means : (T, n, d) nu(t), reduced
-    moments : (T, n, d, d) c(t), reduced
+    system
+        whose they are
+    times
+        (T,) ascending; units of time, or numbers of steps
+    laws
+        (T, n) pi(t)
+    means
+        (T, n, d) nu(t), reduced
+    moments
+        (T, n, d, d) c(t), reduced
     """
 
     system: JumpSystem
@@ -69,6 +79,11 @@ class Transient:
     laws: FloatArray
     means: FloatArray
     moments: FloatArray
+
+    def __repr__(self) -> str:
+        errors, times = self.system_error, self.times
+        course = f"{errors[0]:.6g} at {times[0]:g} to {errors[-1]:.6g} at {times[-1]:g}"
+        return f"<Transient of {len(self.system.output)} agents, {len(times)} times: system error {course}>"
 
     @property
     def mean(self) -> FloatArray:
@@ -102,9 +117,12 @@ def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | Non
 
     Parameters
     ----------
-    system : reduced or not
-    deviation : (m,) x(0) - (what x should be); in consensus, x(0)
-    law : (n,) of g(0); by default the stationary law
+    system
+        reduced or not
+    deviation
+        (m,) x(0) - (what x should be); in consensus, x(0)
+    law
+        (n,) of g(0); by default the stationary law
     """
     law = system.stationary if law is None else law
     y = system.reduced(deviation)
@@ -116,9 +134,12 @@ def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray)
 
     Parameters
     ----------
-    experiment : whose start
-    system : one of its laws
-    stationary : (n, d, d) second moments for ``run.start: stationary``
+    experiment
+        whose start
+    system
+        one of its laws
+    stationary
+        (n, d, d) second moments for ``run.start: stationary``
     """
     law = system.stationary
     if experiment.switching.initial != "stationary":
@@ -135,6 +156,11 @@ def unreduced_consensus(experiment: Experiment) -> JumpSystem:
     """Consensus in continuous time with the agents' mean in it: its second moments grow without bound.
 
     The twin for the steps of a run is ``systems.emulated(step, "tracking")``, which reduces nothing.
+
+    Parameters
+    ----------
+    experiment
+        consensus in continuous time
     """
     gain = experiment.noise_gain
     drift = np.stack([graph.laplacian for graph in experiment.graph_list])
@@ -153,14 +179,19 @@ def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Fl
 
     Parameters
     ----------
-    system : continuous or discrete time
-    start : at time 0
-    times : (T,) >= 0, ascending; whole numbers of steps in discrete time
-    steady : (n, d, d) of ``MomentSolver(system).steady()``; None where there is no steady state
+    system
+        continuous or discrete time
+    start
+        at time 0
+    times
+        (T,) >= 0, ascending; whole numbers of steps in discrete time
+    steady
+        (n, d, d) of ``MomentSolver(system).steady()``; None where there is no steady state
 
     Raises
     ------
-    InputError : times not usable, or too large
+    InputError
+        times not usable, or too large
     """
     times = np.asarray(times, dtype=float)
     _check_times(system, times)
@@ -170,7 +201,13 @@ def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Fl
 
 
 def unknowns(system: JumpSystem) -> int:
-    """Size n p + n of the joint equations of second moments and graph law."""
+    """Size n p + n of the joint equations of second moments and graph law.
+
+    Parameters
+    ----------
+    system
+        reduced or not
+    """
     return system.modes * (symmetric.size(system.dimension) + 1)
 
 
@@ -179,10 +216,14 @@ def joint_flow(system: JumpSystem, stack: FloatArray, slow: Callable[[], float],
 
     Parameters
     ----------
-    system : small, or in continuous time
-    stack : (n, p + 1) of ``joint_stack``
-    slow : gives the slowest rate of interest
-    decays : whether the stack is a distance from the steady state
+    system
+        small, or in continuous time
+    stack
+        (n, p + 1) of ``joint_stack``
+    slow
+        gives the slowest rate of interest
+    decays
+        whether the stack is a distance from the steady state
     """
     if unknowns(system) <= MAX_UNKNOWNS:
         return second_moment_propagator(system)
@@ -221,17 +262,41 @@ def _powered(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Flo
 
 
 def distance(system: JumpSystem, snapshot: Snapshot, steady: FloatArray) -> Snapshot:
-    """What is left to the steady state, which moves by the same equations."""
+    """What is left to the steady state, which moves by the same equations.
+
+    Parameters
+    ----------
+    system
+        that has a steady state
+    snapshot
+        at some time
+    steady
+        (n, d, d) steady second moments
+    """
     return Snapshot(snapshot.law - system.stationary, snapshot.means, snapshot.moments - steady)
 
 
 def joint_stack(snapshot: Snapshot) -> FloatArray:
-    """(n, p + 1) packed second moments and probability of every mode."""
+    """(n, p + 1) packed second moments and probability of every mode.
+
+    Parameters
+    ----------
+    snapshot
+        at some time
+    """
     return np.concatenate([symmetric.pack(snapshot.moments), snapshot.law[:, None]], axis=1)
 
 
 def advance(system: JumpSystem, snapshot: Snapshot) -> Snapshot:
-    """One step. Discrete time; right for the distance to the steady state too."""
+    """One step. Discrete time; right for the distance to the steady state too.
+
+    Parameters
+    ----------
+    system
+        in discrete time
+    snapshot
+        before the step
+    """
     moments, law = system.advance(snapshot.moments, snapshot.law)
     moved = np.einsum("nab,nb->na", system.matrices, snapshot.means)
     return Snapshot(law, system.chain.T @ moved, moments)
