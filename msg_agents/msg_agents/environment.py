@@ -23,7 +23,8 @@ def check_domain() -> None:
 
     Raises
     ------
-    InputError : it cannot
+    InputError
+        it cannot
     """
     value = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not value.isdecimal() or int(value) > LAST_DOMAIN:

@@ -1,6 +1,6 @@
 """What is installed to be run: the command line, and the nodes as executables of the ROS 2 package.
 
-Each node is the command of that name of ``msg-agents``: ``ros2 run msg_agents agent --ros-args -p run:=... -p agents:=[1]``.
+Each node is the command of that name of ``msg-agents``: ``ros2 run msg_agents agent --ros-args -p run:=... ...``.
 """
 
 from __future__ import annotations

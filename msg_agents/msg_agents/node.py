@@ -288,7 +288,13 @@ class NetworkNode(QuietNode):
         return publisher.get_subscription_count() >= len(expected) and not self.missing_readers(publisher, expected)
 
     def has_guests(self, publisher: Publisher) -> bool:
-        """Whether somebody who does not belong to the run wants all of a topic of ours."""
+        """Whether somebody who does not belong to the run wants all of a topic of ours.
+
+        Parameters
+        ----------
+        publisher
+            of this node
+        """
         own = {RECORDER, *map(agent_name, range(self.record.experiment.agents))}
         return any(
             reader.node_name not in own and reader.qos_profile.reliability == ReliabilityPolicy.RELIABLE
