@@ -1,8 +1,62 @@
-"""Theory, bags and statistics of Markov-switching networks, free of ROS."""
+"""Theory, bags and statistics of Markov-switching networks, free of ROS.
+
+    from msg_analysis import Experiment, compare, read_bag
+
+What can be imported from here is that of ``msg_analysis.api``, and is imported when it is first asked for, so that a
+program that needs only one part does not wait for the others.
+"""
+
+from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from msg_analysis.api import BagError as BagError
+    from msg_analysis.api import Comparison as Comparison
+    from msg_analysis.api import Experiment as Experiment
+    from msg_analysis.api import ExperimentError as ExperimentError
+    from msg_analysis.api import InputError as InputError
+    from msg_analysis.api import Moments as Moments
+    from msg_analysis.api import NotAvailableError as NotAvailableError
+    from msg_analysis.api import Prediction as Prediction
+    from msg_analysis.api import Run as Run
+    from msg_analysis.api import Selection as Selection
+    from msg_analysis.api import Transient as Transient
+    from msg_analysis.api import compare as compare
+    from msg_analysis.api import read_bag as read_bag
+    from msg_analysis.api import write_report as write_report
 
 try:
     __version__ = version("msg_analysis")
 except PackageNotFoundError:  # run from a source tree that nobody installed
     __version__ = "0.0.0"
+
+__all__ = [
+    "BagError",
+    "Comparison",
+    "Experiment",
+    "ExperimentError",
+    "InputError",
+    "Moments",
+    "NotAvailableError",
+    "Prediction",
+    "Run",
+    "Selection",
+    "Transient",
+    "compare",
+    "read_bag",
+    "write_report",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from msg_analysis import api
+
+    return getattr(api, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

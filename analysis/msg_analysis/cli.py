@@ -14,6 +14,15 @@ import click
 
 import msg_analysis
 from msg_analysis import cli_compare, cli_theory
+from msg_analysis.cli_options import (
+    BAG,
+    PATH,
+    InputPath,
+    duration_option,
+    experiment_argument,
+    json_option,
+    seed_option,
+)
 from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, print_json, result_console
 from msg_analysis.errors import InputError
@@ -22,11 +31,10 @@ if TYPE_CHECKING:
     from msg_analysis.bags.storage import Compression
 
 
-_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-_experiment = click.argument("experiment", type=click.Path(path_type=Path))
+_SOURCE = InputPath(".yaml", ".yml", ".json", ".mcap", ".mcap.zstd", holds=("metadata.yaml", "*.mcap"))
 
 
-@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=CommandGroup)
 @click.version_option(msg_analysis.__version__, prog_name="msg-analysis")
 def main() -> None:
     """Theory, simulation and statistics of Markov-switching networks of agents."""
@@ -35,16 +43,13 @@ def main() -> None:
 @main.command(
     epilog=examples("msg-analysis predict line_ring.yaml", "msg-analysis predict line_ring.yaml --json | jq .emulated")
 )
-@_experiment
-@_json
+@experiment_argument
+@json_option
 def predict(experiment: Path, as_json: bool) -> None:
     """Predict the steady errors of EXPERIMENT, exactly."""
-    from msg_analysis.model.experiment import Experiment
-    from msg_analysis.theory.prediction import predict as predict_experiment
+    from msg_analysis.api import Experiment
 
-    loaded = Experiment.load(experiment)
-    loaded.require_available("predict")
-    document = predict_experiment(loaded).to_json()
+    document = Experiment.load(experiment).predict().to_json()
     if as_json:
         print_json(document)
     else:
@@ -58,11 +63,12 @@ def predict(experiment: Path, as_json: bool) -> None:
         "msg-analysis simulate line_ring.yaml", "msg-analysis simulate line_ring.yaml --seed 8 --out twin_8"
     )
 )
-@_experiment
-@click.option("--out", type=click.Path(path_type=Path), help="Bag directory to write; <name>_twin by default.")
-@click.option("--seed", type=int, help="Instead of run.seed.")
-@click.option("--duration", type=float, help="Instead of run.duration [units of simulated time].")
+@experiment_argument
+@click.option("--out", type=PATH, metavar="BAG", show_default="<name>_twin", help="Bag to write; must not exist.")
+@seed_option
+@duration_option
 @storage_options
+@json_option
 def simulate(
     experiment: Path,
     out: Path | None,
@@ -70,20 +76,30 @@ def simulate(
     duration: float | None,
     compression: Compression,
     split_size: float | None,
+    as_json: bool,
 ) -> None:
     """Run EXPERIMENT without ROS and write its bag, whose name is printed."""
-    from msg_analysis.bags.store import write_trajectory
-    from msg_analysis.model.experiment import Experiment
-    from msg_analysis.twin import simulate as simulate_experiment
+    from msg_analysis.api import Experiment
 
-    given = {key: value for key, value in {"seed": seed, "duration": duration}.items() if value is not None}
-    loaded = Experiment.load(experiment).with_run(**given)
-    loaded.require_available()
+    loaded = Experiment.load(experiment)
     directory = out or Path(f"{loaded.name}_twin")
     if directory.exists():
         raise InputError(f"{directory}: exists already: remove it, or choose another name with --out")
-    write_trajectory(simulate_experiment(loaded), directory, storage(compression, split_size))
-    click.echo(directory)
+    chosen = storage(compression, split_size)
+    run = loaded.simulate(seed=seed, duration=duration)
+    run.save(directory, chosen)
+    if as_json:
+        print_json(
+            {
+                "bag": str(directory),
+                "run": str(run.record.run),
+                "experiment": loaded.name,
+                "seed": run.experiment.run.seed,
+                "steps": run.experiment.steps,
+            }
+        )
+    else:
+        click.echo(directory)
 
 
 @main.command(
@@ -92,32 +108,36 @@ def simulate(
         "msg-analysis leaders line_ring.yaml --count 2 --gain 0.5 --json | jq .sets[0].agents",
     )
 )
-@_experiment
-@click.option("--count", type=int, required=True, help="Number of leaders.")
+@experiment_argument
+@click.option("--count", type=int, metavar="K", required=True, help="Number of leaders.")
 @click.option(
     "--method",
     type=click.Choice(["auto", "exhaustive", "greedy", "swap"]),
     default="auto",
-    help="auto (default): exhaustive where there are at most 1000 sets, else swap.",
+    help="auto: exhaustive where there are at most 1000 sets, else swap.",
 )
-@click.option("--law", type=click.Choice(["continuous", "emulated", "discrete"]), help="By default the paper's.")
-@click.option("--gain", type=float, default=float("inf"), help="Pull of the leaders; inf (default) holds them.")
-@click.option("--top", type=int, default=10, help="How many sets to list; 10 by default.")
-@_json
+@click.option(
+    "--law",
+    type=click.Choice(["continuous", "emulated", "discrete"]),
+    show_default="the paper's, where there is one",
+    help="The law that the error is of.",
+)
+@click.option(
+    "--gain", type=float, metavar="KAPPA", default=float("inf"), help="Pull of the leaders; inf holds them in place."
+)
+@click.option("--top", type=int, metavar="N", default=10, help="How many sets to list.")
+@json_option
 def leaders(experiment: Path, count: int, method: str, law: str | None, gain: float, top: int, as_json: bool) -> None:
     """Find the best leaders for the network of EXPERIMENT, by joint robustness centrality.
 
     Leaders that EXPERIMENT names do not count.
     """
-    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.api import Experiment
     from msg_analysis.progress import SolveProgress
-    from msg_analysis.theory.leaders import select_leaders
 
     loaded = Experiment.load(experiment)
-    loaded.require_available("predict")
     with SolveProgress(loaded.name) as progress:
-        selection = select_leaders(
-            loaded,
+        selection = loaded.select_leaders(
             count,
             method=method,  # type: ignore[arg-type]  # click has checked it
             law=law,  # type: ignore[arg-type]
@@ -136,30 +156,36 @@ def leaders(experiment: Path, count: int, method: str, law: str | None, gain: fl
 
 @main.command(epilog=examples("msg-analysis figures", "msg-analysis figures 3 --out paper --format pdf"))
 @click.argument("example", type=click.Choice(["1", "2", "3", "all"]), default="all")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("figures"), help="Directory; figures by default.")
+@click.option("--out", type=PATH, metavar="DIR", default=Path("figures"), help="Where the files are written.")
 @click.option(
     "--format",
     "formats",
     type=click.Choice(["png", "svg", "pdf"]),
     multiple=True,
     default=("png", "svg", "pdf"),
-    help="May be given several times; all three by default.",
+    help="Of the drawings. Repeatable.",
 )
-def figures(example: str, out: Path, formats: tuple[str, ...]) -> None:
-    """Draw the EXAMPLEs of the paper, with the numbers as CSV; print the files' names.
+@json_option
+def figures(example: str, out: Path, formats: tuple[str, ...], as_json: bool) -> None:
+    """Draw the examples of the paper, with the numbers as CSV; print the files' names.
 
     Files of the same names in the directory are replaced.
     """
     from msg_analysis.report.paper_figures import write_figures
 
+    written: list[str] = []
     for number in (1, 2, 3) if example == "all" else (int(example),):
         for path in write_figures([number], out, tuple(dict.fromkeys(formats))):
-            click.echo(path)
+            written.append(str(path))
+            if not as_json:
+                click.echo(path)
+    if as_json:
+        print_json({"files": written})
 
 
 @main.command(epilog=examples("msg-analysis info line_ring.yaml", "msg-analysis info line_ring_twin --json"))
-@click.argument("source", metavar="EXPERIMENT|BAG", type=click.Path(path_type=Path))
-@_json
+@click.argument("source", metavar="EXPERIMENT|BAG", type=_SOURCE)
+@json_option
 def info(source: Path, as_json: bool) -> None:
     """Explain an experiment file, or say what a bag holds."""
     from msg_analysis.model.experiment import Experiment
@@ -177,9 +203,9 @@ def info(source: Path, as_json: bool) -> None:
 
 
 @main.command(epilog=examples("msg-analysis salvage runs/line_ring_20250101_120000 whole"))
-@click.argument("bag", type=click.Path(path_type=Path))
-@click.argument("out", type=click.Path(path_type=Path))
-@_json
+@click.argument("bag", type=BAG)
+@click.argument("out", type=PATH)
+@json_option
 def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
     """Make OUT, a valid bag, of what is whole in the torn or damaged BAG; say what was dropped.
 

@@ -19,14 +19,13 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
             "--compression",
             type=click.Choice(COMPRESSIONS),
             default=DEFAULT.compression,
-            show_default=True,
             help="Of the bag, chunk by chunk.",
         ),
         click.option(
             "--split-size",
             type=click.FloatRange(SMALLEST_SPLIT),
             metavar="MB",
-            help=f"Go on in a new file of the bag after so many MB (10^6 bytes), {SMALLEST_SPLIT} at least.",
+            help="Go on in a new file of the bag after so many MB (10^6 bytes).",
         ),
     ):
         command = option(command)

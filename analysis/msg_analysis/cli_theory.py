@@ -6,11 +6,9 @@ from pathlib import Path
 
 import click
 
+from msg_analysis.cli_options import FILE, experiment_argument, json_option
 from msg_analysis.console import examples, print_json, result_console
-from msg_analysis.errors import InputError
-
-_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-_experiment = click.argument("experiment", type=click.Path(path_type=Path))
+from msg_analysis.files import require_place
 
 
 @click.command(
@@ -19,21 +17,21 @@ _experiment = click.argument("experiment", type=click.Path(path_type=Path))
         "msg-analysis transient line_ring.yaml --times 0,1,10 --law continuous --json | jq .settling",
     )
 )
-@_experiment
-@click.option("--times", required=True, help="START:STOP:STEP or t1,t2,... in units of time.")
+@experiment_argument
+@click.option(
+    "--times", metavar="TIMES", required=True, help="START:STOP:STEP or t1,t2,... in units of simulated time."
+)
 @click.option(
     "--law",
     type=click.Choice(["emulated", "continuous"]),
     default="emulated",
-    help="The steps of the run (default), or the paper's continuous time.",
+    help="The steps of the run, or the paper's continuous time.",
 )
 @click.option("--unreduced", is_flag=True, help="Consensus: of the states themselves, not of the disagreement.")
-@click.option(
-    "--fraction", type=float, default=0.05, help="Of the steady error, for the settling time; 0.05 by default."
-)
+@click.option("--fraction", type=float, metavar="F", default=0.05, help="Of the steady error, for the settling time.")
 @click.option("--moments", is_flag=True, help="With --json: means and second moments of every graph as well.")
-@click.option("--csv", "table", type=click.Path(dir_okay=False, path_type=Path), help="Write a table as well.")
-@_json
+@click.option("--csv", "table", type=FILE, metavar="FILE", help="Write a table as well.")
+@json_option
 def transient(
     experiment: Path,
     times: str,
@@ -48,8 +46,7 @@ def transient(
     from msg_analysis.model.experiment import Experiment
     from msg_analysis.report.theory import describe_transient, parse_times, write_transient_csv
 
-    if table and not table.parent.is_dir():
-        raise InputError(f"{table}: no such directory {table.parent}: create it")
+    require_place(table)
     loaded = Experiment.load(experiment)
     loaded.require_available("predict")
     document = describe_transient(
@@ -73,8 +70,8 @@ def transient(
 @click.command(
     epilog=examples("msg-analysis facts line_ring.yaml", "msg-analysis facts line_ring.yaml --json | jq .bounds")
 )
-@_experiment
-@_json
+@experiment_argument
+@json_option
 def facts(experiment: Path, as_json: bool) -> None:
     """Check the paper's lemmas on EXPERIMENT; bounds, indices of its graphs, two graphs in closed form."""
     from msg_analysis.model.experiment import Experiment

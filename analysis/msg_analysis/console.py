@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.exceptions import Exit
 
 from msg_analysis.errors import InputError
 
@@ -18,39 +22,115 @@ if TYPE_CHECKING:
 BAD_INPUT = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
+NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 class CommandGroup(click.Group):
-    """The one place where errors of the user become messages and exit codes."""
+    """The one place where errors of the user become messages and exit codes, and what all help pages have in common.
+
+    Parameters
+    ----------
+    *args, **attributes
+        see click.Group
+    """
+
+    def __init__(self, *args: Any, **attributes: Any) -> None:
+        attributes["context_settings"] = {"help_option_names": ["-h", "--help"], "show_default": True}
+        super().__init__(*args, **attributes)
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """Run the program; see click.Command."""
+        _open_closed_streams()
+        return super().main(*args, **extra)
+
+    def make_context(self, *args: Any, **extra: Any) -> click.Context:
+        """Read the command line, answer ``--help`` and ``--version``; see click.Command."""
+        with _exit_codes():
+            return super().make_context(*args, **extra)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; see click.Group."""
-        try:
+        with _exit_codes():
             return super().invoke(ctx)
-        except InputError as error:
-            complain(str(error))
-            ctx.exit(BAD_INPUT)
-        except BrokenPipeError:
-            # Nobody reads any more: leave nothing to flush at exit, which would complain again.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            ctx.exit(BROKEN_PIPE)
-        except OSError as error:
-            if error.filename is None:
-                raise
+
+
+@contextmanager
+def _exit_codes() -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        complain(str(error))
+        raise Exit(BAD_INPUT) from error
+    except BrokenPipeError as error:
+        _drop_stdout()
+        raise Exit(BROKEN_PIPE) from error
+    except OSError as error:
+        if error.filename is not None:
             complain(f"{error.filename}: {error.strerror}")
-            ctx.exit(BAD_INPUT)
-        except KeyboardInterrupt:
-            ctx.exit(INTERRUPTED)
+        elif _stdout_fails():
+            _drop_stdout()
+            complain(f"stdout: {error.strerror}: the result could not be printed")
+        elif error.errno in NO_ROOM:
+            complain(f"a file could not be written: {error.strerror}")
+        else:
+            raise
+        raise Exit(BAD_INPUT) from error
+    except KeyboardInterrupt as error:
+        raise Exit(INTERRUPTED) from error
 
 
-def complain(text: str) -> None:
-    """One error on stderr."""
-    color = False if "NO_COLOR" in os.environ else None
-    click.echo(f"{click.style('error:', fg='red', bold=True)} {text}", err=True, color=color)
+def _open_closed_streams() -> None:
+    """Keep the numbers of closed standard streams from being given to files and sockets, which prints would spoil.
+
+    What is printed to a closed stdout then fails as it would with any program; a closed stderr swallows it.
+    """
+    for number, mode in ((0, os.O_WRONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, mode)  # the least number that is free
+            if number == 1:
+                sys.stdout = os.fdopen(1, "w")
+            elif number == 2:
+                sys.stderr = os.fdopen(2, "w")
+
+
+def _stdout_fails() -> bool:
+    try:
+        sys.stdout.flush()
+    except OSError:
+        return True
+    return False
+
+
+def _drop_stdout() -> None:
+    """Leave nothing to flush at exit, which would complain again."""
+    with suppress(OSError, ValueError):  # a stream without a file, in tests
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def complain(text: str, label: str = "error:") -> None:
+    """One error on stderr.
+
+    Parameters
+    ----------
+    text
+        says what is wrong
+    label
+        before it, in red on a terminal
+    """
+    color = False if os.environ.get("NO_COLOR") else None
+    click.echo(f"{click.style(label, fg='red', bold=True)} {text}", err=True, color=color)
 
 
 def examples(*lines: str) -> str:
-    """Epilog of a command's help."""
+    """Epilog of a command's help.
+
+    Parameters
+    ----------
+    *lines
+        commands, as a user would type them
+    """
     return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
 
 
@@ -67,12 +147,24 @@ def result_console() -> Console:
 
 
 def print_json(document: dict[str, Any]) -> None:
-    """One JSON object on stdout; infinite and undefined numbers, which JSON does not have, become null."""
+    """One JSON object on stdout; infinite and undefined numbers, which JSON does not have, become null.
+
+    Parameters
+    ----------
+    document
+        what json.dumps takes
+    """
     click.echo(json.dumps(finite(document), allow_nan=False))
 
 
 def finite(value: Any) -> Any:
-    """The same document with None in place of infinite and undefined numbers."""
+    """The same document with None in place of infinite and undefined numbers.
+
+    Parameters
+    ----------
+    value
+        document, or part of one
+    """
     if isinstance(value, dict):
         return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -17,8 +17,20 @@ import click
 import msg_agents
 from msg_agents import cli_nodes, cli_replay
 from msg_agents.environment import RESTARTS
+from msg_analysis.cli_options import (
+    BAG,
+    PATH,
+    RUN_RECORD,
+    InputPath,
+    PositiveFloat,
+    duration_option,
+    experiment_argument,
+    json_option,
+    seed_option,
+    suggest,
+)
 from msg_analysis.cli_storage import storage, storage_options
-from msg_analysis.console import CommandGroup, examples, result_console
+from msg_analysis.console import CommandGroup, complain, examples, print_json, result_console
 
 if TYPE_CHECKING:
     from msg_agents.runner import RunResult
@@ -28,7 +40,7 @@ if TYPE_CHECKING:
 DISAGREES, INCOMPLETE = 1, 3
 
 
-@click.group(cls=CommandGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=CommandGroup)
 @click.version_option(msg_agents.__version__, prog_name="msg-agents")
 def main() -> None:
     """Networks of agents under Markov-switching graphs, as ROS 2 processes."""
@@ -40,38 +52,58 @@ def main() -> None:
         "msg-agents run line_ring.yaml --seed 3 --duration 100 --out runs --json",
     )
 )
-@click.argument("experiment", type=click.Path(path_type=Path))
+@experiment_argument
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
+    metavar="DIR",
     default=Path("runs"),
-    show_default=True,
     help="Where the bag's directory <name>_<time> is made.",
 )
 @click.option("--no-record", is_flag=True, help="Only run: no bag, no verdict.")
-@click.option("--seed", type=int, help="Instead of run.seed.")
-@click.option("--duration", type=float, help="Instead of run.duration, in units of simulated time.")
-@click.option("--pace", help="Instead of run.pace: lockstep or realtime.")
-@click.option("--speed", type=float, help="Instead of run.speed: units of simulated time per second (realtime).")
-@click.option("--processes", help="Instead of run.processes: auto, one_per_agent or a number.")
+@seed_option
+@duration_option
+@click.option(
+    "--pace",
+    metavar="PACE",
+    shell_complete=suggest("lockstep", "realtime"),
+    help="Instead of run.pace: lockstep or realtime.",
+)
+@click.option(
+    "--speed",
+    type=float,
+    metavar="SPEED",
+    help="Instead of run.speed: units of simulated time per second (realtime).",
+)
+@click.option(
+    "--processes",
+    metavar="P",
+    shell_complete=suggest("auto", "one_per_agent"),
+    help="Instead of run.processes: auto, one_per_agent or a number.",
+)
 @click.option(
     "--restarts",
     type=click.IntRange(0),
+    metavar="N",
     default=RESTARTS,
-    show_default=True,
     help="How often, in all, agents or the switcher are started again when they were killed.",
 )
-@click.option("--domain", type=click.IntRange(0, 232), help="ROS_DOMAIN_ID. Default: a free one of the run's own.")
+@click.option(
+    "--domain",
+    type=click.IntRange(0, 232),
+    metavar="D",
+    show_default="a free one of the run's own",
+    help="ROS_DOMAIN_ID.",
+)
 @cli_nodes.use_sim_time
 @click.option(
     "--pin/--no-pin",
     default=True,
-    show_default=True,
     help="Keep each process to one core, where there are more of them than cores: faster (lockstep).",
 )
 @storage_options
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
-@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
+@json_option
 def run(
     experiment: Path,
     *,
@@ -129,7 +161,7 @@ def _end(result: RunResult, as_json: bool) -> None:
     from msg_agents.runner import conclude
 
     for line in result.failures:
-        click.echo(f"{click.style('failed:', fg='red', bold=True)} {line}", err=True)
+        complain(line, "failed:")
     conclude(result)
     _show(result, as_json)
     if result.failures or (result.bag is not None and result.comparison is None):
@@ -157,7 +189,7 @@ def _show(result: RunResult, as_json: bool) -> None:
     if result.bag is not None and result.comparison is not None:
         (result.bag / RESULT_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     if as_json:
-        click.echo(json.dumps(document))
+        print_json(document)
         return
     if result.comparison is not None:
         from msg_analysis.report.text import print_comparison
@@ -200,8 +232,8 @@ class _progress_bar:  # noqa: N801  used like a function
 
 
 @main.command(epilog=examples("msg-agents check runs/line_ring_20250101_120000", "msg-agents check"))
-@click.argument("bag", type=click.Path(path_type=Path), required=False)
-@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
+@click.argument("bag", type=BAG, required=False)
+@json_option
 def check(bag: Path | None, *, as_json: bool) -> None:
     """Compute the run in BAG again with the offline twin; name the first agent and step that differ.
 
@@ -214,7 +246,7 @@ def check(bag: Path | None, *, as_json: bool) -> None:
     outcome = check_trajectory(read_bag(path))
     if as_json:
         document = {"bag": str(path), "equal": outcome.difference is None, "compared": outcome.compared}
-        click.echo(json.dumps(document | {"missing": outcome.missing, "difference": outcome.difference}))
+        print_json(document | {"missing": outcome.missing, "difference": outcome.difference})
     elif outcome.difference:
         click.echo(f"{path}: differs from the twin, first: {outcome.difference}")
     else:
@@ -231,7 +263,7 @@ def _newest_bag(directory: Path) -> Path:
 
 
 @main.command(epilog=examples("msg-agents prepare line_ring.yaml > run.json"))
-@click.argument("experiment", type=click.Path(path_type=Path))
+@experiment_argument
 def prepare(experiment: Path) -> None:
     """Print the run record of a new run of EXPERIMENT: the file that the single nodes are started with."""
     from msg_analysis.twin import new_record
@@ -247,42 +279,42 @@ def prepare(experiment: Path) -> None:
         "msg-agents host run.json hosts.yaml             # on every host",
     )
 )
-@click.argument("run_record", type=click.Path(path_type=Path))
-@click.argument("hosts", type=click.Path(path_type=Path))
-@click.option("--name", help="Which of the hosts this is. Default: the name of this machine.")
+@click.argument("run_record", type=RUN_RECORD)
+@click.argument("hosts", type=InputPath(".yaml", ".yml", ".json"))
+@click.option("--name", metavar="NAME", show_default="the name of this machine", help="Which of the hosts this is.")
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
+    metavar="DIR",
     default=Path("runs"),
-    show_default=True,
     help="Where the directory <name>_<time> is made: bag, report and logs on the recorder's host, logs on the others.",
 )
 @click.option(
     "--discovery-timeout",
-    type=click.FloatRange(0, min_open=True),
+    type=PositiveFloat(),
+    metavar="SECONDS",
     default=120.0,
-    show_default=True,
-    help="Seconds to wait for the other hosts.",
+    help="How long to wait for the other hosts [s].",
 )
 @click.option(
     "--patience",
-    type=click.FloatRange(0, min_open=True),
+    type=PositiveFloat(),
+    metavar="SECONDS",
     default=30.0,
-    show_default=True,
-    help="Seconds after which this host ends when another one has left the run before its end.",
+    help="After how long this host ends when another one has left the run before its end [s].",
 )
 @click.option(
     "--restarts",
     type=click.IntRange(0),
+    metavar="N",
     default=RESTARTS,
-    show_default=True,
     help="How often, in all, what was killed on this host is started again.",
 )
 @click.option(
     "--profile", "only_profile", is_flag=True, help="Only print the discovery profile, for other ROS 2 tools."
 )
 @storage_options
-@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
+@json_option
 def host(
     run_record: Path,
     hosts: Path,

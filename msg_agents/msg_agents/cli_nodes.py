@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from msg_agents.environment import DISCOVERY_TIMEOUT
 from msg_agents.ros_command import RosCommand
+from msg_analysis.cli_options import PATH, RUN_RECORD, PositiveFloat, suggest
 from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import examples
 
@@ -33,13 +35,13 @@ use_sim_time = click.option(
 def _node_options(command: Callable[..., None]) -> Callable[..., None]:
     """What the commands of single nodes have in common."""
     for option in (
-        click.argument("run_record", type=click.Path(path_type=Path)),
+        click.argument("run_record", type=RUN_RECORD),
         click.option(
             "--discovery-timeout",
-            type=float,
+            type=PositiveFloat(),
+            metavar="SECONDS",
             default=DISCOVERY_TIMEOUT,
-            show_default=True,
-            help="Seconds to wait for the other nodes.",
+            help="How long to wait for the other nodes [s].",
         ),
         use_sim_time,
         click.option(
@@ -50,7 +52,8 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option("--lifeline", type=int, hidden=True),
         click.option(
             "--account",
-            type=click.Path(path_type=Path),
+            type=PATH,
+            metavar="FILE",
             help="File that says once a second what the nodes refused and wait for: for health checks.",
         ),
     ):
@@ -62,22 +65,36 @@ _await = click.option(
     "--await",
     "readers",
     multiple=True,
+    metavar="NODE",
+    shell_complete=suggest("recorder"),
     help="A node, such as recorder, that must be there before the run starts. Repeatable.",
 )
 
 
 _patience = click.option(
     "--patience",
-    type=float,
-    help="Seconds after which it ends when others have left before the end. By default it waits for ever.",
+    type=PositiveFloat(),
+    metavar="SECONDS",
+    show_default="it waits for ever",
+    help="After how long it ends when others have left before the end [s].",
 )
 
 
 _checkpoint = click.option(
     "--checkpoint",
     type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
     help="Directory that keeps what is needed to go on after being killed: the same command then takes over.",
 )
+
+
+def _agents_of_record(context: click.Context, _option: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """The agents of the run record that is on the command line already."""
+    try:
+        agents = len(json.loads(Path(context.params["run_record"]).read_text(encoding="utf-8"))["start"])
+    except (OSError, ValueError, KeyError, TypeError):  # a shell is told nothing, rather than something wrong
+        return []
+    return [CompletionItem(str(i)) for i in range(1, agents + 1) if str(i).startswith(incomplete)]
 
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
@@ -86,8 +103,10 @@ _checkpoint = click.option(
     "--agent",
     "agents",
     type=int,
+    metavar="I",
     multiple=True,
     required=True,
+    shell_complete=_agents_of_record,
     help="Number of an agent, from 1. Repeatable.",
 )
 @_await
@@ -172,7 +191,7 @@ def switcher(
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
 @_node_options
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Directory of the bag; must not exist.")
+@click.option("--out", type=PATH, metavar="BAG", required=True, help="Bag to write; must not exist.")
 @storage_options
 def recorder(
     run_record: Path, *, out: Path, compression: Compression, split_size: float | None, **options: Any

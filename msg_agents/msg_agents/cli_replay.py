@@ -11,21 +11,39 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from msg_agents.ros_command import RosCommand
+from msg_analysis.cli_options import BAG, PositiveFloat, json_option
 from msg_analysis.console import examples, print_json, result_console
 
 if TYPE_CHECKING:
     from msg_agents.player import Played
 
 INCOMPLETE = 3
-_domain = click.option("--domain", type=click.IntRange(0, 232), help="Instead of the environment's ROS_DOMAIN_ID.")
+_domain = click.option(
+    "--domain", type=click.IntRange(0, 232), metavar="D", help="Instead of the environment's ROS_DOMAIN_ID."
+)
+_timeout = click.option(
+    "--timeout",
+    type=PositiveFloat(),
+    metavar="SECONDS",
+    show_default="for ever",
+    help="How long to wait for a network [s].",
+)
 
 
-def _positive(_: click.Context, __: click.Parameter, value: float | None) -> float | None:
-    if value is not None and not 0 < value < math.inf:
-        raise click.BadParameter(f"{value}: expected a positive number")
-    return value
+def _topics_of_bag(context: click.Context, _option: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """The topics of the bag that is on the command line already."""
+    from msg_analysis.bags.metadata import read_metadata
+    from msg_analysis.errors import InputError
+
+    try:
+        information = read_metadata(Path(context.params["bag"])) or {}
+        names = [entry["topic_metadata"]["name"] for entry in information["topics_with_message_count"]]
+    except (InputError, OSError, KeyError, TypeError):  # a shell is told nothing, rather than something wrong
+        return []
+    return [CompletionItem(name) for name in sorted(names) if name.startswith(incomplete)]
 
 
 class _Rate(click.types.FloatParamType):
@@ -48,17 +66,17 @@ class _Rate(click.types.FloatParamType):
     epilog=examples(
         "msg-agents play runs/line_ring_20260114_083441",
         "msg-agents play BAG --rate max --await recorder",
-        "msg-agents play BAG --topics '/agent_*/state' --remap /agent_1/state:=/lab/one --start-offset 10 --clock 100",
+        "msg-agents play BAG --topics '/agent_*/state' --start-offset 10 --clock 100",
+        "msg-agents play BAG --remap /agent_1/state:=/lab/one",
     ),
 )
-@click.argument("bag", type=click.Path(path_type=Path))
+@click.argument("bag", type=BAG)
 @click.option(
     "-r",
     "--rate",
     type=_Rate(),
     metavar="RATE",
     default="1",
-    show_default=True,
     help="Seconds of the bag per second; of a network's bag, units of simulated time. max: as fast as readers take it.",
 )
 @click.option(
@@ -68,18 +86,30 @@ class _Rate(click.types.FloatParamType):
     metavar="SECONDS",
     help="Seconds of the bag to leave out at the start.",
 )
-@click.option("--duration", type=float, callback=_positive, help="Seconds of the bag to play; otherwise all.")
+@click.option("--duration", type=PositiveFloat(), metavar="SECONDS", help="Seconds of the bag to play; otherwise all.")
 @click.option("-l", "--loop", is_flag=True, help="Begin again at the end.")
 @click.option("--paused", is_flag=True, help="Stand at first; the space bar starts it.")
 @click.option(
     "--clock",
-    type=float,
-    callback=_positive,
+    type=PositiveFloat(),
     metavar="HZ",
     help="Publish the time of the bag on /clock so often a second.",
 )
-@click.option("--topics", multiple=True, help="Only this topic; or a pattern such as '/agent_*/state'. Repeatable.")
-@click.option("-x", "--exclude", multiple=True, help="Not this topic, or pattern. Repeatable.")
+@click.option(
+    "--topics",
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=_topics_of_bag,
+    help="Only this topic; or a pattern such as '/agent_*/state'. Repeatable.",
+)
+@click.option(
+    "-x",
+    "--exclude",
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=_topics_of_bag,
+    help="Not this topic, or pattern. Repeatable.",
+)
 @click.option(
     "-m", "--remap", "remaps", multiple=True, metavar="OLD:=NEW", help="Another name for a topic. Repeatable."
 )
@@ -93,13 +123,13 @@ class _Rate(click.types.FloatParamType):
 @click.option("--await", "readers", multiple=True, metavar="NODE", help="Begin when NODE reads them. Repeatable.")
 @click.option(
     "--wait-timeout",
-    type=float,
-    callback=_positive,
+    type=PositiveFloat(),
+    metavar="SECONDS",
     default=30.0,
-    show_default=True,
-    help="Seconds to wait for readers.",
+    help="How long to wait for readers [s].",
 )
 @_domain
+@json_option
 def play(
     bag: Path,
     *,
@@ -116,6 +146,7 @@ def play(
     readers: tuple[str, ...],
     wait_timeout: float,
     domain: int | None,
+    as_json: bool,
 ) -> None:
     """Publish the messages of BAG again, a bag of ROS 2 with MCAP storage, in the order in which they were recorded.
 
@@ -154,6 +185,8 @@ def play(
             raise
     held = f"; held back by readers for {played.held_back:.1f} s" if played.held_back >= 0.1 else ""
     click.echo(f"{played.messages} messages played in {played.seconds:.1f} s{held}", err=True)
+    if as_json:
+        print_json({"messages": played.messages, "seconds": played.seconds, "held_back": played.held_back})
 
 
 class _play_bar:  # noqa: N801  used like a function
@@ -240,8 +273,8 @@ def _enter(domain: int | None) -> None:
     is_flag=True,
     help="Miss no state, and hold the network back where that takes too long. By default it never waits.",
 )
-@click.option("--timeout", type=float, callback=_positive, help="Seconds to wait for a network; by default for ever.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, at the end, and nothing else.")
+@_timeout
+@json_option
 @_domain
 def live(*, reliable: bool, timeout: float | None, as_json: bool, domain: int | None) -> None:
     """Watch a network, running or played: its errors up to now beside their prediction.
@@ -296,13 +329,13 @@ def live(*, reliable: bool, timeout: float | None, as_json: bool, domain: int | 
 @click.option(
     "--rate",
     type=click.FloatRange(0, 1000, min_open=True),
+    metavar="HZ",
     default=10.0,
-    show_default=True,
     help="Pictures a second.",
 )
-@click.option("--replica", type=click.IntRange(1), default=1, show_default=True, help="Which of the copies is drawn.")
-@click.option("--frame", default="network", show_default=True, help="Frame of reference: the fixed frame of RViz.")
-@click.option("--timeout", type=float, callback=_positive, help="Seconds to wait for a network; by default for ever.")
+@click.option("--replica", type=click.IntRange(1), metavar="R", default=1, help="Which of the copies is drawn.")
+@click.option("--frame", metavar="FRAME", default="network", help="Frame of reference: the fixed frame of RViz.")
+@_timeout
 @_domain
 def markers(*, rate: float, replica: int, frame: str, timeout: float | None, domain: int | None) -> None:
     """Draw a network, running or played, for RViz and Foxglove: markers on the topic `markers`.

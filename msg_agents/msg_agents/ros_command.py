@@ -26,6 +26,8 @@ class RosCommand(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """See click.Command."""
         ours, ros = split_arguments(args)
+        if ctx.resilient_parsing:  # a shell asks how the line could go on
+            return super().parse_args(ctx, ours)
         if not GIVES_PARAMETERS.intersection(ros):
             rest = super().parse_args(ctx, ours)
         else:

@@ -16,8 +16,8 @@ import msg_analysis
 
 ANALYSIS = Path(msg_analysis.__file__).parent
 AGENTS = Path(msg_agents.__file__).parent
-ROOMS = ["base", "model", "theory", "twin", "bags", "inference", "report", "cli"]
-BASE = {"__init__", "errors", "types", "console"}  # what every room may use
+ROOMS = ["base", "model", "theory", "twin", "bags", "inference", "report", "api", "cli"]
+FRONT_DOOR = "msg_analysis.__init__"
 ROS = ("rclpy", "msg_agents", "rosidl", "ament", "launch")
 
 
@@ -49,6 +49,10 @@ def imported(file: Path) -> Iterator[str]:
 
 def room(name: str) -> str:
     parts = name.split(".")[1:] or ["__init__"]
+    if name == FRONT_DOOR or parts[0] in msg_analysis.__all__:  # what the API gives away under the package's name
+        return "api"
+    if parts == ["__main__"]:
+        return "cli"
     if "twin" in parts[:2]:  # the twin needs the theory for its start
         return "twin"
     top = parts[0].partition("_")[0]  # cli_theory is part of the command line

@@ -70,7 +70,8 @@ def test_every_parameter_is_documented(name: str) -> None:
 
 
 def test_parameters_are_found_by_the_name_of_the_executable() -> None:
-    assert {command.node_name for command in NODES.values()} == {"agent", "switcher", "recorder", "player", "live"}
+    names = {"agent", "switcher", "recorder", "player", "live", "markers"}
+    assert {command.node_name for command in NODES.values()} == names
 
 
 def test_ranges_are_those_of_the_options() -> None:

@@ -25,9 +25,10 @@ from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.order import Order, order_of_nodes
 from msg_analysis.inference.switching import SwitchingTest, switching_test
 from msg_analysis.inference.timing import Timing
+from msg_analysis.markdown import markdown_table, number_text
 from msg_analysis.model.sequential import step_law
 from msg_analysis.model.trajectory import Trajectory
-from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.prediction import SHOWN_AGENTS, Prediction, predict
 from msg_analysis.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ class Test:
     rejected: bool
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Comparison:
     """What ``msg-analysis compare`` says.
 
@@ -99,6 +100,30 @@ class Comparison:
     order: Order | None = None
     blame: Sequence[Cause] = ()
     pool: Pool | None = None
+
+    def __repr__(self) -> str:
+        total, runs = self.system_error, f"{len(self.pool.members)} runs" if self.pool else "run"
+        numbers = f"measured {number_text(total.measured)} +- {number_text(total.standard_error)}"
+        numbers += f", predicted {number_text(total.predicted)}"
+        name = self.trajectory.record.experiment.name
+        return f"<Comparison, {runs} of {name!r}: {self.verdict}; system error {numbers}>"
+
+    def _repr_markdown_(self) -> str:
+        rows = [
+            (
+                name,
+                *map(number_text, (error.measured, error.standard_error, error.predicted)),
+                "-" if error.z is None else f"{error.z:+.2f}",
+            )
+            for name, error in [
+                ("**system**", self.system_error),
+                *((f"agent {i}", node) for i, node in enumerate(self.node_errors[:SHOWN_AGENTS], start=1)),
+            ]
+        ]
+        rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
+        table = markdown_table(("mean-square error", "measured", "standard error", "predicted", "z"), rows)
+        blame = "".join(f"- {cause.words}\n" for cause in self.blame)
+        return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
 
     @property
     def verdict(self) -> Verdict:

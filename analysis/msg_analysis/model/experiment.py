@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from msg_analysis.errors import NotAvailableError
+from msg_analysis.markdown import markdown_table, number_text
 from msg_analysis.model import protocols, validation
 from msg_analysis.model.chain import MarkovChain, Time
 from msg_analysis.model.document import read_yaml
@@ -27,8 +28,11 @@ from msg_analysis.types import FloatArray
 
 __all__ = ["Experiment", "ExperimentError", "json_schema"]
 
+SHOWN_GRAPHS = 4
+"""Most graphs that are named in a line."""
 
-@dataclass(frozen=True, slots=True, eq=False)
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Experiment:
     """A valid experiment. Two are equal if their documents are, the order of the graphs included.
 
@@ -43,11 +47,11 @@ class Experiment:
     """
 
     spec: ExperimentSpec
-    graph_list: tuple[Graph, ...] = field(repr=False)
-    chain: MarkovChain = field(repr=False)
-    noise_gain: FloatArray = field(repr=False)
+    graph_list: tuple[Graph, ...]
+    chain: MarkovChain
+    noise_gain: FloatArray
     source: str = "experiment"
-    protocol: ChosenProtocol | None = field(default=None, repr=False)
+    protocol: ChosenProtocol | None = None
 
     def __eq__(self, other: object) -> bool:
         return (
@@ -58,8 +62,27 @@ class Experiment:
 
     __hash__ = None  # type: ignore[assignment]  # the document has lists in it
 
+    def __repr__(self) -> str:
+        graphs = ", ".join(graph.name for graph in self.graph_list[:SHOWN_GRAPHS])
+        more = ", ..." if len(self.graph_list) > SHOWN_GRAPHS else ""
+        kind = f"{self.problem} of {self.agents} agents in {self.time} time"
+        return f"<Experiment {self.name!r}: {kind}, graphs {graphs}{more}; {self.steps} steps of {self.step_length:g}>"
+
+    def _repr_markdown_(self) -> str:
+        shares = self.chain.stationary
+        rows = [
+            (graph.name, str(len(graph.edges if graph.symmetric else graph.arcs)), number_text(share))
+            for graph, share in zip(self.graph_list, shares, strict=True)
+        ]
+        run = self.run
+        return (
+            f"**{self.name}**: {self.problem} of {self.agents} agents in {self.time} time; {self.steps} steps of "
+            f"{self.step_length:g}, {run.replicas} replicas, seed {run.seed}, {run.pace}\n\n"
+            + markdown_table(("graph", "links", "share of time"), rows)
+        )
+
     @classmethod
-    def load(cls, path: str | Path) -> Experiment:
+    def load(cls, path: str | Path) -> Self:
         """Read an experiment file (YAML; JSON is YAML too).
 
         Raises
@@ -78,7 +101,7 @@ class Experiment:
         source: str = "experiment",
         directory: Path | None = None,
         recorded: ProtocolInfo | None = None,
-    ) -> Experiment:
+    ) -> Self:
         """Check a document and make it an experiment.
 
         Parameters
@@ -108,7 +131,7 @@ class Experiment:
         )
         return experiment._with_protocol(sections.protocol, recorded) if sections.protocol else experiment
 
-    def _with_protocol(self, protocol: ChosenProtocol, recorded: ProtocolInfo | None) -> Experiment:
+    def _with_protocol(self, protocol: ChosenProtocol, recorded: ProtocolInfo | None) -> Self:
         """The same with a protocol that knows its network."""
         bound, found = protocols.bind(protocol, self, recorded)
         experiment = replace(self, protocol=bound)
@@ -126,7 +149,7 @@ class Experiment:
             document["protocol"] = self.spec.protocol.model_dump(mode="json")
         return document
 
-    def with_run(self, **changes: Any) -> Experiment:
+    def with_run(self, **changes: Any) -> Self:
         """The same experiment with other values of ``run``, checked again.
 
         Parameters
@@ -139,7 +162,7 @@ class Experiment:
         """
         document = self.to_document()
         document["run"].update(changes)
-        return Experiment.parse(document, source=self.source)
+        return self.parse(document, source=self.source)
 
     def unavailable(self, purpose: Purpose = "run") -> list[str]:
         """What the experiment asks for that this version does not do yet, one line each.

@@ -39,7 +39,7 @@ class Completeness:
         return self.missing == 0 and self.missing_modes == 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Trajectory:
     """One run, ordered by step.
 
@@ -73,6 +73,14 @@ class Trajectory:
     lost: BoolArray | None = None
     used: IntArray | None = None
     made: IntArray | None = None
+
+    def __repr__(self) -> str:
+        experiment, count = self.record.experiment, self.completeness
+        whole = "complete" if count.complete else f"{count.missing} of {count.expected} states missing"
+        last = len(self.states) - 1
+        states = f"x(0..{last}) of {experiment.agents} agents" if last >= 0 else "no states kept"
+        replicas = f"{experiment.run.replicas} replicas, seed {experiment.run.seed}"
+        return f"<{type(self).__name__} of {experiment.name!r}: {states}, {replicas}; {whole}>"
 
     @property
     def values(self) -> FloatArray:

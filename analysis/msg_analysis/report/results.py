@@ -18,7 +18,8 @@ from scipy import stats
 
 from msg_analysis.errors import InputError
 from msg_analysis.inference.order import Order, order_of
-from msg_analysis.report.tables import number_table, number_text
+from msg_analysis.markdown import markdown_table, number_text
+from msg_analysis.report.tables import number_table
 from msg_analysis.report.verdict_text import order_statements
 
 RESULT_FILE = "result.json"
@@ -211,8 +212,7 @@ def to_csv(rows: Sequence[Result]) -> str:
 def to_markdown(rows: Sequence[Result]) -> str:
     """A table for a text."""
     heads, body = _shown(rows)
-    lines = [heads, ["---"] * 4 + ["---:"] * (len(heads) - 4), *body]
-    return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
+    return markdown_table(heads, body, names=4)
 
 
 def print_results(rows: Sequence[Result], level: float, console: Console) -> None:

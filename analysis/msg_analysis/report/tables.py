@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from msg_analysis.markdown import number_text as number_text
+
 ROWS = 30
 """Most rows of a table; --json has them all."""
 
@@ -36,11 +38,6 @@ def note_cut(table: Table, total: int, what: str) -> None:
     """Say how many rows of the total are not shown."""
     if total > ROWS:
         table.caption = f"{total - ROWS} more {what}: use --json"
-
-
-def number_text(value: float | None) -> str:
-    """Six digits; a dash for what is undefined."""
-    return "-" if value is None else f"{value:.6g}"
 
 
 def z_text(value: float | None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -19,11 +20,11 @@ from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.system import JumpSystem
-from msg_analysis.theory.transient import point_start, start_of, transient, unreduced_consensus
+from msg_analysis.theory.transient import Transient, point_start, start_of, transient, unreduced_consensus
 from msg_analysis.theory.two_topology import two_topology
 from msg_analysis.types import FloatArray
 
-Law = Literal["emulated", "continuous"]
+TransientLaw = Literal["emulated", "continuous"]
 Result = TypeVar("Result")
 
 
@@ -54,7 +55,7 @@ def describe_transient(
     experiment: Experiment,
     times: FloatArray,
     *,
-    law: Law = "emulated",
+    law: TransientLaw = "emulated",
     unreduced: bool = False,
     moments: bool = False,
     fraction: float = 0.05,
@@ -74,19 +75,8 @@ def describe_transient(
     ------
     InputError : times that are no whole steps, a law that does not exist here, or too large
     """
-    system, unit = _system(experiment, law)
-    steady = MomentSolver(system).steady()
-    if unreduced:
-        if experiment.problem != "consensus":
-            raise InputError("--unreduced: expected problem: consensus, since tracking reduces nothing: leave it out")
-        if unit is None:
-            whole = unreduced_consensus(experiment)
-        else:
-            whole = systems.emulated(build_run_model(experiment), "tracking")
-        start = start_of(experiment, whole, system.lift @ steady @ system.lift.T)
-        found = transient(whole, start, _steps(times, unit))
-    else:
-        found = transient(system, start_of(experiment, system, steady), _steps(times, unit), steady)
+    solved = solve_transient(experiment, times, law=law, unreduced=unreduced)
+    found = solved.course
     document: dict[str, Any] = {
         "law": "discrete" if experiment.time == "discrete" else law,
         "unreduced": unreduced,
@@ -99,14 +89,72 @@ def describe_transient(
     document |= dict(
         zip(_mean_squares(document), (found.system_error.tolist(), found.node_errors.tolist()), strict=True)
     )
-    document |= _settling(experiment, system, steady, unit or 1.0, fraction)
+    document |= _settling(experiment, solved.system, solved.steady, solved.unit or 1.0, fraction)
     if moments:
         document["mode_means"] = found.mode_means.tolist()
         document["mode_second_moments"] = found.mode_second_moments.tolist()
     return document
 
 
-def _system(experiment: Experiment, law: Law) -> tuple[JumpSystem, float | None]:
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedTransient:
+    """Moments over time, and what they were computed with.
+
+    Attributes
+    ----------
+    course
+        the moments
+    system
+        the reduced system of the law
+    steady
+        (n, d, d) its steady second moments
+    unit
+        time of a step [units of simulated time]; None in continuous time
+    """
+
+    course: Transient
+    system: JumpSystem
+    steady: FloatArray
+    unit: float | None
+
+
+def solve_transient(
+    experiment: Experiment, times: FloatArray, *, law: TransientLaw = "emulated", unreduced: bool = False
+) -> SolvedTransient:
+    """Moments over time from the experiment's start.
+
+    Parameters
+    ----------
+    experiment
+        with its start in ``run.start`` and ``switching.initial``
+    times
+        (T,) ascending [units of simulated time]
+    law
+        "emulated" (the steps of the run) or "continuous"
+    unreduced
+        consensus only: the states themselves, whose second moments grow without bound
+
+    Raises
+    ------
+    InputError
+        times that are no whole steps, a law that does not exist here, or too large
+    """
+    system, unit = _system(experiment, law)
+    steady = MomentSolver(system).steady()
+    if not unreduced:
+        found = transient(system, start_of(experiment, system, steady), _steps(times, unit), steady)
+        return SolvedTransient(found, system, steady, unit)
+    if experiment.problem != "consensus":
+        raise InputError("--unreduced: expected problem: consensus, since tracking reduces nothing: leave it out")
+    if unit is None:
+        whole = unreduced_consensus(experiment)
+    else:
+        whole = systems.emulated(build_run_model(experiment), "tracking")
+    start = start_of(experiment, whole, system.lift @ steady @ system.lift.T)
+    return SolvedTransient(transient(whole, start, _steps(times, unit)), system, steady, unit)
+
+
+def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, float | None]:
     """The reduced system of a law, and the time of a step (None in continuous time)."""
     if law == "emulated":
         return systems.emulated(build_run_model(experiment), experiment.problem), experiment.step_length

@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse.csgraph
 
 from msg_analysis.errors import InputError
+from msg_analysis.markdown import markdown_table, number_text
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.sequential import build_run_model
 from msg_analysis.model.spec import LeadersSpec
@@ -124,7 +125,7 @@ class LeaderProblem:
         return systems.emulated(build_run_model(led), "tracking")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Selection:
     """Result of a leader selection.
 
@@ -144,6 +145,15 @@ class Selection:
     order: tuple[int, ...]
     evaluations: int
     bound: float | None
+
+    def __repr__(self) -> str:
+        error, agents = self.sets[0]
+        best = f"agents {', '.join(str(agent + 1) for agent in agents)} with system error {error:.6g}"
+        return f"<Selection for {self.problem.experiment.name!r}: {best}; {self.method}, {self.evaluations} evaluated>"
+
+    def _repr_markdown_(self) -> str:
+        rows = [(", ".join(str(agent + 1) for agent in agents), number_text(error)) for error, agents in self.sets]
+        return markdown_table(("leaders", "system error"), rows)
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis leaders --json``."""

@@ -12,6 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from msg_analysis.errors import InputError
+from msg_analysis.markdown import markdown_table, number_text
 from msg_analysis.model.sequential import StepLaw, build_run_model, step_law
 from msg_analysis.model.step import StepModel, build_step_model
 from msg_analysis.theory import system as systems
@@ -27,11 +28,14 @@ if TYPE_CHECKING:
 ROUNDING = 1e-14
 """Node errors below this, relative to the largest one, are rounding."""
 
+SHOWN_AGENTS = 30
+"""Most agents in a notebook's table; the arrays have all of them."""
+
 WEAK_NOISE = 1e-6
 """Directions with less noise than this, relative to the noisiest one, do not show whether steps are stable."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Moments:
     """Steady second moments of the agents.
 
@@ -51,6 +55,9 @@ class Moments:
     solver: SolverReport | None = None
     law: StepLaw | None = None
 
+    def __repr__(self) -> str:
+        return f"<Moments of {len(self.covariance)} agents: system error {self.system_error:.6g}>"
+
     @property
     def node_errors(self) -> FloatArray:
         """(m,) E_i."""
@@ -62,13 +69,24 @@ class Moments:
         """E, the sum of the node errors."""
         return float(np.trace(self.covariance))
 
+    @property
+    def system_certainty(self) -> float:
+        """1/E, inf without noise (the paper's certainty index of the system)."""
+        return 1.0 / self.system_error if self.system_error > 0.0 else math.inf
+
+    @property
+    def node_certainty(self) -> FloatArray:
+        """(m,) 1/E_i, inf where there is no error (the paper's node certainty index)."""
+        errors = self.node_errors
+        return np.asarray(np.divide(1.0, errors, out=np.full(len(errors), math.inf), where=errors > 0.0))
+
     def to_json(self) -> dict[str, Any]:
         """The document of one law; what is infinite or undefined is None."""
         document: dict[str, Any] = {
             "system_error": _finite(self.system_error),
             "node_errors": [_finite(e) for e in self.node_errors],
-            "system_certainty": _inverse(self.system_error),
-            "node_certainty": [_inverse(e) for e in self.node_errors],
+            "system_certainty": _finite(self.system_certainty),
+            "node_certainty": [_finite(c) for c in self.node_certainty],
             "covariance": self.covariance.tolist(),
         }
         if self.law is not None:
@@ -80,7 +98,7 @@ class Moments:
         return document
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Prediction:
     """Everything ``msg-analysis predict`` says, and what a comparison needs.
 
@@ -106,6 +124,24 @@ class Prediction:
     emulated: Moments
     continuous: Moments | None
     static: Moments | None
+
+    def _laws(self) -> dict[str, Moments]:
+        """What there is, by name in a text."""
+        steps = "steps in turn" if self.emulated.law == "sequential" else "steps of the run"
+        laws = {steps: self.emulated, "continuous time": self.continuous, "graphs held for ever": self.static}
+        return {name: law for name, law in laws.items() if law is not None}
+
+    def __repr__(self) -> str:
+        errors = ", ".join(f"{law.system_error:.6g} ({name})" for name, law in self._laws().items())
+        return f"<Prediction of {self.experiment.name!r}: system error {errors}>"
+
+    def _repr_markdown_(self) -> str:
+        laws = self._laws()
+        rows = [("**system**", *(number_text(law.system_error) for law in laws.values()))]
+        shown = min(self.experiment.agents, SHOWN_AGENTS)
+        rows += [(f"agent {i + 1}", *(number_text(law.node_errors[i]) for law in laws.values())) for i in range(shown)]
+        rows += [("...", *("" for _ in laws))] * (shown < self.experiment.agents)
+        return "Mean-square error in the steady state\n\n" + markdown_table(("", *laws), rows)
 
     @property
     def system(self) -> JumpSystem:
@@ -245,7 +281,3 @@ def _holds_together(experiment: Experiment, mode: int) -> bool:
 
 def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
-
-
-def _inverse(value: float) -> float | None:
-    return _finite(1.0 / value) if value > 0.0 else None

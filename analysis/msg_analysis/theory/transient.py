@@ -51,7 +51,7 @@ class Snapshot:
     moments: FloatArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Transient:
     """Moments over time.
 
@@ -69,6 +69,11 @@ class Transient:
     laws: FloatArray
     means: FloatArray
     moments: FloatArray
+
+    def __repr__(self) -> str:
+        errors, times = self.system_error, self.times
+        course = f"{errors[0]:.6g} at {times[0]:g} to {errors[-1]:.6g} at {times[-1]:g}"
+        return f"<Transient of {len(self.system.output)} agents, {len(times)} times: system error {course}>"
 
     @property
     def mean(self) -> FloatArray:

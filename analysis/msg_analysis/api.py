@@ -1,0 +1,368 @@
+"""The Python API: experiments, runs and comparisons for scripts and notebooks.
+
+Everything here can be imported from ``msg_analysis`` itself, and the command line stands on it. Agents and graphs count
+from 0 in arrays and arguments, and from 1 in files and texts.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from msg_analysis.bags.reader import read_bag as read_trajectory
+from msg_analysis.bags.storage import DEFAULT, Storage
+from msg_analysis.bags.store import write_trajectory
+from msg_analysis.errors import BagError, InputError, NotAvailableError
+from msg_analysis.files import require_place
+from msg_analysis.inference.compare import Comparison
+from msg_analysis.inference.compare import compare as compare_trajectory
+from msg_analysis.inference.pool import compare_pooled
+from msg_analysis.model import experiment as model
+from msg_analysis.model.problems import ExperimentError
+from msg_analysis.model.record import RunRecord
+from msg_analysis.model.trajectory import Trajectory
+from msg_analysis.report.theory import TransientLaw, solve_transient
+from msg_analysis.theory.leader_search import Watch, ignore
+from msg_analysis.theory.leaders import Law, Method, Selection, select_leaders
+from msg_analysis.theory.prediction import Moments, Prediction, predict
+from msg_analysis.theory.transient import Transient
+from msg_analysis.twin import simulate
+from msg_analysis.types import FloatArray
+
+__all__ = [
+    "BagError",
+    "Comparison",
+    "Experiment",
+    "ExperimentError",
+    "InputError",
+    "Moments",
+    "NotAvailableError",
+    "Prediction",
+    "Run",
+    "Selection",
+    "Transient",
+    "compare",
+    "read_bag",
+    "write_report",
+]
+
+
+class Experiment(model.Experiment):
+    """A Markov switching network and a run of it, with what can be done with it.
+
+    Make one with :meth:`load` (a file) or :meth:`parse` (a dictionary); change its run with :meth:`with_run`.
+    """
+
+    __slots__ = ()
+
+    @classmethod
+    def of(cls, experiment: model.Experiment) -> Self:
+        """The same experiment with the methods of this class.
+
+        Parameters
+        ----------
+        experiment
+            checked already, such as that of a recorded run
+
+        Returns
+        -------
+        Experiment
+            the same object where it is one already
+        """
+        return experiment if isinstance(experiment, cls) else cls(**_fields(experiment))
+
+    def predict(self) -> Prediction:
+        """The steady second moments, exactly; see :func:`msg_analysis.theory.prediction.predict`.
+
+        Returns
+        -------
+        Prediction
+            ``emulated`` (what the run's steps do), ``continuous`` (the paper's law) and ``static`` (the graphs held for
+            ever), each with ``system_error``, ``node_errors`` (m,), ``node_certainty`` (m,) and ``covariance`` (m, m)
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for what cannot be predicted
+        InputError
+            too large, or no steady errors
+        """
+        self.require_available("predict")
+        return predict(self)
+
+    def transient(self, times: ArrayLike, *, law: TransientLaw = "emulated", unreduced: bool = False) -> Transient:
+        """The moments over time from the experiment's own start, exactly.
+
+        Parameters
+        ----------
+        times
+            (T,) ascending [units of simulated time]; whole steps of ``run.dt`` in the emulated law
+        law
+            "emulated" (the steps of the run), or "continuous" (the paper's)
+        unreduced
+            consensus: of the states themselves, whose second moments grow, not of the disagreement
+
+        Returns
+        -------
+        Transient
+            ``times`` as given, ``system_error`` (T,), ``node_errors`` (T, m), ``mean`` (T, m)
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for what cannot be predicted
+        InputError
+            times that are no whole steps, a law that does not exist here, or too large
+        """
+        self.require_available("predict")
+        given = np.asarray(times, dtype=float)
+        return dataclasses.replace(solve_transient(self, given, law=law, unreduced=unreduced).course, times=given)
+
+    def simulate(
+        self, *, seed: int | None = None, duration: float | None = None, record: RunRecord | None = None
+    ) -> Run:
+        """Run the experiment without ROS: the offline twin of a network.
+
+        Parameters
+        ----------
+        seed
+            instead of ``run.seed``
+        duration
+            instead of ``run.duration`` [units of simulated time]
+        record
+            of the run to repeat; a new one by default. With it, ``seed`` and ``duration`` are those of the record
+
+        Returns
+        -------
+        Run
+            the same, to the last bit, as a network run in lockstep
+
+        Raises
+        ------
+        ExperimentError
+            the seed or the duration is not valid
+        NotAvailableError
+            the experiment asks for what runs do not have yet
+        InputError
+            no stationary start, since there is no prediction
+        """
+        changes = {key: value for key, value in {"seed": seed, "duration": duration}.items() if value is not None}
+        experiment = self.with_run(**changes) if changes else self
+        experiment.require_available()
+        return Run.of(simulate(experiment, record=record))
+
+    def select_leaders(
+        self,
+        count: int,
+        *,
+        method: Method = "auto",
+        law: Law | None = None,
+        gain: float = math.inf,
+        top: int = 10,
+        watch: Watch = ignore,
+    ) -> Selection:
+        """The best leaders for the network, by joint robustness centrality; leaders that it has do not count.
+
+        Parameters
+        ----------
+        count
+            number of leaders
+        method
+            "auto" (exhaustive where there are few sets, else swap), "exhaustive", "greedy" or "swap"
+        law
+            "continuous" (the paper's), "emulated" or "discrete"; by default the paper's where there is one
+        gain
+            pull of the leaders [1 / unit of simulated time]; inf holds them at the reference
+        top
+            how many sets to keep
+        watch
+            is told how far the search is
+
+        Returns
+        -------
+        Selection
+            ``sets``: (system error, agents from 0), best first
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for what cannot be predicted
+        InputError
+            an impossible count, gain or law, too many sets, or none that reaches everybody
+        """
+        self.require_available("predict")
+        return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Run(Trajectory):
+    """A run of an experiment, of a network or of the twin: states and graphs of every step.
+
+    Its arrays are those of :class:`msg_analysis.model.trajectory.Trajectory`; NaN and -1 stand where something is
+    missing, of which ``completeness`` keeps the account.
+    """
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Self:
+        """The same run with the methods of this class.
+
+        Parameters
+        ----------
+        trajectory
+            of a bag or of the twin; the arrays are shared, not copied
+        """
+        return trajectory if isinstance(trajectory, cls) else cls(**_fields(trajectory))
+
+    @property
+    def experiment(self) -> Experiment:
+        """What was run."""
+        return Experiment.of(self.record.experiment)
+
+    @property
+    def times(self) -> FloatArray:
+        """(N + 1,) simulated time of the states x(0), ..., x(N) [units of simulated time]."""
+        return np.asarray(np.arange(len(self.states)) * self.record.experiment.step_length, dtype=float)
+
+    def compare(self, *, level: float = 0.01) -> Comparison:
+        """Compare the run with what theory predicts for it; see :func:`compare`.
+
+        Parameters
+        ----------
+        level
+            chance of a false "disagrees", all tests together
+
+        Raises
+        ------
+        InputError
+            the level is no chance, or there is no prediction (too large, or without bounds)
+        """
+        return compare(self, level=level)
+
+    def save(self, directory: str | Path, storage: Storage = DEFAULT) -> Path:
+        """Write the run as a bag with the topics and the layout of a network's.
+
+        Parameters
+        ----------
+        directory
+            of the bag; must not exist
+        storage
+            compression and size of its files
+
+        Returns
+        -------
+        Path
+            the directory
+
+        Raises
+        ------
+        BagError
+            the directory exists or cannot be written
+        """
+        write_trajectory(self, directory, storage)
+        return Path(directory)
+
+
+def read_bag(path: str | Path) -> Run:
+    """The run that a bag holds, whoever recorded it: whole, torn or damaged.
+
+    Parameters
+    ----------
+    path
+        directory of a bag, or one of its .mcap files
+
+    Returns
+    -------
+    Run
+        ``states`` (N + 1, m, replicas), ``modes`` (N,), ``times`` (N + 1,), and ``completeness``
+
+    Raises
+    ------
+    BagError
+        no bag, a bag without the run record, or with several runs
+    InputError
+        the run record in it is not valid
+    """
+    return Run.of(read_trajectory(path))
+
+
+def compare(*runs: Trajectory | str | Path, level: float = 0.01) -> Comparison:
+    """Compare a run, or several of one experiment, with what theory predicts.
+
+    Parameters
+    ----------
+    *runs
+        runs, or paths of their bags, which are read one after the other; several need different seeds, and get one
+        verdict together
+    level
+        chance of a false "disagrees", all tests together; above 0, 0.5 at most
+
+    Returns
+    -------
+    Comparison
+        ``verdict``, ``system_error``, ``node_errors``, ``covariance``, ``tests``, ``blame`` and more
+
+    Raises
+    ------
+    InputError
+        no run, a level that is no chance, runs that do not belong together, or no prediction (too large, or without
+        bounds)
+    BagError
+        a path that holds no run
+    """
+    if not runs:
+        raise InputError("no run: give at least one, or the path of its bag")
+    if not 0.0 < level <= 0.5:
+        raise InputError(f"level: {level:g}: expected a chance above 0, 0.5 at most")
+    if len(runs) == 1:
+        return compare_trajectory(_read(runs[0]), level=level)
+    absent = [str(path) for path in runs if not isinstance(path, Trajectory) and not Path(path).exists()]
+    if absent:
+        raise InputError(f"{', '.join(absent)}: not found: expected bags, {len(runs)} were given")
+    named = ((_name(run, place), _read(run)) for place, run in enumerate(runs, start=1))
+    return compare_pooled(named, level=level)
+
+
+def write_report(comparison: Comparison, file: str | Path, **options: Any) -> Path:
+    """Write a comparison as one HTML page that needs nothing else.
+
+    Parameters
+    ----------
+    comparison
+        of :func:`compare`
+    file
+        to be written; replaced where it exists
+    **options
+        see :func:`msg_analysis.report.html.write_report`
+
+    Returns
+    -------
+    Path
+        the file
+
+    Raises
+    ------
+    InputError
+        the file cannot be written
+    """
+    from msg_analysis.report.html import write_report as write_html  # here: it draws, and few want that
+
+    require_place(Path(file))
+    write_html(comparison, comparison.trajectory, Path(file), **options)
+    return Path(file)
+
+
+def _read(run: Trajectory | str | Path) -> Trajectory:
+    return run if isinstance(run, Trajectory) else read_trajectory(run)
+
+
+def _name(run: Trajectory | str | Path, place: int) -> str:
+    return f"run {place}" if isinstance(run, Trajectory) else str(run)
+
+
+def _fields(instance: Any) -> dict[str, Any]:
+    return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}

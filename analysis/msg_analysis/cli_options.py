@@ -1,0 +1,119 @@
+"""What the commands' arguments and options have in common: one name, one metavar, one way to be completed each."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from click.shell_completion import CompletionItem
+
+_PLAIN = re.compile(r"[\w./~+,:@%=-]*")  # what a shell takes as it stands
+
+
+class InputPath(click.Path):
+    """The path of a file of ours; a shell completes it to such files and to directories.
+
+    Parameters
+    ----------
+    *suffixes
+        of the files, such as ".yaml"
+    holds
+        a directory with one of these in it (names or patterns) counts as a file
+    """
+
+    def __init__(self, *suffixes: str, holds: Sequence[str] = ()) -> None:
+        super().__init__(path_type=Path)
+        self._suffixes = suffixes
+        self._holds = tuple(holds)
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """See click.ParamType."""
+        del ctx, param
+        found = _paths(incomplete, self._is_wanted)
+        if not all(_PLAIN.fullmatch(path) for path in found):
+            return [CompletionItem(incomplete, type="file")]  # the shell itself knows best how to quote
+        return [CompletionItem(path) for path in found]
+
+    def _is_wanted(self, path: Path) -> bool:
+        if path.is_dir():
+            return any(next(path.glob(pattern), None) for pattern in self._holds)
+        return path.name.endswith(self._suffixes)
+
+
+def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:
+    """What begins like this; an only answer, which a shell puts a blank behind, is no directory if it can be helped."""
+    begin = incomplete.rfind("/") + 1
+    head, start = incomplete[:begin], incomplete[begin:]
+    found = []
+    try:
+        for entry in sorted(Path(head or ".").expanduser().iterdir()):
+            if not entry.name.startswith(start) or (entry.name.startswith(".") and not start):
+                continue
+            if wanted(entry):
+                found.append(head + entry.name)
+            elif entry.is_dir():
+                found.append(f"{head}{entry.name}/")
+    except (OSError, RuntimeError):  # not ours to read; a home that nobody has
+        return []
+    return found + _paths(found[0], wanted) if len(found) == 1 and found[0].endswith("/") else found
+
+
+EXPERIMENT = InputPath(".yaml", ".yml", ".json")
+BAG = InputPath(".mcap", ".mcap.zstd", holds=("metadata.yaml", "*.mcap"))
+RESULT = InputPath(".json", holds=("result.json",))
+RUN_RECORD = InputPath(".json")
+PATH = click.Path(path_type=Path)
+FILE = click.Path(dir_okay=False, path_type=Path)
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+experiment_argument = click.argument("experiment", type=EXPERIMENT)
+seed_option = click.option("--seed", type=int, metavar="N", help="Instead of run.seed.")
+duration_option = click.option(
+    "--duration", type=float, metavar="T", help="Instead of run.duration, in units of simulated time."
+)
+
+
+class PositiveFloat(click.FloatRange):
+    """A finite number above 0."""
+
+    def __init__(self) -> None:
+        super().__init__(min=0, min_open=True)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """See click.ParamType."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):  # a range lets nan through
+            self.fail(f"{number}: expected a positive number", param, ctx)
+        return number
+
+
+def level_option(what: str) -> Callable[..., Any]:
+    """The option ``--level``.
+
+    Parameters
+    ----------
+    what
+        is held to that chance
+    """
+
+    def checked(_context: click.Context, _option: click.Parameter, value: float) -> float:
+        if not 0.0 < value <= 0.5:
+            raise click.BadParameter(f"{value:g}: expected a chance above 0, 0.5 at most")
+        return value
+
+    return click.option("--level", type=float, metavar="P", callback=checked, default=0.01, help=what)
+
+
+def suggest(*words: str) -> Callable[..., list[CompletionItem]]:
+    """For ``shell_complete``: words that a shell offers, among others that are allowed.
+
+    Parameters
+    ----------
+    *words
+        to offer
+    """
+    return lambda _context, _option, incomplete: [CompletionItem(w) for w in words if w.startswith(incomplete)]
