@@ -10,11 +10,14 @@ from xml.etree import ElementTree
 from latex2mathml.converter import convert
 from mkdocs.exceptions import PluginError
 
+ElementTree.register_namespace("", "http://www.w3.org/1998/Math/MathML")
+
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
     from mkdocs.structure.pages import Page
 
+OPENING = frozenset("([{=<>≤≥⪯,;|→↦")  # after these a minus is a sign, not a difference
 # What pymdownx.arithmatex leaves with `generic: true`.
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 
@@ -32,12 +35,27 @@ def on_page_content(html: str, /, *, page: Page, config: MkDocsConfig, files: Fi
         block = match[2] == "["
         mathml = convert(latex, display="block" if block else "inline")
         try:
-            unknown = "\\" in "".join(ElementTree.fromstring(mathml).itertext())
-        except ElementTree.ParseError:
-            unknown = True
-        if unknown:
-            raise PluginError(f"{page.file.src_uri}: cannot draw the equation {latex}")
+            tree = ElementTree.fromstring(mathml)
+        except ElementTree.ParseError as error:
+            raise PluginError(f"{page.file.src_uri}: cannot draw the equation {latex}: {error}") from error
+        if "\\" in "".join(tree.itertext()):
+            raise PluginError(f"{page.file.src_uri}: unknown command in the equation {latex}")
+        set_spaces(tree)
+        mathml = ElementTree.tostring(tree, encoding="unicode")
         # The letters of an equation, one by one, are nothing to search for.
         return f'<div class="equation" data-search-exclude>{mathml}</div>' if block else mathml
 
     return EQUATION.sub(drawn, html)
+
+
+def set_spaces(tree: ElementTree.Element) -> None:
+    """Space signs and infinity as letters: browsers would space them as operators between two operands."""
+    for parent in tree.iter():
+        before = None
+        for child in parent:
+            if child.tag.endswith("mo") and child.text == "∞":
+                child.tag = child.tag[:-1] + "i"
+            elif child.tag.endswith("mo") and child.text in {"−", "+"} and parent.tag.endswith(("mrow", "mtd")):
+                if before is None or (before.tag.endswith("mo") and before.text in OPENING):
+                    child.set("form", "prefix")
+            before = child
