@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 
 import matplotlib as mpl
@@ -49,7 +50,7 @@ def picture(run: Trajectory) -> Figure:
     times = experiment.run.dt * np.arange(shown + 1)
     axes = figure.add_subplot(grid[0, 1])
     changes = [0, *(np.flatnonzero(np.diff(run.modes[:shown])) + 1), shown]
-    for first, behind in zip(changes[:-1], changes[1:], strict=True):
+    for first, behind in itertools.pairwise(changes):
         axes.axvspan(times[first], times[behind], color=colours[run.modes[first]][0], linewidth=0)
     values = run.values[: shown + 1, :, 0]
     for agent, colour in zip(range(experiment.agents), COLOURS, strict=False):

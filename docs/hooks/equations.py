@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from html import unescape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 from latex2mathml.converter import convert
@@ -13,16 +13,15 @@ from mkdocs.exceptions import PluginError
 ElementTree.register_namespace("", "http://www.w3.org/1998/Math/MathML")
 
 if TYPE_CHECKING:
-    from mkdocs.config.defaults import MkDocsConfig
-    from mkdocs.structure.files import Files
     from mkdocs.structure.pages import Page
 
+SIGNS = frozenset("−+")
 OPENING = frozenset("([{=<>≤≥⪯,;|→↦")  # after these a minus is a sign, not a difference
 # What pymdownx.arithmatex leaves with `generic: true`.
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 
 
-def on_page_content(html: str, /, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_content(html: str, /, *, page: Page, **_: Any) -> str:
     """Draw the equations of a page.
 
     Raises
@@ -53,9 +52,10 @@ def set_spaces(tree: ElementTree.Element) -> None:
     for parent in tree.iter():
         before = None
         for child in parent:
-            if child.tag.endswith("mo") and child.text == "∞":
-                child.tag = child.tag[:-1] + "i"
-            elif child.tag.endswith("mo") and child.text in {"−", "+"} and parent.tag.endswith(("mrow", "mtd")):
-                if before is None or (before.tag.endswith("mo") and before.text in OPENING):
-                    child.set("form", "prefix")
+            operator = child.tag.endswith("}mo")
+            begins = before is None or (before.tag.endswith("}mo") and before.text in OPENING)
+            if operator and child.text == "∞":
+                child.tag = child.tag.removesuffix("mo") + "mi"
+            elif operator and child.text in SIGNS and begins and parent.tag.endswith(("}mrow", "}mtd")):
+                child.set("form", "prefix")
             before = child
