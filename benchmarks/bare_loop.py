@@ -145,7 +145,8 @@ def measure(
 
     Parameters
     ----------
-    batch, pin : batch scheduling, and one core for each process, both of which the real network chooses itself
+    batch, pin
+        batch scheduling, and one core for each process, both of which the real network chooses itself
     """
     common = f"--agents {agents} --processes {processes} --steps {steps} --replicas {replicas}"
     roles = [f"--worker {w}" for w in range(processes)] + (["--worker -1"] if recorder else [])

@@ -29,8 +29,10 @@ class Usage:
 
     Attributes
     ----------
-    user, system : s of CPU time
-    switches : from one process to another, of all its threads
+    user, system
+        s of CPU time
+    switches
+        from one process to another, of all its threads
     """
 
     user: float
@@ -68,8 +70,10 @@ def watch(run: Callable[..., float], guess: int) -> None:
 
     Parameters
     ----------
-    run : makes ``steps`` steps, gives steps per second
-    guess : steps per second
+    run
+        makes ``steps`` steps, gives steps per second
+    guess
+        steps per second
     """
     looks: list[dict[str, Usage]] = []
 

@@ -46,11 +46,16 @@ def run(
 
     Parameters
     ----------
-    late : how long after it is due an agent's timer fires [periods]; what has become due meanwhile is caught up
-    slow : how long a state is under way to each neighbour [periods]
-    switch : how long a switch of the graph is under way to each agent [periods]
-    timing_seed : of all this
-    truth : what the agents really do, given what they should
+    late
+        how long after it is due an agent's timer fires [periods]; what has become due meanwhile is caught up
+    slow
+        how long a state is under way to each neighbour [periods]
+    switch
+        how long a switch of the graph is under way to each agent [periods]
+    timing_seed
+        of all this
+    truth
+        what the agents really do, given what they should
     """
     random = np.random.default_rng(timing_seed)
     record = new_record(experiment)

@@ -34,10 +34,14 @@ class Point:
 
     Attributes
     ----------
-    agents, processes : of the network; switcher and recorder have one more process each
-    start : s
-    memory : bytes
-    rate : steps per second
+    agents, processes
+        of the network; switcher and recorder have one more process each
+    start
+        s
+    memory
+        bytes
+    rate
+        steps per second
     """
 
     agents: int

@@ -105,7 +105,7 @@ def simulate(
 @main.command(
     epilog=examples(
         "msg-analysis leaders line_ring.yaml --count 2",
-        "msg-analysis leaders line_ring.yaml --count 2 --gain 0.5 --json | jq .sets[0].agents",
+        "msg-analysis leaders line_ring.yaml --count 2 --gain 0.5 --json",
     )
 )
 @experiment_argument
@@ -114,7 +114,7 @@ def simulate(
     "--method",
     type=click.Choice(["auto", "exhaustive", "greedy", "swap"]),
     default="auto",
-    help="auto: exhaustive where there are at most 1000 sets, else swap.",
+    help="How to search; auto: exhaustive where there are at most 1000 sets, else swap.",
 )
 @click.option(
     "--law",

@@ -14,7 +14,7 @@ from msg_analysis.files import require_place
 @click.command(
     epilog=examples(
         "msg-analysis transient line_ring.yaml --times 0:10:0.5",
-        "msg-analysis transient line_ring.yaml --times 0,1,10 --law continuous --json | jq .settling",
+        "msg-analysis transient line_ring.yaml --times 0,1,10 --law continuous",
     )
 )
 @experiment_argument

@@ -6,6 +6,7 @@ import errno
 import json
 import math
 import os
+import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 BAD_INPUT = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
-NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+NOT_WRITTEN = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF}
 
 
 class CommandGroup(click.Group):
@@ -67,11 +68,10 @@ def _exit_codes() -> Iterator[None]:
     except OSError as error:
         if error.filename is not None:
             complain(f"{error.filename}: {error.strerror}")
-        elif _stdout_fails():
+        elif error.errno in NOT_WRITTEN:
+            place = "stdout" if _stdout_can_fail() else "a file"
             _drop_stdout()
-            complain(f"stdout: {error.strerror}: the result could not be printed")
-        elif error.errno in NO_ROOM:
-            complain(f"a file could not be written: {error.strerror}")
+            complain(f"{place}: {error.strerror}: the result could not be written")
         else:
             raise
         raise Exit(BAD_INPUT) from error
@@ -95,12 +95,15 @@ def _open_closed_streams() -> None:
                 sys.stderr = os.fdopen(2, "w")
 
 
-def _stdout_fails() -> bool:
+def _stdout_can_fail() -> bool:
+    """Whether an error without a name is that of stdout: our files have names, pipes and terminals are never full."""
     try:
-        sys.stdout.flush()
-    except OSError:
-        return True
-    return False
+        number = sys.stdout.fileno()
+        return stat.S_ISREG(os.fstat(number).st_mode) or (
+            stat.S_ISCHR(os.fstat(number).st_mode) and not os.isatty(number)
+        )
+    except (OSError, ValueError):  # a stream without a file, in tests
+        return False
 
 
 def _drop_stdout() -> None:

@@ -275,8 +275,8 @@ def prepare(experiment: Path) -> None:
 
 @main.command(
     epilog=examples(
-        "msg-agents prepare line_ring.yaml > run.json    # once; give every host run.json and hosts.yaml",
-        "msg-agents host run.json hosts.yaml             # on every host",
+        "msg-agents prepare line_ring.yaml > run.json   # once; copy it to all hosts",
+        "msg-agents host run.json hosts.yaml            # on every host",
     )
 )
 @click.argument("run_record", type=RUN_RECORD)

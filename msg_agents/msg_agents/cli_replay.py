@@ -265,7 +265,8 @@ def _enter(domain: int | None) -> None:
     cls=RosCommand,
     epilog=examples(
         "msg-agents live --domain 42",
-        "msg-agents live --reliable --json    # then, elsewhere: msg-agents play BAG --rate max --await live",
+        "msg-agents live --reliable --json    # misses nothing of:",
+        "msg-agents play BAG --await live",
     ),
 )
 @click.option(

@@ -16,7 +16,8 @@ class RosCommand(click.Command):
 
     Parameters
     ----------
-    node_name : by which parameters are found, where they are given to a certain node; the command's name by default
+    node_name
+        by which parameters are found, where they are given to a certain node; the command's name by default
     """
 
     def __init__(self, *args: Any, node_name: str | None = None, **options: Any) -> None:
@@ -26,7 +27,9 @@ class RosCommand(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """See click.Command."""
         ours, ros = split_arguments(args)
-        if ctx.resilient_parsing:  # a shell asks how the line could go on
+        if ctx.resilient_parsing:  # a shell asks how the line could go on, perhaps behind an option without its value
+            while ours and ours[-1].startswith("-"):
+                ours.pop()
             return super().parse_args(ctx, ours)
         if not GIVES_PARAMETERS.intersection(ros):
             rest = super().parse_args(ctx, ours)

@@ -33,7 +33,8 @@ def parse_times(text: str) -> FloatArray:
 
     Raises
     ------
-    InputError : neither of them
+    InputError
+        neither of them
     """
     wanted = "expected START:STOP:STEP or t1,t2,..., ascending numbers >= 0: for example 0:10:0.5"
     try:
@@ -64,16 +65,23 @@ def describe_transient(
 
     Parameters
     ----------
-    experiment : with its start in ``run.start`` and ``switching.initial``
-    times : (T,) ascending [units of time]
-    law : "emulated" (the steps of the run; "discrete" in discrete time) or "continuous"
-    unreduced : consensus only: the states themselves, whose second moments grow without bound
-    moments : whether nu(t) and c(t) of every mode are in the document too
-    fraction : of the steady system error, for the settling time
+    experiment
+        with its start in ``run.start`` and ``switching.initial``
+    times
+        (T,) ascending [units of time]
+    law
+        "emulated" (the steps of the run; "discrete" in discrete time) or "continuous"
+    unreduced
+        consensus only: the states themselves, whose second moments grow without bound
+    moments
+        whether nu(t) and c(t) of every mode are in the document too
+    fraction
+        of the steady system error, for the settling time
 
     Raises
     ------
-    InputError : times that are no whole steps, a law that does not exist here, or too large
+    InputError
+        times that are no whole steps, a law that does not exist here, or too large
     """
     solved = solve_transient(experiment, times, law=law, unreduced=unreduced)
     found = solved.course
@@ -217,9 +225,10 @@ def describe_facts(experiment: Experiment) -> dict[str, Any]:
 
     Returns
     -------
-    ``facts`` (list), ``bounds``, ``graphs`` (list; None for directed or disconnected graphs), ``two_topology``
-    (``continuous``, ``emulated`` or ``discrete``; None unless there are two graphs that can each be held for ever).
-    What the network is too large for is None, and ``notes`` say so.
+    dict[str, Any]
+        ``facts`` (list), ``bounds``, ``graphs`` (list; None for directed or disconnected graphs), ``two_topology``
+        (``continuous``, ``emulated`` or ``discrete``; None unless there are two graphs that can each be held for ever).
+        What the network is too large for is None, and ``notes`` say so.
     """
     prediction = predict(experiment)
     laws = {"discrete" if experiment.time == "discrete" else "emulated": prediction.system}
@@ -254,22 +263,28 @@ def write_transient_csv(document: dict[str, Any], path: Path) -> None:
 
     Parameters
     ----------
-    document : of ``describe_transient``
-    path : of the CSV file
+    document
+        of ``describe_transient``
+    path
+        of the CSV file
     """
     system, nodes = _mean_squares(document)
     agents = range(1, document["agents"] + 1)
     header = ["time", *(f"probability of {name}" for name in document["modes"])]
     header += [*(f"mean of agent {i}" for i in agents), system.replace("_", " ")]
     header += [f"{nodes.removesuffix('s').replace('_', ' ')} of agent {i}" for i in agents]
+    keys = ("times", "graph_law", "mean", system, nodes)
+    rows = zip(*(document[key] for key in keys), strict=True)
     temporary = path.with_name(path.name + ".part")
-    with temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        keys = ("times", "graph_law", "mean", system, nodes)
-        for time, law, mean, error, errors in zip(*(document[key] for key in keys), strict=True):
-            writer.writerow([time, *law, *mean, error, *errors])
-    temporary.replace(path)
+    try:
+        with temporary.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            writer.writerows([time, *law, *mean, error, *errors] for time, law, mean, error, errors in rows)
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
 
 
 def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:

@@ -1,0 +1,179 @@
+"""What can be imported from msg_analysis itself."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import msg_analysis
+from msg_analysis import BagError, Experiment, ExperimentError, InputError, Run, compare, read_bag, write_report
+from msg_analysis.model.experiment import Experiment as ModelExperiment
+
+ROOT = Path(__file__).parents[2]
+LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"
+GOLDEN = json.loads((ROOT / "tests/data/golden/line_ring.predict.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def experiment() -> Experiment:
+    return Experiment.load(LINE_RING).with_run(duration=50, seed=3)
+
+
+@pytest.fixture(scope="module")
+def run(experiment: Experiment) -> Run:
+    return experiment.simulate()
+
+
+def test_importing_the_package_imports_nothing_else() -> None:
+    code = (
+        "import sys, msg_analysis\nassert 'numpy' not in sys.modules\n"
+        "assert set(msg_analysis.__all__) <= set(dir(msg_analysis))\n"
+        "from msg_analysis import Experiment\nassert 'numpy' in sys.modules\n"
+        "assert 'matplotlib' not in sys.modules and 'rich' not in sys.modules\n"
+    )
+    process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+
+
+def test_names() -> None:
+    """What is promised is there, for type checkers too, and nothing else is."""
+    from msg_analysis import api
+
+    assert msg_analysis.__all__ == api.__all__
+    for name in msg_analysis.__all__:
+        assert getattr(msg_analysis, name) is getattr(api, name)
+    text = Path(msg_analysis.__file__).read_text(encoding="utf-8")
+    assert re.findall(r"from msg_analysis.api import (\w+) as \1", text) == msg_analysis.__all__
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        getattr(msg_analysis, "nonsense")  # noqa: B009
+
+
+def test_predict(experiment: Experiment) -> None:
+    """The golden numbers, as arrays."""
+    prediction = experiment.predict()
+    assert prediction.emulated.system_error == pytest.approx(GOLDEN["emulated"]["system_error"], rel=1e-8)
+    assert prediction.continuous
+    np.testing.assert_allclose(prediction.continuous.node_certainty, GOLDEN["continuous"]["node_certainty"], rtol=1e-8)
+    assert prediction.continuous.system_certainty == pytest.approx(GOLDEN["continuous"]["system_certainty"], rel=1e-8)
+    assert prediction.emulated.covariance.shape == (5, 5)
+
+
+def test_experiments_stay_what_they_are(experiment: Experiment, run: Run) -> None:
+    """With their methods, after a change and out of a run; the model's own have none."""
+    assert type(experiment) is Experiment
+    assert type(Experiment.parse(experiment.to_document())) is Experiment
+    assert type(run.experiment) is Experiment
+    assert run.experiment == experiment
+    assert type(Experiment.of(ModelExperiment.load(LINE_RING))) is Experiment
+
+
+def test_simulate(experiment: Experiment, run: Run) -> None:
+    assert run.states.shape == (1001, 5, 16)
+    assert run.times.shape == (1001,)
+    assert run.times[-1] == pytest.approx(50)
+    again = Experiment.load(LINE_RING).simulate(seed=3, duration=50)
+    assert np.array_equal(again.states, run.states)
+    assert again.record.run != run.record.run
+    assert experiment.simulate(record=run.record).record is run.record
+    with pytest.raises(ExperimentError, match=r"run\.seed: -1"):
+        experiment.simulate(seed=-1)
+
+
+def test_a_bag_is_the_same_run(run: Run, tmp_path: Path) -> None:
+    assert run.save(tmp_path / "bag") == tmp_path / "bag"
+    read = read_bag(tmp_path / "bag")
+    assert isinstance(read, Run)
+    assert np.array_equal(read.states, run.states)
+    assert np.array_equal(read.modes, run.modes)
+    assert read.completeness.complete
+    with pytest.raises(BagError, match="exists already"):
+        run.save(tmp_path / "bag")
+    with pytest.raises(BagError, match="not found"):
+        read_bag(tmp_path / "nowhere")
+
+
+def test_compare(run: Run, experiment: Experiment, tmp_path: Path) -> None:
+    """Runs and bags, one or several. The seeds are fixed; fresh ones would disagree with probability 0.01 each."""
+    run.save(tmp_path / "bag")
+    alone, by_path = run.compare(), compare(tmp_path / "bag")
+    assert alone.to_json() == by_path.to_json()
+    assert alone.verdict == "agrees"
+    together = compare(tmp_path / "bag", experiment.simulate(seed=4))
+    assert together.pool
+    assert [member.name for member in together.pool.members] == [str(tmp_path / "bag"), "run 2"]
+    file = write_report(together, tmp_path / "report.html")
+    assert file.read_text(encoding="utf-8").startswith("<!")
+
+
+@pytest.mark.parametrize(
+    ("runs", "options", "words"),
+    [
+        ([], {}, "no run"),
+        (["here"], {"level": 0.0}, "level: 0"),
+        (["here"], {"level": float("nan")}, "level: nan"),
+        (["here", "there"], {}, "here, there: not found"),
+    ],
+)
+def test_compare_refuses(runs: list[str], options: dict[str, float], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        compare(*runs, **options)
+
+
+def test_transient(experiment: Experiment) -> None:
+    """In units of time, whatever the law; with a stationary start the error stays."""
+    times = [0, 1, 2.5]
+    for law in ("emulated", "continuous"):
+        course = experiment.transient(times, law=law)  # type: ignore[arg-type]
+        np.testing.assert_allclose(course.times, times)
+        np.testing.assert_allclose(course.system_error, GOLDEN[law]["system_error"], rtol=1e-6)
+        assert course.node_errors.shape == (3, 5)
+    with pytest.raises(InputError, match="no whole number of steps"):
+        experiment.transient([0.01])
+
+
+def test_select_leaders(experiment: Experiment) -> None:
+    selection = experiment.select_leaders(1)
+    error, agents = selection.sets[0]
+    assert agents == (2,)  # from 0: the middle of the line
+    assert selection.bound == error
+
+
+def test_everything_says_what_it_is(experiment: Experiment, run: Run) -> None:
+    """In a line; and in a notebook as a table, whose rows have equally many cells."""
+    results = [
+        (experiment, ["line_ring", "consensus of 5 agents", "1000 steps"]),
+        (run, ["line_ring", "x(0..1000)", "seed 3", "complete"]),
+        (experiment.predict(), ["1.41159", "1.35941", "1.5"]),
+        (experiment.predict().emulated, ["5 agents", "1.41159"]),
+        (run.compare(), ["agrees", "measured", "predicted 1.41159"]),
+        (compare(run, experiment.simulate(seed=4)), ["2 runs"]),
+        (experiment.select_leaders(1), ["agents 3", "exhaustive"]),
+        (experiment.transient([0, 1]), ["2 times"]),
+    ]
+    for result, words in results:
+        text = repr(result)
+        assert "\n" not in text
+        assert len(text) < 200
+        assert all(word in text for word in words), text
+        if hasattr(result, "_repr_markdown_"):
+            rows = [line for line in result._repr_markdown_().splitlines() if line.startswith("|")]
+            assert len(rows) >= 3
+            assert len({row.count("|") for row in rows}) == 1
+
+
+def test_large_networks_are_short_too() -> None:
+    agents = list(range(1, 61))
+    document = {
+        "name": "large",
+        "graphs": {f"g{i}": {"path": agents if i % 2 else agents[::-1]} for i in range(6)},
+        "switching": {"rates": {f"g{i}": {f"g{(i + 1) % 6}": 1.0} for i in range(6)}},
+    }
+    experiment = Experiment.parse(document)
+    assert "g3, ...;" in repr(experiment)
+    assert len(experiment.predict()._repr_markdown_().splitlines()) < 40

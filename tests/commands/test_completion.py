@@ -1,0 +1,139 @@
+"""Completion by shells: by the protocol that their scripts speak, and in a real bash."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+from programs import COMMANDS, PROGRAMS, command_of
+
+from msg_analysis.api import Experiment
+
+BIN = Path(sys.executable).parent
+PAIR = {
+    "name": "pair",
+    "graphs": {"apart": {"path": [1, 2, 3]}},
+    "run": {"dt": 0.1, "duration": 5, "start": "zero"},
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A directory as users have them: experiments, results, a bag among others in runs/."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("line.yaml", "ring.yml", "result.json", "notes.txt", ".hidden.yaml"):
+        (tmp_path / name).write_text("")
+    run = Experiment.parse(PAIR).simulate()
+    run.save(tmp_path / "runs" / "lab_1")
+    run.save(tmp_path / "runs" / "lab_2")
+    (tmp_path / "run.json").write_text(run.record.to_json())
+    (tmp_path / "empty").mkdir()
+    return tmp_path
+
+
+def complete(line: str, shell: str = "bash") -> list[str]:
+    """What a shell is answered at the end of a line."""
+    program, *rest = line.split(" ")
+    variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
+    words = {"COMP_WORDS": line, "COMP_CWORD": rest[-1] if shell == "fish" else str(len(rest))}
+    result = CliRunner().invoke(PROGRAMS[program], [], prog_name=program, env={variable: f"{shell}_complete", **words})
+    assert (result.exit_code, result.stderr) == (0, ""), result
+    if shell == "zsh":
+        kinds = iter(result.stdout.strip("\n").splitlines())
+        return [f"{kind},{value}" for kind, value, _ in zip(kinds, kinds, kinds, strict=True)]
+    return [each.partition("\t")[0] for each in result.stdout.splitlines() if each]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize(
+    ("line", "values"),
+    [
+        ("msg-analysis p", ["predict"]),
+        ("msg-agents re", ["recorder"]),
+        ("msg-analysis predict ", ["empty/", "line.yaml", "result.json", "ring.yml", "run.json", "runs/"]),
+        ("msg-analysis predict l", ["line.yaml"]),
+        ("msg-analysis predict .h", [".hidden.yaml"]),
+        ("msg-analysis compare ", ["empty/", "runs/"]),
+        ("msg-analysis compare ru", ["runs/", "runs/lab_1", "runs/lab_2"]),
+        ("msg-analysis compare runs/lab_1 runs/", ["runs/lab_1", "runs/lab_2"]),
+        ("msg-analysis compare runs/lab_1/", ["runs/lab_1/lab_1_0.mcap"]),
+        ("msg-analysis compare nowhere/", []),
+        ("msg-analysis info runs/lab_1", ["runs/lab_1"]),
+        ("msg-analysis leaders line.yaml --me", ["--method"]),
+        ("msg-analysis leaders line.yaml --method ", ["auto", "exhaustive", "greedy", "swap"]),
+        ("msg-analysis figures ", ["1", "2", "3", "all"]),
+        ("msg-agents run line.yaml --pace ", ["lockstep", "realtime"]),
+        ("msg-agents run line.yaml --processes o", ["one_per_agent"]),
+        ("msg-agents agent run.json --agent ", ["1", "2", "3"]),
+        ("msg-agents agent line.yaml --agent ", []),
+        ("msg-agents agent run.json --await ", ["recorder"]),
+        ("msg-agents play runs/lab_1 --topics /agent_1", ["/agent_1/state"]),
+        ("msg-agents play empty --topics /", []),
+    ],
+)
+def test_complete(folder: Path, shell: str, line: str, values: list[str]) -> None:
+    assert complete(line, shell) == [f"plain,{value}" for value in values]
+
+
+def test_names_that_must_be_quoted_are_left_to_the_shell(folder: Path) -> None:
+    (folder / "two words.yaml").write_text("")
+    assert complete("msg-analysis predict t") == ["file,t"]
+
+
+@pytest.mark.parametrize(("program", "name"), COMMANDS)
+def test_every_option_and_choice_is_offered(program: str, name: str) -> None:
+    offered = {each.removeprefix("plain,") for each in complete(f"{program} {name} --")}
+    options = [each for each in command_of(program, name).params if isinstance(each, click.Option) and not each.hidden]
+    assert offered >= {max(each.opts, key=len) for each in options}
+
+
+def test_in_bash(folder: Path) -> None:
+    """By the line that docs/commands.md has for ~/.bashrc, and the function that it defines."""
+    bash = shutil.which("bash")
+    if not bash:
+        pytest.skip("no bash here")
+    script = """
+        eval "$(_MSG_AGENTS_COMPLETE=bash_source msg-agents)"
+        eval "$(_MSG_ANALYSIS_COMPLETE=bash_source msg-analysis)"
+        complete -p msg-agents msg-analysis
+        compopt() { echo "compopt $*"; }
+        try() {
+            COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=()
+            $(complete -p "$1" | sed 's/.* -F \\([^ ]*\\) .*/\\1/') "$1"
+            echo "${COMPREPLY[*]}"
+        }
+        try msg-analysis compare ru
+        try msg-agents ch
+        try msg-agents run --pace r
+    """
+    environment = os.environ | {"PATH": f"{BIN}:{os.environ['PATH']}"}
+    process = subprocess.run(
+        [bash, "--norc", "-c", script], capture_output=True, text=True, cwd=folder, env=environment
+    )
+    assert process.stderr == ""
+    assert process.stdout.splitlines() == [
+        "complete -o nosort -F _msg_agents_completion msg-agents",
+        "complete -o nosort -F _msg_analysis_completion msg-analysis",
+        "runs/ runs/lab_1 runs/lab_2",
+        "check",
+        "realtime",
+    ]
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_what_a_shell_reads_at_its_start(program: str, shell: str, tmp_path: Path) -> None:
+    """Is a script of that shell, where it is here to be asked."""
+    variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
+    result = CliRunner().invoke(PROGRAMS[program], [], prog_name=program, env={variable: f"{shell}_source"})
+    assert result.exit_code == 0
+    assert f"{variable}={shell}_complete" in result.stdout
+    if found := shutil.which(shell):
+        (tmp_path / "script").write_text(result.stdout)
+        assert subprocess.run([found, "-n", str(tmp_path / "script")], capture_output=True).returncode == 0
