@@ -69,11 +69,11 @@ bench: setup ## Measure speed side by side with the bare middleware, other solve
 	$(BIN)/python benchmarks/leaders.py
 	$(BIN)/python benchmarks/reading.py
 
-calibrate: setup ## Measure error rates and power of the verdict into docs/statistics.md: some 10 minutes on two CPUs
+calibrate: setup ## Measure error rates and power of the verdict into docs/calibration.md: some 10 minutes on two CPUs
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --write
 
 docs: setup ## Build the documentation into site/
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 # Build the workspace as a ROS 2 user does. With ROS 2 from wheels, the virtual environment is the underlay.
 COLCON := cd ros_ws && env AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) PATH=$(CURDIR)/$(BIN):$$PATH \

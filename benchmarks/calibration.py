@@ -1,4 +1,4 @@
-"""How often the comparison is right: ``make calibrate`` writes the tables between the marks of docs/statistics.md.
+"""How often the comparison is right: ``make calibrate`` writes the tables between the marks of docs/calibration.md.
 
 Simulates runs with the offline twin. Runs that follow their law say how often intervals cover the truth and how often
 "disagrees" is a false alarm; runs in which one thing is wrong say how often that is found, and how often the first
@@ -33,7 +33,7 @@ from msg_analysis.model.record import RunRecord
 from msg_analysis.twin import new_record, simulate
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs/statistics.md"
+PAGE = ROOT / "docs/calibration.md"
 ROOMS = ("model", "theory", "inference")
 LINE = [(1, 2), (2, 3), (3, 4), (4, 5)]
 RING = [*LINE, (5, 1)]

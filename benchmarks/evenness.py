@@ -1,4 +1,4 @@
-"""P-values on the air and in real time, and what small deviations show: tables of docs/statistics.md.
+"""P-values on the air and in real time, and what small deviations show: tables of docs/calibration.md.
 
 Beside ``calibration.py``: simulates runs with the offline twin and compares each with its prediction. Prints Markdown;
 about ten minutes on one core.

@@ -22,7 +22,7 @@ def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) ->
 
     In lockstep every message wakes the process that it is for. To wake it on another core costs an interrupt there,
     and left alone the scheduler spreads those who wake each other over the cores: with two, the demo network makes a
-    third to a half fewer steps per second (docs/network.md). Where every process can have a core of its own, the
+    third to a half fewer steps per second (docs/performance.md). Where every process can have a core of its own, the
     scheduler is left alone.
 
     Parameters

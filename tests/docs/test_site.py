@@ -1,0 +1,122 @@
+"""The site: strict, whole, and nothing of it comes from elsewhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+from pages import ROOT
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+QUIET = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+         "--disable-component-update", "--disable-sync"]  # fmt: skip
+LOADS = {"img": "src", "script": "src", "iframe": "src", "source": "src", "link": "href"}
+
+
+class Links(HTMLParser):
+    """What a page links to and loads, and where it can be linked to."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.loads: list[str] = []
+        self.anchors: set[str] = set()
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        given = {key: value or "" for key, value in attributes}
+        if "id" in given:
+            self.anchors.add(given["id"])
+        if tag == "a" and "href" in given:
+            self.links.append(given["href"])
+        if tag in LOADS and LOADS[tag] in given and given.get("rel") not in {"canonical", "prev", "next"}:
+            self.loads.append(given[LOADS[tag]])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as ``make docs`` does it."""
+    target = tmp_path_factory.mktemp("site")
+    mkdocs = Path(sys.executable).with_name("mkdocs")
+    subprocess.run(
+        [mkdocs, "build", "--strict", "--quiet", "--site-dir", target],
+        cwd=ROOT,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+        check=True,
+    )
+    return target
+
+
+@pytest.fixture(scope="module")
+def pages(site: Path) -> dict[Path, Links]:
+    # The page for what is not found can only be served: its links begin at the root of the server.
+    return {page: Links(page) for page in site.rglob("*.html") if page.name != "404.html"}
+
+
+def test_no_link_is_broken(pages: dict[Path, Links]) -> None:
+    """mkdocs looks at what is written in the pages' sources; this looks at what has become of it."""
+    broken = []
+    for page, found in pages.items():
+        for link in found.links + found.loads:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            target = (page.parent / unquote(parts.path)).resolve() if parts.path else page
+            if not target.exists():
+                broken.append(f"{page.name}: {link}")
+            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors:
+                broken.append(f"{page.name}: {link}: no such place")
+    assert broken == []
+
+
+def test_nothing_is_loaded_from_elsewhere(site: Path, pages: dict[Path, Links]) -> None:
+    foreign = [f"{page.name}: {load}" for page, found in pages.items() for load in found.loads if "//" in load]
+    for sheet in site.rglob("*.css"):
+        text = sheet.read_text(encoding="utf-8")
+        foreign += [f"{sheet.name}: {url}" for url in re.findall(r"url\([\"']?((?:https?:)?//[^)]*)", text)]
+        foreign += [f"{sheet.name}: {url}" for url in re.findall(r"@import[^;]*", text)]
+    assert foreign == []
+
+
+def test_equations_are_drawn(site: Path) -> None:
+    theory = (site / "theory.html").read_text(encoding="utf-8")
+    assert theory.count('display="block"') > 10
+    for page in site.glob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert "arithmatex" not in text
+        assert "$$" not in text
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_in_a_browser(site: Path, pages: dict[Path, Links]) -> None:
+    """Opened from the disk: no request to anywhere, no error, nothing wider than a phone, and the search finds."""
+    from playwright.sync_api import sync_playwright
+
+    asked, complaints, wide = [], [], []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+        page = browser.new_page(viewport={"width": 390, "height": 844})
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        for file in pages:
+            page.goto(file.as_uri())
+            if page.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth"):
+                wide.append(file.name)
+        page.set_viewport_size({"width": 1280, "height": 900})
+        page.goto((site / "index.html").as_uri())
+        page.locator(".md-search__input").fill("supermodularity")
+        first = page.locator(".md-search-result__link").first
+        first.wait_for(timeout=30_000)
+        assert "leaders.html" in str(first.get_attribute("href"))
+        browser.close()
+    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
+    assert complaints == []
+    assert wide == []
