@@ -38,7 +38,8 @@ def storage(compression: Compression, split_size: float | None) -> Storage:
 
     Raises
     ------
-    InputError : no size
+    InputError
+        no size
     """
     try:
         size = None if split_size is None else round(split_size * MEGABYTE)

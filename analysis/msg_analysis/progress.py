@@ -13,7 +13,8 @@ class SolveProgress:
 
     Parameters
     ----------
-    title : what is being worked on
+    title
+        what is being worked on
     """
 
     def __init__(self, title: str) -> None:

@@ -46,13 +46,19 @@ class Network:
 
     Attributes
     ----------
-    graphs : the n graphs, each with ``name``, ``adjacency`` (m, m) and ``laplacian`` (m, m); ``adjacency[i, j]`` > 0
-        where agent i hears agent j
-    dt : simulated time of a step; 1 in discrete time
-    noise_gain : (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I); sqrt(dt) F, as the file has it
-    tracking : whether the agents should follow leaders to ``reference``, instead of agreeing with each other
-    leader_gains : (m,) kappa [1 / unit of time]; 0 for followers, inf for leaders that are to be held
-    reference : what is tracked; 0 without leaders
+    graphs
+        the n graphs, each with ``name``, ``adjacency`` (m, m) and ``laplacian`` (m, m); ``adjacency[i, j]`` > 0 where
+        agent i hears agent j
+    dt
+        simulated time of a step; 1 in discrete time
+    noise_gain
+        (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I); sqrt(dt) F, as the file has it
+    tracking
+        whether the agents should follow leaders to ``reference``, instead of agreeing with each other
+    leader_gains
+        (m,) kappa [1 / unit of time]; 0 for followers, inf for leaders that are to be held
+    reference
+        what is tracked; 0 without leaders
     """
 
     graphs: tuple[Graph, ...]
@@ -76,12 +82,15 @@ class LinearProtocol(ABC):
 
     Attributes
     ----------
-    Parameters : model of the parameters
-    network, parameters : as given
+    Parameters
+        model of the parameters
+    network, parameters
+        as given
 
     Raises
     ------
-    ValueError : (constructor) the parameters do not go with this network; the text is shown to the user
+    ValueError
+        (constructor) the parameters do not go with this network; the text is shown to the user
     """
 
     Parameters: ClassVar[type[BaseModel]] = Parameters
@@ -107,9 +116,12 @@ class Heard:
 
     Attributes
     ----------
-    agents : (d,) who they are, from 0, ascending
-    weights : (d,) of the links, as in the graph's adjacency
-    values : (d, R) what they published
+    agents
+        (d,) who they are, from 0, ascending
+    weights
+        (d,) of the links, as in the graph's adjacency
+    values
+        (d, R) what they published
     """
 
     agents: IntArray
@@ -123,7 +135,8 @@ class Heard:
 
         Parameters
         ----------
-        terms : (d, R), for example differences of ``values``
+        terms
+            (d, R), for example differences of ``values``
         """
         if not len(self.weights):
             return np.zeros(terms.shape[1:])
@@ -138,14 +151,19 @@ class Protocol(ABC):
 
     Attributes
     ----------
-    Parameters : model of the parameters
-    tracking : whether this protocol knows leaders; otherwise experiments with ``problem: tracking`` are refused
-    states : S; may be set in the constructor, to the same number for all agents
-    network, parameters, agent : as given
+    Parameters
+        model of the parameters
+    tracking
+        whether this protocol knows leaders; otherwise experiments with ``problem: tracking`` are refused
+    states
+        S; may be set in the constructor, to the same number for all agents
+    network, parameters, agent
+        as given
 
     Raises
     ------
-    ValueError : (constructor) the parameters do not go with this network; the text is shown to the user
+    ValueError
+        (constructor) the parameters do not go with this network; the text is shown to the user
     """
 
     Parameters: ClassVar[type[BaseModel]] = Parameters
@@ -173,13 +191,19 @@ class Protocol(ABC):
 
         Parameters
         ----------
-        k : number of the step, from x(k) to x(k+1)
-        mode : graph of the step, from 0
-        state : (S, R) before; read-only
-        heard : what others published of their states of step k
-        noise : (R,) this agent's process noise of the step, N(0, (B_g B_g^T)_ii), correlated as F says
+        k
+            number of the step, from x(k) to x(k+1)
+        mode
+            graph of the step, from 0
+        state
+            (S, R) before; read-only
+        heard
+            what others published of their states of step k
+        noise
+            (R,) this agent's process noise of the step, N(0, (B_g B_g^T)_ii), correlated as F says
 
         Returns
         -------
-        (S, R), finite
+        FloatArray
+            (S, R), finite
         """

@@ -32,7 +32,8 @@ def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatA
 
     Parameters
     ----------
-    first_mode : index of g(0); the stationary start depends on it
+    first_mode
+        index of g(0); the stationary start depends on it
     """
     replicas = experiment.run.replicas
     start = experiment.run.start
@@ -52,7 +53,8 @@ def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecor
 
     Parameters
     ----------
-    run : run id; a new random one if not given
+    run
+        run id; a new random one if not given
     """
     model = build_model(experiment)
     modes = mode_path(experiment, model.initial)
@@ -67,12 +69,14 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
 
     Parameters
     ----------
-    record : of the run to repeat; a new run with a new id if not given
+    record
+        of the run to repeat; a new run with a new id if not given
 
     Returns
     -------
-    The same states, to the last bit, as those of a lockstep network run; in real time, as those of a run with ideal
-    timers and no delay.
+    Trajectory
+        The same states, to the last bit, as those of a lockstep network run; in real time, as those of a run with ideal
+        timers and no delay.
     """
     experiment = record.experiment if record else experiment
     experiment.require_available()

@@ -18,15 +18,19 @@ def replay(trajectory: Trajectory) -> FloatArray:
 
     Parameters
     ----------
-    trajectory : of a run in real time
+    trajectory
+        of a run in real time
 
     Returns
     -------
-    (N + 1, m, replicas) the states that the law gives, to the last bit; NaN where the log has not all that is needed.
+    FloatArray
+        (N + 1, m, replicas) the states that the law gives, to the last bit; NaN where the log has not all that is
+        needed.
 
     Raises
     ------
-    ValueError : nothing was logged of who used what
+    ValueError
+        nothing was logged of who used what
     """
     used, modes = trajectory.used, trajectory.agent_modes
     if used is None or modes is None:

@@ -21,8 +21,10 @@ class IdealTimers:
 
     Parameters
     ----------
-    experiment : of pace realtime
-    model : its step model
+    experiment
+        of pace realtime
+    model
+        its step model
     """
 
     def __init__(self, experiment: Experiment, model: StepModel) -> None:
@@ -36,9 +38,12 @@ class IdealTimers:
 
         Parameters
         ----------
-        modes : (N,)
-        start : (m, R) x(0)
-        drives : for every step, (m, R) noise plus offset
+        modes
+            (N,)
+        start
+            (m, R) x(0)
+        drives
+            for every step, (m, R) noise plus offset
         """
         m = len(start)
         both = np.concatenate([start, start])  # x(k) above x(k+1)

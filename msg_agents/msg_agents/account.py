@@ -19,8 +19,10 @@ class Account:
 
     Attributes
     ----------
-    refused : messages that nodes did not take, counted by (node, topic, reason)
-    waiting : for what those nodes wait that cannot go on, by node
+    refused
+        messages that nodes did not take, counted by (node, topic, reason)
+    waiting
+        for what those nodes wait that cannot go on, by node
     """
 
     refused: Counter[tuple[str, str, str]] = field(default_factory=Counter)

@@ -36,14 +36,22 @@ class Agent(NetworkNode):
 
     Parameters
     ----------
-    record : of the run
-    model : its step model, or wiring
-    agent : index from 0
-    peers : every other agent that it hears or is heard by, ascending
-    colleagues : the agents of its process, itself included
-    readers : names of the nodes, besides the other agents, that must read the states before the run starts
-    checkpoints : directory that keeps what it has published, from which it goes on if it has been there before
-    group : to which it belongs
+    record
+        of the run
+    model
+        its step model, or wiring
+    agent
+        index from 0
+    peers
+        every other agent that it hears or is heard by, ascending
+    colleagues
+        the agents of its process, itself included
+    readers
+        names of the nodes, besides the other agents, that must read the states before the run starts
+    checkpoints
+        directory that keeps what it has published, from which it goes on if it has been there before
+    group
+        to which it belongs
     """
 
     def __init__(

@@ -22,12 +22,18 @@ class Audience:
 
     Parameters
     ----------
-    node : whose topics they are
-    writers : publishers of the topics
-    latched : keys of those that need not be waited for: who reads them gets all of them, however late
-    subscribers : how many readers every topic must have
-    readers : names of nodes that must read every topic
-    timeout : s to wait for them
+    node
+        whose topics they are
+    writers
+        publishers of the topics
+    latched
+        keys of those that need not be waited for: who reads them gets all of them, however late
+    subscribers
+        how many readers every topic must have
+    readers
+        names of nodes that must read every topic
+    timeout
+        s to wait for them
     """
 
     def __init__(
@@ -49,12 +55,15 @@ class Audience:
 
         Parameters
         ----------
-        pause : takes some time, between two looks
-        on_note : told whom it waits for
+        pause
+            takes some time, between two looks
+        on_note
+            told whom it waits for
 
         Raises
         ------
-        InputError : somebody did not come
+        InputError
+            somebody did not come
         """
         looked = time.monotonic()
         waited = changed = 0.0

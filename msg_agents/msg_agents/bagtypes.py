@@ -18,7 +18,8 @@ def message_class(type_name: str) -> Any:
 
     Raises
     ------
-    ImportError, AttributeError, ValueError : there is none of this name here
+    ImportError, AttributeError, ValueError
+        there is none of this name here
     """
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
@@ -29,13 +30,17 @@ def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Ca
 
     Parameters
     ----------
-    topics : of the bag
-    all_wanted : whether somebody asked for just these, so that none may be left out
-    on_note : told which are left out
+    topics
+        of the bag
+    all_wanted
+        whether somebody asked for just these, so that none may be left out
+    on_note
+        told which are left out
 
     Raises
     ------
-    InputError : one cannot be played that must be, or none can
+    InputError
+        one cannot be played that must be, or none can
     """
     found, unplayable = {}, []
     for topic in topics:
@@ -58,13 +63,17 @@ def check_definitions(node: Node, writers: Mapping[str, Publisher], topics: Mapp
 
     Parameters
     ----------
-    node : that publishes
-    writers : its publishers, by name of the topic in the bag
-    topics : of the bag, by name
+    node
+        that publishes
+    writers
+        its publishers, by name of the topic in the bag
+    topics
+        of the bag, by name
 
     Raises
     ------
-    InputError : a topic was recorded with another definition
+    InputError
+        a topic was recorded with another definition
     """
     for name, publisher in writers.items():
         recorded = topics[name].type_hash

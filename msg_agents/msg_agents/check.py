@@ -22,9 +22,12 @@ class Check:
 
     Attributes
     ----------
-    compared : states that were there to compare
-    missing : states that were not
-    difference : the first one in words (steps first, then agents from 1), or None
+    compared
+        states that were there to compare
+    missing
+        states that were not
+    difference
+        the first one in words (steps first, then agents from 1), or None
     """
 
     compared: int
@@ -40,11 +43,13 @@ def check(trajectory: Trajectory) -> Check:
 
     Parameters
     ----------
-    trajectory : of the bag
+    trajectory
+        of the bag
 
     Raises
     ------
-    NotAvailableError : the run was not of a kind that the twin repeats
+    NotAvailableError
+        the run was not of a kind that the twin repeats
     """
     if trajectory.record.experiment.run.pace == "realtime":
         return _check_realtime(trajectory)

@@ -40,16 +40,20 @@ class Checkpoint:
 
     Parameters
     ----------
-    path : of the file; made if there is none. None: in memory, for this process only
-    size : bytes of the longest message
+    path
+        of the file; made if there is none. None: in memory, for this process only
+    size
+        bytes of the longest message
 
     Attributes
     ----------
-    found : whether the file was there: some process has been here before
+    found
+        whether the file was there: some process has been here before
 
     Raises
     ------
-    InputError : the file is there and of another size, or there is no room for it
+    InputError
+        the file is there and of another size, or there is no room for it
     """
 
     def __init__(self, path: Path | None, size: int) -> None:

@@ -233,7 +233,8 @@ def load_record(path: Path) -> RunRecord:
 
     Raises
     ------
-    InputError : it cannot be read, or is none
+    InputError
+        it cannot be read, or is none
     """
     from msg_analysis.errors import InputError
     from msg_analysis.model.record import RunRecord

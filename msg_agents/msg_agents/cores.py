@@ -27,13 +27,17 @@ def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) ->
 
     Parameters
     ----------
-    plans : in the order of ``plan_network``, in which neighbours are next to each other: they share a core
-    cores : numbers of the cores
-    first : any number; networks that are given successive ones begin at different cores, and so share them evenly
+    plans
+        in the order of ``plan_network``, in which neighbours are next to each other: they share a core
+    cores
+        numbers of the cores
+    first
+        any number; networks that are given successive ones begin at different cores, and so share them evenly
 
     Returns
     -------
-    core by name of the process; the switcher, which has hardly anything to do, is not in it
+    dict[str, int]
+        core by name of the process; the switcher, which has hardly anything to do, is not in it
     """
     agents = sum(len(plan.agents) for plan in plans)
     loads = {

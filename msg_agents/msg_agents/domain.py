@@ -48,7 +48,8 @@ def free_domain() -> Iterator[int]:
 
     Raises
     ------
-    InputError : all are taken
+    InputError
+        all are taken
     """
     busy = {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in _ports_in_use()}
     candidates = [domain for domain in DOMAINS if domain not in busy]

@@ -18,8 +18,10 @@ def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str,
 
     Parameters
     ----------
-    domain : ROS_DOMAIN_ID
-    profile : of Fast DDS
+    domain
+        ROS_DOMAIN_ID
+    profile
+        of Fast DDS
     """
     environment = {
         # The arithmetic of one agent is far too small for threads, which would only fight for the cores.

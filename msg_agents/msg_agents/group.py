@@ -35,18 +35,25 @@ class AgentGroup:
 
     Parameters
     ----------
-    record : of the run
-    model : its step model, or wiring
-    agents : indices from 0, at least one
-    readers : names of the nodes, besides the other agents, that must read the states before the run starts
-    checkpoints : directory that keeps what the agents have published, from which they go on if they have been there
-        before
+    record
+        of the run
+    model
+        its step model, or wiring
+    agents
+        indices from 0, at least one
+    readers
+        names of the nodes, besides the other agents, that must read the states before the run starts
+    checkpoints
+        directory that keeps what the agents have published, from which they go on if they have been there before
 
     Attributes
     ----------
-    nodes : the agents, in this order
-    turns : of the agents
-    progress_period : s of wall time between two Progress messages of an agent
+    nodes
+        the agents, in this order
+    turns
+        of the agents
+    progress_period
+        s of wall time between two Progress messages of an agent
     """
 
     def __init__(

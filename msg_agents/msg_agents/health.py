@@ -22,9 +22,12 @@ class Health:
 
     Attributes
     ----------
-    message : one line
-    waiting : whether it cannot go on, or not keep up, for the time being
-    values : facts, by name
+    message
+        one line
+    waiting
+        whether it cannot go on, or not keep up, for the time being
+    values
+        facts, by name
     """
 
     message: str
@@ -52,8 +55,10 @@ class Reporter:
 
     Parameters
     ----------
-    nodes : at least one; with a method ``health() -> Health`` and counters ``refused`` and ``repeated``
-    account : file for whoever started the process: what its nodes have refused, and what they wait for
+    nodes
+        at least one; with a method ``health() -> Health`` and counters ``refused`` and ``repeated``
+    account
+        file for whoever started the process: what its nodes have refused, and what they wait for
     """
 
     def __init__(self, nodes: Sequence[Node], account: Path | None = None) -> None:

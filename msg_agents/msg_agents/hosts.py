@@ -82,10 +82,14 @@ class Hosts:
 
     Attributes
     ----------
-    domain : ROS_DOMAIN_ID
-    recorder : name of the host with recorder and switcher
-    addresses : of the hosts, by name, as numbers
-    agents : indices from 0 of the agents on each host, ascending, by name
+    domain
+        ROS_DOMAIN_ID
+    recorder
+        name of the host with recorder and switcher
+    addresses
+        of the hosts, by name, as numbers
+    agents
+        indices from 0 of the agents on each host, ascending, by name
     """
 
     domain: int
@@ -99,7 +103,8 @@ class Hosts:
 
         Raises
         ------
-        InputError : it cannot be read, or does not fit the experiment; names every mistake
+        InputError
+            it cannot be read, or does not fit the experiment; names every mistake
         """
         return cls.parse(read_yaml(path), experiment, source=str(path))
 
@@ -145,13 +150,17 @@ class Hosts:
 
         Parameters
         ----------
-        name : of the host
-        discovery_timeout : s to wait for the other hosts
-        patience : s after which the others are left alone when a host has left them
+        name
+            of the host
+        discovery_timeout
+            s to wait for the other hosts
+        patience
+            s after which the others are left alone when a host has left them
 
         Raises
         ------
-        InputError : there is no such host, or nothing to do on it
+        InputError
+            there is no such host, or nothing to do on it
         """
         if name not in self.agents:
             known = ", ".join(self.agents)
@@ -194,8 +203,10 @@ class Hosts:
 
         Parameters
         ----------
-        experiment : of the run
-        folder : in which the profile is written
+        experiment
+            of the run
+        folder
+            in which the profile is written
         """
         profile = folder / "hosts.xml"
         profile.write_text(self.profile(experiment), encoding="utf-8")

@@ -14,8 +14,10 @@ class JobControl:
 
     Parameters
     ----------
-    before : called before it stops; not for SIGSTOP, of which no process hears
-    after : called when it goes on, in the foreground or in the background
+    before
+        called before it stops; not for SIGSTOP, of which no process hears
+    after
+        called when it goes on, in the foreground or in the background
     """
 
     def __init__(self, *, before: Callable[[], None], after: Callable[[], None]) -> None:

@@ -76,7 +76,8 @@ class Keyboard:
 
         Parameters
         ----------
-        seconds : to wait if nothing was
+        seconds
+            to wait if nothing was
         """
         if not self._saved:
             self.listen()  # it may have been started in the background

@@ -58,7 +58,8 @@ def flag(arguments: Mapping[str, str], name: str) -> bool:
 
     Raises
     ------
-    InputError : it is neither
+    InputError
+        it is neither
     """
     word = arguments[name].strip().lower()
     if word not in TRUE | FALSE:
@@ -71,8 +72,10 @@ def find_experiment(name: str, share: Path) -> Path:
 
     Parameters
     ----------
-    name : path, or name of an example
-    share : directory of msg_agents_bringup's data
+    name
+        path, or name of an example
+    share
+        directory of msg_agents_bringup's data
     """
     path = Path(name).expanduser()
     examples = share / "experiments"
@@ -108,18 +111,24 @@ class LaunchedNetwork:
 
     Parameters
     ----------
-    arguments : of the launch, by the names of NETWORK_ARGUMENTS
-    share : directory of msg_agents_bringup's data
+    arguments
+        of the launch, by the names of NETWORK_ARGUMENTS
+    share
+        directory of msg_agents_bringup's data
 
     Attributes
     ----------
-    processes : to be started, as nodes; ``arguments[0]`` of each is its executable
-    bag : directory that the recorder makes; None: nothing is recorded
-    namespace : of all nodes
+    processes
+        to be started, as nodes; ``arguments[0]`` of each is its executable
+    bag
+        directory that the recorder makes; None: nothing is recorded
+    namespace
+        of all nodes
 
     Raises
     ------
-    InputError : the arguments or the experiment are wrong; nothing has been written
+    InputError
+        the arguments or the experiment are wrong; nothing has been written
     """
 
     def __init__(self, arguments: Mapping[str, str], share: Path) -> None:
@@ -153,16 +162,20 @@ class LaunchedNetwork:
 
         Parameters
         ----------
-        name : of the process
-        code : its exit code, or minus the signal that killed it
+        name
+            of the process
+        code
+            its exit code, or minus the signal that killed it
 
         Returns
         -------
-        True if this was the last one and the run is complete, else False
+        bool
+            True if this was the last one and the run is complete, else False
 
         Raises
         ------
-        LaunchFailedError : it has not done its part; not said again of those who are ended because of that
+        LaunchFailedError
+            it has not done its part; not said again of those who are ended because of that
         """
         self._running.discard(name)
         # After its part a process may hang in the middleware's farewell; then it ends itself by an alarm.
@@ -187,7 +200,8 @@ class LaunchedNetwork:
 
         Raises
         ------
-        LaunchFailedError : it does not say that the run agrees with the prediction
+        LaunchFailedError
+            it does not say that the run agrees with the prediction
         """
         if code:
             verdict = {1: "the run disagrees with the prediction", 3: "data are incomplete: no verdict"}
@@ -215,11 +229,13 @@ def replay_commands(arguments: Mapping[str, str]) -> list[tuple[str, list[str]]]
 
     Parameters
     ----------
-    arguments : of the launch, by the names of REPLAY_ARGUMENTS
+    arguments
+        of the launch, by the names of REPLAY_ARGUMENTS
 
     Raises
     ------
-    InputError : no bag, or what does not go together
+    InputError
+        no bag, or what does not go together
     """
     bag, live = arguments["bag"].strip(), flag(arguments, "live")
     if not bag or not Path(bag).expanduser().exists():

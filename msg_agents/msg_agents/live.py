@@ -39,9 +39,12 @@ class Watched:
 
     Attributes
     ----------
-    record : of the run
-    report : the numbers
-    finished : whether the run was followed to its last step
+    record
+        of the run
+    report
+        the numbers
+    finished
+        whether the run was followed to its last step
     """
 
     record: RunRecord
@@ -54,13 +57,17 @@ class Live(Watcher):
 
     Parameters
     ----------
-    reliable : whether to miss no state, and so hold the network back where this node does not keep up
-    on_report : told of every estimate, with the number of steps per second
-    on_note : told what somebody should know
+    reliable
+        whether to miss no state, and so hold the network back where this node does not keep up
+    on_report
+        told of every estimate, with the number of steps per second
+    on_note
+        told what somebody should know
 
     Attributes
     ----------
-    outcome : what was seen, in the end; None: no network
+    outcome
+        what was seen, in the end; None: no network
     """
 
     def __init__(
@@ -84,7 +91,8 @@ class Live(Watcher):
 
         Raises
         ------
-        InputError : there is no prediction for it (too large, unbounded)
+        InputError
+            there is no prediction for it (too large, unbounded)
         """
         assert self.record is not None
         record, experiment = self.record, self.record.experiment
@@ -183,16 +191,21 @@ def watch(
 
     Parameters
     ----------
-    reliable, on_report, on_note : see ``Live``
-    timeout : s to wait for a network; None: for ever
+    reliable, on_report, on_note
+        see ``Live``
+    timeout
+        s to wait for a network; None: for ever
 
     Returns
     -------
-    What was seen; None: no network. Where the run was seen to be over, the node is still there: end the process at once
+    Watched | None
+        What was seen; None: no network. Where the run was seen to be over, the node is still there: end the process at
+        once
 
     Raises
     ------
-    InputError : no network came in time, or there is no prediction for it
+    InputError
+        no network came in time, or there is no prediction for it
     """
     node = run_watcher(
         lambda: Live(reliable=reliable, on_report=on_report, on_note=on_note), timeout=timeout, on_note=on_note

@@ -57,10 +57,14 @@ class Markers(Watcher):
 
     Parameters
     ----------
-    rate : pictures a second of the wall
-    replica : index from 0 of the replica that is drawn
-    frame : of reference, for the header
-    on_note : told what somebody should know
+    rate
+        pictures a second of the wall
+    replica
+        index from 0 of the replica that is drawn
+    frame
+        of reference, for the header
+    on_note
+        told what somebody should know
     """
 
     def __init__(self, *, rate: float, replica: int, frame: str, on_note: Callable[[str], None]) -> None:
@@ -79,7 +83,8 @@ class Markers(Watcher):
 
         Raises
         ------
-        InputError : there is no such replica
+        InputError
+            there is no such replica
         """
         assert self.record is not None
         experiment = self.record.experiment
@@ -213,16 +218,20 @@ def show_markers(
 
     Parameters
     ----------
-    rate, replica, frame, on_note : see ``Markers``
-    timeout : s to wait for a network; None: for ever
+    rate, replica, frame, on_note
+        see ``Markers``
+    timeout
+        s to wait for a network; None: for ever
 
     Returns
     -------
-    Whether the run was seen to be over; the node is then still there: end the process at once
+    bool
+        Whether the run was seen to be over; the node is then still there: end the process at once
 
     Raises
     ------
-    InputError : no network came in time, or it has no such replica
+    InputError
+        no network came in time, or it has no such replica
     """
     node = run_watcher(
         lambda: Markers(rate=rate, replica=replica, frame=frame, on_note=on_note), timeout=timeout, on_note=on_note

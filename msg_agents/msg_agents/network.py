@@ -26,10 +26,14 @@ class ProcessPlan:
 
     Attributes
     ----------
-    name : what people call it
-    arguments : of the command ``msg-agents`` that runs it
-    agents : indices from 0 of the agents in it
-    resumes : whether the same command takes over when the process has been killed
+    name
+        what people call it
+    arguments
+        of the command ``msg-agents`` that runs it
+    agents
+        indices from 0 of the agents in it
+    resumes
+        whether the same command takes over when the process has been killed
     """
 
     name: str
@@ -44,10 +48,14 @@ class Share:
 
     Attributes
     ----------
-    agents : indices from 0, ascending
-    home : whether recorder and switcher are here
-    discovery_timeout : s for which nodes look for those of other hosts, which people start
-    patience : s after which nodes end that have been left alone
+    agents
+        indices from 0, ascending
+    home
+        whether recorder and switcher are here
+    discovery_timeout
+        s for which nodes look for those of other hosts, which people start
+    patience
+        s after which nodes end that have been left alone
     """
 
     agents: tuple[int, ...]
@@ -61,12 +69,15 @@ def count_processes(experiment: Experiment, agents: int | None = None) -> int:
 
     Parameters
     ----------
-    experiment : what is run
-    agents : how many of them are on this machine; None: all
+    experiment
+        what is run
+    agents
+        how many of them are on this machine; None: all
 
     Raises
     ------
-    InputError : more than discovery can handle
+    InputError
+        more than discovery can handle
     """
     agents, wanted = experiment.agents if agents is None else agents, experiment.run.processes
     if wanted == "auto":
@@ -110,17 +121,25 @@ def plan_network(
 
     Parameters
     ----------
-    experiment : what is run
-    run_file : the run record that every node is given
-    bag : directory to record to; None: no recorder
-    checkpoints : directory for what agents and switcher need to go on after being killed; None: they cannot
-    use_sim_time : whether the nodes take the time from ``/clock``
-    storage : how the recorder stores the bag
-    share : what of it runs on this host, of several, one of which records; None: all
+    experiment
+        what is run
+    run_file
+        the run record that every node is given
+    bag
+        directory to record to; None: no recorder
+    checkpoints
+        directory for what agents and switcher need to go on after being killed; None: they cannot
+    use_sim_time
+        whether the nodes take the time from ``/clock``
+    storage
+        how the recorder stores the bag
+    share
+        what of it runs on this host, of several, one of which records; None: all
 
     Raises
     ------
-    InputError : more processes than discovery can handle
+    InputError
+        more processes than discovery can handle
     """
     here = tuple(range(experiment.agents)) if share is None else share.agents
     count = count_processes(experiment, len(here))

@@ -22,12 +22,18 @@ class Newest(Generic[Value]):
 
     Parameters
     ----------
-    agent : index of the agent
-    steps : N, steps of the run
-    inputs : for each mode, the other agents whose states the agent's row uses, ascending
-    peers : every other agent that the agent ever hears or is heard by (of which ``inputs`` are some)
-    reach : gives the newest step that anybody can have reached by now; what claims to be newer is refused
-    start : step that the agent is at already, where it takes over from a process that has gone
+    agent
+        index of the agent
+    steps
+        N, steps of the run
+    inputs
+        for each mode, the other agents whose states the agent's row uses, ascending
+    peers
+        every other agent that the agent ever hears or is heard by (of which ``inputs`` are some)
+    reach
+        gives the newest step that anybody can have reached by now; what claims to be newer is refused
+    start
+        step that the agent is at already, where it takes over from a process that has gone
     """
 
     def __init__(
@@ -61,8 +67,9 @@ class Newest(Generic[Value]):
 
         Returns
         -------
-        None if taken, else the reason (a ``Refusal``). Sojourns must come in sequence, each where the last one ended,
-        and not before their time.
+        str | None
+            None if taken, else the reason (a ``Refusal``). Sojourns must come in sequence, each where the last one
+            ended, and not before their time.
         """
         if not 0 <= first_step <= last_step < self.steps:
             return Refusal.SEQUENCE
@@ -86,7 +93,8 @@ class Newest(Generic[Value]):
 
         Returns
         -------
-        None if taken, else the reason (a ``Refusal``).
+        str | None
+            None if taken, else the reason (a ``Refusal``).
         """
         newest = self._steps_of.get(agent)
         if newest is None:
@@ -118,8 +126,9 @@ class Newest(Generic[Value]):
 
         Returns
         -------
-        mode, and of the agents that the row of this mode uses, ascending, and of nobody else: step and value of the
-        newest state that has been heard, (``NOTHING``, None) where there is none
+        tuple[int, list[tuple[int, Value | None]]]
+            mode, and of the agents that the row of this mode uses, ascending, and of nobody else: step and value of the
+            newest state that has been heard, (``NOTHING``, None) where there is none
         """
         assert self._mode is not None, "not ready"
         return self._mode, [(self._steps_of[j], self._values.get(j)) for j in self._inputs[self._mode]]

@@ -59,8 +59,10 @@ def why_not(data: bytes, record: RunRecord, agent: int, length: int) -> str:
 
     Parameters
     ----------
-    agent : whose topic it is (index from 0)
-    length : of the states there
+    agent
+        whose topic it is (index from 0)
+    length
+        of the states there
     """
     try:
         message = AgentState.decode(data)
@@ -80,8 +82,10 @@ class NetworkNode(QuietNode):
 
     Parameters
     ----------
-    name : of the node
-    record : of the run; the run id is the mark of every message that belongs to it
+    name
+        of the node
+    record
+        of the run; the run id is the mark of every message that belongs to it
     """
 
     def __init__(self, name: str, *, record: RunRecord) -> None:

@@ -12,8 +12,10 @@ class Pace:
 
     Attributes
     ----------
-    rate : steps per second between the last two looks
-    stalled : s for which there has been no step; 0.0 if there was one since the last look
+    rate
+        steps per second between the last two looks
+    stalled
+        s for which there has been no step; 0.0 if there was one since the last look
     """
 
     def __init__(self) -> None:

@@ -44,9 +44,12 @@ class ProcessParameters:
 
     Attributes
     ----------
-    values : by name of the option in the command's function
-    options : which of them are parameters
-    qos_overrides : whether somebody may have asked for another quality of service
+    values
+        by name of the option in the command's function
+    options
+        which of them are parameters
+    qos_overrides
+        whether somebody may have asked for another quality of service
     """
 
     values: dict[str, Any] = field(default_factory=dict)
@@ -163,12 +166,15 @@ def given(node_name: str, arguments: Sequence[str]) -> dict[str, Parameter]:
 
     Parameters
     ----------
-    node_name : of the node
-    arguments : of ROS 2, from ``--ros-args`` on
+    node_name
+        of the node
+    arguments
+        of ROS 2, from ``--ros-args`` on
 
     Raises
     ------
-    InputError : rcl does not take them
+    InputError
+        rcl does not take them
     """
     import rclpy
     from rclpy.context import Context
@@ -211,14 +217,19 @@ def merge(
 
     Parameters
     ----------
-    ctx : of the command
-    options : of the command that are parameters
-    parameters : given by the arguments of ROS 2, by name
-    known : names of the parameters of all our nodes: a file may be for several of them
+    ctx
+        of the command
+    options
+        of the command that are parameters
+    parameters
+        given by the arguments of ROS 2, by name
+    known
+        names of the parameters of all our nodes: a file may be for several of them
 
     Raises
     ------
-    InputError : an unknown name, a wrong type, a value that the option would not take
+    InputError
+        an unknown name, a wrong type, a value that the option would not take
     """
     own = {name_of(option): option for option in options}
     known = set(known) | own.keys()

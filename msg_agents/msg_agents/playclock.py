@@ -14,10 +14,14 @@ class PlayClock:
 
     Parameters
     ----------
-    start : time of the bag [ns] at which it begins
-    rate : seconds of the bag per second of the wall; inf: as fast as it goes
-    paused : whether it stands at first
-    wall : seconds that pass
+    start
+        time of the bag [ns] at which it begins
+    rate
+        seconds of the bag per second of the wall; inf: as fast as it goes
+    paused
+        whether it stands at first
+    wall
+        seconds that pass
     """
 
     def __init__(

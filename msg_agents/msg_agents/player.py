@@ -48,16 +48,26 @@ class PlayOptions:
 
     Attributes
     ----------
-    rate : seconds of the bag per second; inf: as fast as the readers take it
-    start_offset, duration : s of the bag left out at the beginning, and played (None: all of the rest)
-    loop : whether to begin again at the end
-    paused : whether to stand at first
-    clock : Hz at which ``/clock`` is published; None: not
-    topics, exclude : see ``select_topics``
-    remaps : see ``parse_remaps``
-    subscribers : how many readers every topic must have before it begins
-    readers : names of nodes that must read every topic before it begins
-    wait_timeout : s to wait for them
+    rate
+        seconds of the bag per second; inf: as fast as the readers take it
+    start_offset, duration
+        s of the bag left out at the beginning, and played (None: all of the rest)
+    loop
+        whether to begin again at the end
+    paused
+        whether to stand at first
+    clock
+        Hz at which ``/clock`` is published; None: not
+    topics, exclude
+        see ``select_topics``
+    remaps
+        see ``parse_remaps``
+    subscribers
+        how many readers every topic must have before it begins
+    readers
+        names of nodes that must read every topic before it begins
+    wait_timeout
+        s to wait for them
     """
 
     rate: float = 1.0
@@ -80,14 +90,22 @@ class Played:
 
     Attributes
     ----------
-    messages : published
-    seconds : of the wall, since the first
-    held_back : s of them in which readers did not take what was published
-    now : time of the bag, s from its start
-    length : s of the bag, all of it
-    rate : at which it is played
-    paused : whether it stands
-    begun : whether the readers who are waited for were there
+    messages
+        published
+    seconds
+        of the wall, since the first
+    held_back
+        s of them in which readers did not take what was published
+    now
+        time of the bag, s from its start
+    length
+        s of the bag, all of it
+    rate
+        at which it is played
+    paused
+        whether it stands
+    begun
+        whether the readers who are waited for were there
     """
 
     messages: int = 0
@@ -109,12 +127,18 @@ class Player(QuietNode):
 
     Parameters
     ----------
-    bag : to be played
-    options : how
-    keyboard : for pause, step and rate
-    jobs : says when the process had been stopped
-    on_progress : told a few times a second how far it is
-    on_note : told what somebody should know
+    bag
+        to be played
+    options
+        how
+    keyboard
+        for pause, step and rate
+    jobs
+        says when the process had been stopped
+    on_progress
+        told a few times a second how far it is
+    on_note
+        told what somebody should know
     """
 
     def __init__(
@@ -169,7 +193,8 @@ class Player(QuietNode):
 
         Raises
         ------
-        InputError : readers that were to be waited for did not come
+        InputError
+            readers that were to be waited for did not come
         """
         early = self._publish_early()
         self._on_progress(self.played)
@@ -331,16 +356,23 @@ def play(
 
     Parameters
     ----------
-    path : of the bag, or of one of its files
-    options : how
-    on_progress : told a few times a second how far it is
-    on_note : told what somebody should know
-    on_stop, on_continue : called before the process is stopped by Ctrl-Z, and when it goes on
+    path
+        of the bag, or of one of its files
+    options
+        how
+    on_progress
+        told a few times a second how far it is
+    on_note
+        told what somebody should know
+    on_stop, on_continue
+        called before the process is stopped by Ctrl-Z, and when it goes on
 
     Raises
     ------
-    BagError, InputError : no bag, or it cannot be played like that
-    KeyboardInterrupt, SystemExit : by Ctrl-C or another signal
+    BagError, InputError
+        no bag, or it cannot be played like that
+    KeyboardInterrupt, SystemExit
+        by Ctrl-C or another signal
     """
     bag = Playback(path)
     for line in bag.damage:

@@ -22,8 +22,10 @@ class Presence:
 
     Parameters
     ----------
-    node : of the process; it has begun
-    patience : s that they may be away, for example to be started again
+    node
+        of the process; it has begun
+    patience
+        s that they may be away, for example to be started again
     """
 
     def __init__(self, node: NetworkNode, patience: float) -> None:

@@ -41,7 +41,8 @@ def make_executor(kind: str = "events") -> Executor:
 
     Parameters
     ----------
-    kind : "events" or "single"; "single" is there for comparison
+    kind
+        "events" or "single"; "single" is there for comparison
     """
     if kind == "events":
         try:
@@ -90,22 +91,32 @@ def run_nodes(
 
     Parameters
     ----------
-    make_nodes : called once ROS is up
-    executor : "events" or "single"
-    discovery_timeout : s to wait for the other nodes of the run
-    throughput : whether much work in little time counts for more than being woken at once
-    use_sim_time : whether the nodes take the time from ``/clock``; as the ROS parameter of that name
-    account : file that says once a second, and at the end, what the nodes have refused and what they wait for
-    patience : s after which it ends when it has been left alone; None: never
+    make_nodes
+        called once ROS is up
+    executor
+        "events" or "single"
+    discovery_timeout
+        s to wait for the other nodes of the run
+    throughput
+        whether much work in little time counts for more than being woken at once
+    use_sim_time
+        whether the nodes take the time from ``/clock``; as the ROS parameter of that name
+    account
+        file that says once a second, and at the end, what the nodes have refused and what they wait for
+    patience
+        s after which it ends when it has been left alone; None: never
 
     Returns
     -------
-    True if all nodes did their part, False if the process was told to stop (SIGINT, SIGTERM) before
+    bool
+        True if all nodes did their part, False if the process was told to stop (SIGINT, SIGTERM) before
 
     Raises
     ------
-    NotFoundError : with the names of who is missing
-    InputError : what a node failed with, or the names of who is there twice
+    NotFoundError
+        with the names of who is missing
+    InputError
+        what a node failed with, or the names of who is there twice
     """
     # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
     # installed on top, ends the spin between two callbacks.

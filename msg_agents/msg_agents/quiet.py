@@ -30,7 +30,8 @@ class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that myp
 
     Parameters
     ----------
-    name : of the node
+    name
+        of the node
     """
 
     def __init__(self, name: str) -> None:
@@ -119,9 +120,12 @@ def objection(before: QoSProfile, after: QoSProfile, *, publishes: bool) -> str:
 
     Parameters
     ----------
-    before : what our code asks for
-    after : what it would become
-    publishes : whether it is that of a publisher; a publisher may offer more than it has to
+    before
+        what our code asks for
+    after
+        what it would become
+    publishes
+        whether it is that of a publisher; a publisher may offer more than it has to
     """
     if before.history != HistoryPolicy.KEEP_ALL:  # messages may be lost there anyway
         return ""

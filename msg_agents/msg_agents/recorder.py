@@ -56,9 +56,12 @@ class Recorder(NetworkNode):
 
     Parameters
     ----------
-    record : of the run
-    directory : of the bag; must not exist
-    storage : compression and size of its files
+    record
+        of the run
+    directory
+        of the bag; must not exist
+    storage
+        compression and size of its files
     """
 
     def __init__(self, *, record: RunRecord, directory: Path, storage: Storage = DEFAULT) -> None:

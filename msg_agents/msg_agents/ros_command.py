@@ -16,7 +16,8 @@ class RosCommand(click.Command):
 
     Parameters
     ----------
-    node_name : by which parameters are found, where they are given to a certain node; the command's name by default
+    node_name
+        by which parameters are found, where they are given to a certain node; the command's name by default
     """
 
     def __init__(self, *args: Any, node_name: str | None = None, **options: Any) -> None:

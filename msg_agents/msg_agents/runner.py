@@ -44,14 +44,22 @@ class RunResult:
 
     Attributes
     ----------
-    bag : directory; None if nothing was recorded
-    failures : what went wrong, one line each
-    interrupted : whether the user ended the run
-    wall_time : s from the first state to the last one
-    rate : steps per second of wall time
-    restarts : what was killed and started again, one line each
-    strangers : what the nodes refused: "node", "topic", "reason", "count"
-    trajectory, comparison : of the bag, if it could be read
+    bag
+        directory; None if nothing was recorded
+    failures
+        what went wrong, one line each
+    interrupted
+        whether the user ended the run
+    wall_time
+        s from the first state to the last one
+    rate
+        steps per second of wall time
+    restarts
+        what was killed and started again, one line each
+    strangers
+        what the nodes refused: "node", "topic", "reason", "count"
+    trajectory, comparison
+        of the bag, if it could be read
     """
 
     bag: Path | None
@@ -96,27 +104,41 @@ def run_network(
 
     Parameters
     ----------
-    experiment : what to run
-    out : directory in which a new bag is made; None: do not record
-    domain : ROS_DOMAIN_ID; a free one is chosen if not given
-    restarts : how often, in all, agents or the switcher are started again when they were killed; once more ends the run
-    use_sim_time : whether the nodes take the time from ``/clock``, which somebody else publishes in the same domain
-    storage : compression of the bag and size of its files
-    pin : whether the processes of a run in lockstep keep to one core each, where they are more than the cores
-    on_progress : called a few times a second with the step that every agent has reached
-    on_note : called with a line about what happens: a restart, a standstill
-    environment : changes to the environment of the processes
-    record : of the run; a new one is made if not given
-    share : what of it this host runs, of several; None: all. Where there is no recorder, only the logs are kept in
-        the directory of the bag
+    experiment
+        what to run
+    out
+        directory in which a new bag is made; None: do not record
+    domain
+        ROS_DOMAIN_ID; a free one is chosen if not given
+    restarts
+        how often, in all, agents or the switcher are started again when they were killed; once more ends the run
+    use_sim_time
+        whether the nodes take the time from ``/clock``, which somebody else publishes in the same domain
+    storage
+        compression of the bag and size of its files
+    pin
+        whether the processes of a run in lockstep keep to one core each, where they are more than the cores
+    on_progress
+        called a few times a second with the step that every agent has reached
+    on_note
+        called with a line about what happens: a restart, a standstill
+    environment
+        changes to the environment of the processes
+    record
+        of the run; a new one is made if not given
+    share
+        what of it this host runs, of several; None: all. Where there is no recorder, only the logs are kept in the
+        directory of the bag
 
     Returns
     -------
-    The result, without comparison. ``failures`` is empty if every process did its part.
+    RunResult
+        The result, without comparison. ``failures`` is empty if every process did its part.
 
     Raises
     ------
-    NotAvailableError, InputError : the experiment cannot be run; nothing was started or written
+    NotAvailableError, InputError
+        the experiment cannot be run; nothing was started or written
     """
     experiment.require_available()
     count_processes(experiment, None if share is None else len(share.agents))

@@ -17,10 +17,14 @@ class Schedule:
 
     Parameters
     ----------
-    epoch : time of the clock [ns] at which simulated time is 0
-    speed : units of simulated time per second of the clock
-    step_length : dt, units of simulated time
-    phase : part of a step after which it is due, 0 <= phase < 1
+    epoch
+        time of the clock [ns] at which simulated time is 0
+    speed
+        units of simulated time per second of the clock
+    step_length
+        dt, units of simulated time
+    phase
+        part of a step after which it is due, 0 <= phase < 1
     """
 
     def __init__(self, *, epoch: int, speed: float, step_length: float, phase: float = 0.0) -> None:

@@ -13,13 +13,17 @@ def select_topics(topics: Iterable[str], wanted: Sequence[str], excluded: Sequen
 
     Parameters
     ----------
-    topics : names of all topics
-    wanted : names, or patterns such as ``/agent_*/state``; none: all
-    excluded : the same
+    topics
+        names of all topics
+    wanted
+        names, or patterns such as ``/agent_*/state``; none: all
+    excluded
+        the same
 
     Raises
     ------
-    InputError : a name that no topic has, or nothing is left
+    InputError
+        a name that no topic has, or nothing is left
     """
     names = list(topics)
     for option, patterns in (("--topics", wanted), ("--exclude", excluded)):
@@ -46,12 +50,15 @@ def parse_remaps(remaps: Sequence[str], topics: Sequence[str]) -> dict[str, str]
 
     Parameters
     ----------
-    remaps : ``old:=new``; names without a slash at the beginning get one
-    topics : that are played
+    remaps
+        ``old:=new``; names without a slash at the beginning get one
+    topics
+        that are played
 
     Raises
     ------
-    InputError : not of this form, or a topic that is not played
+    InputError
+        not of this form, or a topic that is not played
     """
     names = {name: name for name in topics}
     for remap in remaps:

@@ -39,15 +39,18 @@ class Succession:
 
     Parameters
     ----------
-    path : of a file that names the process; made if there is none
+    path
+        of a file that names the process; made if there is none
 
     Attributes
     ----------
-    predecessor : prefix of the GUIDs of the process before; empty if there was none
+    predecessor
+        prefix of the GUIDs of the process before; empty if there was none
 
     Raises
     ------
-    InputError : another process is running the node
+    InputError
+        another process is running the node
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,12 +74,15 @@ def succeed(directory: Path | None, names: Iterable[str]) -> list[Succession]:
 
     Parameters
     ----------
-    directory : where every node has a file of its name; None: nobody will follow
-    names : of the nodes
+    directory
+        where every node has a file of its name; None: nobody will follow
+    names
+        of the nodes
 
     Raises
     ------
-    InputError : another process is running one of the nodes
+    InputError
+        another process is running one of the nodes
     """
     if directory is None:
         return []
@@ -104,8 +110,10 @@ def farewell(prefix: bytes, number: int = _LATE) -> bytes:
 
     Parameters
     ----------
-    prefix : of its GUIDs, 12 bytes
-    number : sequence number of the message
+    prefix
+        of its GUIDs, 12 bytes
+    number
+        sequence number of the message
     """
     parameters = (
         struct.pack("<HH", _KEY_HASH, 16)
@@ -127,8 +135,10 @@ def bury(prefix: bytes, domain: int) -> None:
 
     Parameters
     ----------
-    prefix : of its GUIDs, 12 bytes
-    domain : ROS_DOMAIN_ID
+    prefix
+        of its GUIDs, 12 bytes
+    domain
+        ROS_DOMAIN_ID
     """
     base = PORT_BASE + PORTS_PER_DOMAIN * domain + 10  # the RTPS rule for the ports of discovery
     addresses = {"127.0.0.1", *os.environ.get(PEERS_VARIABLE, "").split()}

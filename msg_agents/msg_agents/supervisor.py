@@ -35,10 +35,14 @@ class Child:
 
     Attributes
     ----------
-    plan : what it is
-    process : the running process
-    log : file with what it printed
-    number : how many times it has been started
+    plan
+        what it is
+    process
+        the running process
+    log
+        file with what it printed
+    number
+        how many times it has been started
     """
 
     plan: ProcessPlan
@@ -106,11 +110,16 @@ class Supervisor:
 
     Attributes
     ----------
-    logs : directory for what the children print
-    environment : theirs
-    children : in the order of their start
-    steps : newest step of every agent as far as reported
-    cores : the core that a child keeps to, by name; the others run where the scheduler likes
+    logs
+        directory for what the children print
+    environment
+        theirs
+    children
+        in the order of their start
+    steps
+        newest step of every agent as far as reported
+    cores
+        the core that a child keeps to, by name; the others run where the scheduler likes
     """
 
     logs: Path

@@ -60,12 +60,18 @@ class Switcher(NetworkNode):
 
     Parameters
     ----------
-    record : of the run
-    model : its step model, or wiring
-    readers : names of the nodes, besides the agents, that must read the graph before the run starts
-    on_progress : called with the newest step of every agent (-1: none yet) a few times a second, if one has reported
-    checkpoints : directory in which it leaves a mark; whoever finds one there takes over from a process that has gone
-    farewell : s to wait for everybody to say that the end has been heard
+    record
+        of the run
+    model
+        its step model, or wiring
+    readers
+        names of the nodes, besides the agents, that must read the graph before the run starts
+    on_progress
+        called with the newest step of every agent (-1: none yet) a few times a second, if one has reported
+    checkpoints
+        directory in which it leaves a mark; whoever finds one there takes over from a process that has gone
+    farewell
+        s to wait for everybody to say that the end has been heard
     """
 
     def __init__(

@@ -52,12 +52,18 @@ class Synchronizer(Generic[Value]):
 
     Parameters
     ----------
-    agent : index of the agent
-    steps : N, steps of the run
-    inputs : for each mode, the other agents whose states the agent's row uses, ascending
-    peers : every other agent that the agent ever hears or is heard by (of which ``inputs`` are some)
-    window : steps that the agent may be ahead of a peer, >= 0
-    start : step that the agent is at already, where it takes over from a process that has gone
+    agent
+        index of the agent
+    steps
+        N, steps of the run
+    inputs
+        for each mode, the other agents whose states the agent's row uses, ascending
+    peers
+        every other agent that the agent ever hears or is heard by (of which ``inputs`` are some)
+    window
+        steps that the agent may be ahead of a peer, >= 0
+    start
+        step that the agent is at already, where it takes over from a process that has gone
     """
 
     def __init__(
@@ -94,7 +100,9 @@ class Synchronizer(Generic[Value]):
 
         Returns
         -------
-        None if taken, else the reason (a ``Refusal``). Sojourns must come in sequence, each where the last one ended.
+        str | None
+            None if taken, else the reason (a ``Refusal``). Sojourns must come in sequence, each where the last one
+            ended.
         """
         if self._sequence is None:
             if last_step < self.step:
@@ -117,7 +125,8 @@ class Synchronizer(Generic[Value]):
 
         Returns
         -------
-        None if taken, else the reason (a ``Refusal``).
+        str | None
+            None if taken, else the reason (a ``Refusal``).
         """
         buffer = self._buffers.get(agent)
         if buffer is None:
@@ -150,7 +159,8 @@ class Synchronizer(Generic[Value]):
 
         Returns
         -------
-        mode and the states x_j(step), j ascending, of the agents that the row of this mode uses, and of nobody else
+        tuple[int, list[Value]]
+            mode and the states x_j(step), j ascending, of the agents that the row of this mode uses, and of nobody else
         """
         step, buffers = self.step, self._buffers
         return self._mode, [buffers[j][step] for j in self._needed]

@@ -19,8 +19,10 @@ class DueTimer:
 
     Parameters
     ----------
-    node : whose clock counts
-    callback : called when it is time, or a little later
+    node
+        whose clock counts
+    callback
+        called when it is time, or a little later
     """
 
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:

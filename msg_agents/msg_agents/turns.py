@@ -26,9 +26,11 @@ class Turns:
 
     Parameters
     ----------
-    members : number of those who must have joined before the first turn is given: until then some may not be ready to
-        be told anything
-    defer : calls what it is given a little later, when all that waits has been dealt with
+    members
+        number of those who must have joined before the first turn is given: until then some may not be ready to be told
+        anything
+    defer
+        calls what it is given a little later, when all that waits has been dealt with
     """
 
     def __init__(self, members: int, defer: Callable[[Callable[[], None]], object]) -> None:

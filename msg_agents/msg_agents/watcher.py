@@ -37,14 +37,19 @@ class Watcher(QuietNode):
 
     Parameters
     ----------
-    name : of the node
-    on_note : told what somebody should know
+    name
+        of the node
+    on_note
+        told what somebody should know
 
     Attributes
     ----------
-    record : of the run, once it is known; None before
-    known : set when the run is known
-    done : set when the run is over
+    record
+        of the run, once it is known; None before
+    known
+        set when the run is known
+    done
+        set when the run is over
     """
 
     def __init__(self, name: str, *, on_note: Callable[[str], None]) -> None:
@@ -64,7 +69,8 @@ class Watcher(QuietNode):
 
         Raises
         ------
-        InputError : that cannot be done with this run
+        InputError
+            that cannot be done with this run
         """
         raise NotImplementedError
 
@@ -111,18 +117,23 @@ def run_watcher(
 
     Parameters
     ----------
-    make_node : called once ROS is up
-    timeout : s to wait for a network; None: for ever
-    on_note : told what somebody should know
+    make_node
+        called once ROS is up
+    timeout
+        s to wait for a network; None: for ever
+    on_note
+        told what somebody should know
 
     Returns
     -------
-    The node; None: it was interrupted before there was one. Where the run was seen to be over, it is still on the
-    network: end the process at once
+    Kind | None
+        The node; None: it was interrupted before there was one. Where the run was seen to be over, it is still on the
+        network: end the process at once
 
     Raises
     ------
-    InputError : no network came in time, or it cannot be followed
+    InputError
+        no network came in time, or it cannot be followed
     """
     with ros_arguments():
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
@@ -159,7 +170,8 @@ def _spin(executor: Executor, done: Future) -> None:
 
     Raises
     ------
-    KeyboardInterrupt : by Ctrl-C or another signal
+    KeyboardInterrupt
+        by Ctrl-C or another signal
     """
     caught: list[int] = []
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -28,7 +28,8 @@ def workshop(room: int | None = None) -> Iterator[Path]:
 
     Parameters
     ----------
-    room : bytes that will be mapped into memory; the folder then is in memory, if there is plenty of it
+    room
+        bytes that will be mapped into memory; the folder then is in memory, if there is plenty of it
     """
     _clear_abandoned()
     parent = MEMORY if room is not None and _free(MEMORY) > SPARE * room else None

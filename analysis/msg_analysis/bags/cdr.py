@@ -36,7 +36,8 @@ def stamp_ns(data: bytes) -> int:
 
     Raises
     ------
-    CdrError : too short, or of an unknown encapsulation
+    CdrError
+        too short, or of an unknown encapsulation
     """
     try:
         seconds, nanoseconds = _STAMP[data[:2]].unpack_from(data)
@@ -50,10 +51,14 @@ class StateCodec:
 
     Parameters
     ----------
-    run : the 16 bytes of the run id
-    agent : number of the agent, from 1
-    replicas : length of every state
-    dt : length of a step [units of simulated time]
+    run
+        the 16 bytes of the run id
+    agent
+        number of the agent, from 1
+    replicas
+        length of every state
+    dt
+        length of a step [units of simulated time]
     """
 
     def __init__(self, run: bytes, agent: int, replicas: int, dt: float) -> None:
@@ -68,12 +73,13 @@ class StateCodec:
 
         Parameters
         ----------
-        step, mode, state : int, int, FloatArray
-            k; graph of the step that led here, from 1 (0 at step 0); (replicas,) x(k), float64
+        step, mode, state
+            int, int, FloatArray k; graph of the step that led here, from 1 (0 at step 0); (replicas,) x(k), float64
 
         Raises
         ------
-        ValueError : state of another shape or type (its bytes would be a different message)
+        ValueError
+            state of another shape or type (its bytes would be a different message)
         """
         if state.shape != self._shape or state.dtype != np.float64:
             raise ValueError(f"state: {state.dtype} of shape {state.shape}, expected float64 of shape {self._shape}")
@@ -95,14 +101,19 @@ class StateFrame:
 
     Parameters
     ----------
-    run : the 16 bytes of the run id
-    replicas : length of every state
-    most_heard : largest length of ``heard``
+    run
+        the 16 bytes of the run id
+    replicas
+        length of every state
+    most_heard
+        largest length of ``heard``
 
     Attributes
     ----------
-    replicas : as given
-    size : bytes of the longest message
+    replicas
+        as given
+    size
+        bytes of the longest message
     """
 
     def __init__(self, run: bytes, replicas: int, most_heard: int = 0) -> None:
@@ -139,8 +150,10 @@ def with_state(data: bytes, payload: bytes, size: int | None = None) -> bytes:
 
     Parameters
     ----------
-    data, payload : the message, and the bytes of the new state
-    size : bytes of the old state; as many as those of the new one if not given
+    data, payload
+        the message, and the bytes of the new state
+    size
+        bytes of the old state; as many as those of the new one if not given
     """
     if size is None or size == len(payload):
         return data[: len(data) - len(payload)] + payload
@@ -153,14 +166,22 @@ class AgentState:
 
     Attributes
     ----------
-    stamp : simulated time of the step [ns]
-    run : 16 bytes
-    agent : from 1
-    step : k
-    mode : from 1; 0 at step 0
-    state : (replicas,)
-    heard : (neighbours,) steps of the values used; empty: all of k - 1
-    frame_id : of the header
+    stamp
+        simulated time of the step [ns]
+    run
+        16 bytes
+    agent
+        from 1
+    step
+        k
+    mode
+        from 1; 0 at step 0
+    state
+        (replicas,)
+    heard
+        (neighbours,) steps of the values used; empty: all of k - 1
+    frame_id
+        of the header
     """
 
     stamp: int
@@ -201,14 +222,22 @@ class ActiveGraph:
 
     Attributes
     ----------
-    stamp : simulated time at which it begins [ns]
-    run : 16 bytes
-    sequence : number of the sojourn, from 0
-    mode : from 1
-    name : of the graph
-    first_step, last_step : the steps k -> k+1 with first_step <= k <= last_step use it
-    arcs : (source, target, weight), agents from 1: target listens to source
-    frame_id : of the header
+    stamp
+        simulated time at which it begins [ns]
+    run
+        16 bytes
+    sequence
+        number of the sojourn, from 0
+    mode
+        from 1
+    name
+        of the graph
+    first_step, last_step
+        the steps k -> k+1 with first_step <= k <= last_step use it
+    arcs
+        (source, target, weight), agents from 1: target listens to source
+    frame_id
+        of the header
     """
 
     stamp: int
@@ -278,11 +307,16 @@ class Progress:
 
     Attributes
     ----------
-    stamp : simulated time of the step [ns]
-    run : 16 bytes
-    agent : from 1
-    step : newest step that it has published
-    frame_id : of the header
+    stamp
+        simulated time of the step [ns]
+    run
+        16 bytes
+    agent
+        from 1
+    step
+        newest step that it has published
+    frame_id
+        of the header
     """
 
     stamp: int

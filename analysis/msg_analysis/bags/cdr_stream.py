@@ -37,12 +37,15 @@ class CdrReader:
 
     Parameters
     ----------
-    data : the message
-    kind : its name in errors
+    data
+        the message
+    kind
+        its name in errors
 
     Raises
     ------
-    CdrError : here and by all methods, where the bytes are not what is asked for
+    CdrError
+        here and by all methods, where the bytes are not what is asked for
     """
 
     def __init__(self, data: bytes, kind: str) -> None:

@@ -37,11 +37,11 @@ def gather(data: bytes, start: IntArray, size: int) -> AnyArray:
 
     Parameters
     ----------
-    data : bytes
+    data
         the buffer
-    start : IntArray
+    start
         (pieces,) where each begins
-    size : int
+    size
         bytes of each, at least 1
 
     Returns
@@ -51,7 +51,8 @@ def gather(data: bytes, start: IntArray, size: int) -> AnyArray:
 
     Raises
     ------
-    IndexError : a piece that is not all in the buffer
+    IndexError
+        a piece that is not all in the buffer
     """
     count = len(data) - size + 1
     if count < 1:
@@ -68,14 +69,15 @@ def unpack(content: bytes, zstd: zstandard.ZstdDecompressor) -> bytes:
 
     Parameters
     ----------
-    content : bytes
+    content
         of the chunk's record
-    zstd : zstandard.ZstdDecompressor
-        to be used again from chunk to chunk: making one takes longer than a small chunk
+    zstd
+        zstandard.ZstdDecompressor to be used again from chunk to chunk: making one takes longer than a small chunk
 
     Raises
     ------
-    DamageError : too large, or a wrong checksum; decompressors raise errors of their own
+    DamageError
+        too large, or a wrong checksum; decompressors raise errors of their own
     """
     _, _, size, crc, name_size = _CHUNK.unpack_from(content)
     at = _CHUNK.size + name_size
@@ -108,10 +110,10 @@ def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | N
 
     Parameters
     ----------
-    data : bytes
+    data
         the records in the chunk
-    index : Sequence[bytes]
-        contents of the message index records behind the chunk
+    index
+        Sequence[bytes] contents of the message index records behind the chunk
 
     Returns
     -------
@@ -143,9 +145,9 @@ def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
 
     Parameters
     ----------
-    data : bytes
+    data
         a part of a file
-    at : int
+    at
         where a record begins
 
     Returns
@@ -193,10 +195,10 @@ def indexed(start: IntArray, index: Sequence[bytes]) -> bool:
 
     Parameters
     ----------
-    start : IntArray
+    start
         (messages,) where the content of each message's record starts, ascending
-    index : Sequence[bytes]
-        contents of the message index records behind the chunk
+    index
+        Sequence[bytes] contents of the message index records behind the chunk
     """
     if not all(map(_is_index, index)):
         return False

@@ -43,9 +43,9 @@ class Collector:
 
         Parameters
         ----------
-        batch : Batch
+        batch
             messages
-        chosen : IntArray
+        chosen
             indices of those that are states
         """
         states, undecodable = decode_states(batch, chosen, self._position)
@@ -63,14 +63,15 @@ class Collector:
 
         Parameters
         ----------
-        record : RunRecord
+        record
             of the run
-        width : int
+        width
             length of its states
 
         Raises
         ------
-        BagError : the run is too large for the memory of this machine
+        BagError
+            the run is too large for the memory of this machine
         """
         expected = run_number(record.run.bytes)
         if expected in self._expected:
@@ -94,7 +95,7 @@ class Collector:
 
         Parameters
         ----------
-        run : bytes
+        run
             16 bytes of its id
         """
         return self._counts[run_number(run)]
@@ -125,19 +126,26 @@ class Collected:
 
     Parameters
     ----------
-    record : of the run
-    width : length of its states
+    record
+        of the run
+    width
+        length of its states
 
     Attributes
     ----------
-    states : (N + 1, m, width); NaN where a state is missing
-    modes : (N + 1, m) from 0; -1 where missing
-    lost, used, made : see ``Trajectory``
-    received, duplicates, out_of_order, refused : see ``Completeness``
+    states
+        (N + 1, m, width); NaN where a state is missing
+    modes
+        (N + 1, m) from 0; -1 where missing
+    lost, used, made
+        see ``Trajectory``
+    received, duplicates, out_of_order, refused
+        see ``Completeness``
 
     Raises
     ------
-    BagError : the run is too large for the memory of this machine
+    BagError
+        the run is too large for the memory of this machine
     """
 
     def __init__(self, record: RunRecord, width: int) -> None:
@@ -181,7 +189,7 @@ class Collected:
 
         Parameters
         ----------
-        states : States
+        states
             in the order of the bag, and all behind those that came before
         """
         states, values = self._good(states)
@@ -299,7 +307,8 @@ def _out_of_order(position: IntArray) -> int:
 
     Parameters
     ----------
-    position : (N + 1, m) place in the bag, from 1; 0 where a state is missing
+    position
+        (N + 1, m) place in the bag, from 1; 0 where a state is missing
     """
     late = 0
     for column in position.T:  # one agent at a time: less memory
@@ -314,7 +323,8 @@ class _Links:
 
     Attributes
     ----------
-    most : largest number of neighbours
+    most
+        largest number of neighbours
     """
 
     def __init__(self, model: Wiring, steps: int) -> None:

@@ -35,10 +35,14 @@ class FileInventory:
 
     Attributes
     ----------
-    file : as it was read: how it ends, what is damaged
-    count : messages by topic, first and last log time
-    summary : at its end; None where it has none that can be believed
-    problem : why nothing can be read of it; None where something can
+    file
+        as it was read: how it ends, what is damaged
+    count
+        messages by topic, first and last log time
+    summary
+        at its end; None where it has none that can be believed
+    problem
+        why nothing can be read of it; None where something can
     """
 
     file: McapFile
@@ -97,7 +101,8 @@ class Inventory:
 
     Attributes
     ----------
-    files : in their order
+    files
+        in their order
     """
 
     files: list[FileInventory] = field(default_factory=list)

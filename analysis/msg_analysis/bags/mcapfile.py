@@ -39,10 +39,14 @@ class Batch:
 
     Attributes
     ----------
-    data : bytes in which they are; before the CDR bytes of each message there is the rest of its record
-    start, size : (messages,) where the CDR bytes begin in ``data``, and how many they are
-    head : (messages,) of type ``MESSAGE_HEAD``
-    end : bytes of the file up to the end of the chunk, or of the last record, that they are from
+    data
+        bytes in which they are; before the CDR bytes of each message there is the rest of its record
+    start, size
+        (messages,) where the CDR bytes begin in ``data``, and how many they are
+    head
+        (messages,) of type ``MESSAGE_HEAD``
+    end
+        bytes of the file up to the end of the chunk, or of the last record, that they are from
     """
 
     data: bytes
@@ -57,7 +61,8 @@ class Batch:
 
         Raises
         ------
-        DamageError : too short for a message, or a time that no clock has
+        DamageError
+            too short for a message, or a time that no clock has
         """
         if (size < MESSAGE_HEAD.itemsize).any():
             raise DamageError
@@ -89,9 +94,12 @@ class _Chunk:
 
     Attributes
     ----------
-    content : of its record
-    end : bytes of the file up to its own end
-    index : contents of the message index records behind it
+    content
+        of its record
+    end
+        bytes of the file up to its own end
+    index
+        contents of the message index records behind it
     """
 
     content: bytes
@@ -111,7 +119,8 @@ class _Source:
 
     Parameters
     ----------
-    stream : of which nothing else reads
+    stream
+        of which nothing else reads
     """
 
     def __init__(self, stream: io.BufferedReader) -> None:
@@ -132,8 +141,9 @@ class _Source:
 
         Returns
         -------
-        the bytes in which they are; (messages,) where the content of each begins there, and its size; bytes of all:
-        0 where the first is too long for this, or cut off
+        tuple[bytes, IntArray, IntArray, int]
+            the bytes in which they are; (messages,) where the content of each begins there, and its size; bytes of all:
+            0 where the first is too long for this, or cut off
         """
         if self._at >= len(head):
             self._at -= len(head)
@@ -156,14 +166,22 @@ class McapFile:
 
     Attributes
     ----------
-    path : of the file; compressed as a whole where it ends with .zstd
-    channels, schemas : seen so far, by number
-    metadata, attachments : seen so far
-    profile, library : of the header
-    whole_bytes : length of the whole records so far
-    torn : what is there instead of the end of the file; None where it ends well (known when all is read)
-    damaged_chunks : chunks whose content did not survive; the reading goes on behind them
-    false_indexes : chunks whose message index says what is not so: here the records decide, others go by it
+    path
+        of the file; compressed as a whole where it ends with .zstd
+    channels, schemas
+        seen so far, by number
+    metadata, attachments
+        seen so far
+    profile, library
+        of the header
+    whole_bytes
+        length of the whole records so far
+    torn
+        what is there instead of the end of the file; None where it ends well (known when all is read)
+    damaged_chunks
+        chunks whose content did not survive; the reading goes on behind them
+    false_indexes
+        chunks whose message index says what is not so: here the records decide, others go by it
     """
 
     path: Path
@@ -183,7 +201,8 @@ class McapFile:
 
         Raises
         ------
-        BagError : not an MCAP file, empty, or one that cannot be read
+        BagError
+            not an MCAP file, empty, or one that cannot be read
         """
         try:
             size = self.path.stat().st_size

@@ -27,9 +27,12 @@ class ChannelCount:
 
     Attributes
     ----------
-    topic, type_name, type_hash : of the channel
-    qos : offered profiles, the same list as in the MCAP channel
-    messages : counted so far
+    topic, type_name, type_hash
+        of the channel
+    qos
+        offered profiles, the same list as in the MCAP channel
+    messages
+        counted so far
     """
 
     topic: str
@@ -45,9 +48,12 @@ class FileCount:
 
     Attributes
     ----------
-    name : without directory
-    start, end : log times of the first and the last message [ns]
-    channels : its topics, by name
+    name
+        without directory
+    start, end
+        log times of the first and the last message [ns]
+    channels
+        its topics, by name
     """
 
     name: str
@@ -71,10 +77,10 @@ def bag_information(files: Sequence[FileCount], custom: Mapping[str, str]) -> di
 
     Parameters
     ----------
-    files : Sequence[FileCount]
-        its files, in order
-    custom : Mapping[str, str]
-        our own entries
+    files
+        Sequence[FileCount] its files, in order
+    custom
+        Mapping[str, str] our own entries
     """
     topics = total_channels(files)
     start = min(file.start for file in files)
@@ -134,10 +140,10 @@ def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
 
     Parameters
     ----------
-    directory : Path
+    directory
         of the bag
-    information : Mapping[str, Any]
-        from :func:`bag_information`
+    information
+        Mapping[str, Any] from :func:`bag_information`
     """
     temporary = directory / f".{METADATA_FILE}.tmp"
     with temporary.open("w", encoding="utf-8") as stream:
@@ -162,7 +168,8 @@ def read_metadata(directory: Path) -> dict[str, Any] | None:
 
     Raises
     ------
-    BagError : not the metadata of a bag
+    BagError
+        not the metadata of a bag
     """
     file = directory / METADATA_FILE
     try:

@@ -39,12 +39,18 @@ class BagTopic:
 
     Attributes
     ----------
-    name : absolute
-    type_name : of its messages, such as ``std_msgs/msg/String``
-    encoding : of its messages; ``cdr`` in ROS 2
-    type_hash : of its type's description; empty where the bag does not say
-    latched : whether a publisher of it kept its messages for those who come late
-    messages : how many there are
+    name
+        absolute
+    type_name
+        of its messages, such as ``std_msgs/msg/String``
+    encoding
+        of its messages; ``cdr`` in ROS 2
+    type_hash
+        of its type's description; empty where the bag does not say
+    latched
+        whether a publisher of it kept its messages for those who come late
+    messages
+        how many there are
     """
 
     name: str
@@ -61,8 +67,10 @@ class _Outline:
 
     Attributes
     ----------
-    lows : (end of a piece of the file [bytes], earliest log time in it [ns]), in the order of the file
-    start, end : log times of the earliest and the latest message [ns]; None without messages
+    lows
+        (end of a piece of the file [bytes], earliest log time in it [ns]), in the order of the file
+    start, end
+        log times of the earliest and the latest message [ns]; None without messages
     """
 
     path: Path
@@ -89,17 +97,22 @@ class Playback:
 
     Parameters
     ----------
-    path : the directory of a bag, or one of its .mcap files; whole or torn
+    path
+        the directory of a bag, or one of its .mcap files; whole or torn
 
     Attributes
     ----------
-    topics : by name; those of which there are messages
-    start, end : log times of the earliest and the latest message [ns]
-    damage : what is wrong with its files, a line each; damaged chunks may show only while they are read
+    topics
+        by name; those of which there are messages
+    start, end
+        log times of the earliest and the latest message [ns]
+    damage
+        what is wrong with its files, a line each; damaged chunks may show only while they are read
 
     Raises
     ------
-    BagError : no bag, or without messages
+    BagError
+        no bag, or without messages
     """
 
     def __init__(self, path: Path) -> None:
@@ -142,8 +155,10 @@ class Playback:
 
         Parameters
         ----------
-        topics : names
-        until : time [ns] of the last ones that are wanted; what is behind them in the bag is not read
+        topics
+            names
+        until
+            time [ns] of the last ones that are wanted; what is behind them in the bag is not read
         """
         newest: dict[str, int] = {}
         pending: list[tuple[int, int, str, bytes]] = []  # time, position in the bag, topic, data
@@ -286,7 +301,8 @@ def _outline(path: Path) -> _Outline:
 
     Raises
     ------
-    BagError : not an MCAP file, empty, or one that cannot be read
+    BagError
+        not an MCAP file, empty, or one that cannot be read
     """
     outline, file = _Outline(path), McapFile(path)
     for batch in file.batches():

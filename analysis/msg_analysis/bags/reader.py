@@ -43,10 +43,10 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
 
     Parameters
     ----------
-    path : str | Path
-        the directory of a bag, with metadata.yaml or without, or one of its .mcap files; torn files are read
-        up to the tear
-    inventory : Inventory | None
+    path
+        the directory of a bag, with metadata.yaml or without, or one of its .mcap files; torn files are read up to the
+        tear
+    inventory
         is filled with what the files hold, also where no run can be made of it
 
     Returns
@@ -56,8 +56,10 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
 
     Raises
     ------
-    BagError : no bag, a bag without the run record, or with several runs
-    InputError : the run record in it is not valid
+    BagError
+        no bag, a bag without the run record, or with several runs
+    InputError
+        the run record in it is not valid
     """
     path = Path(path)
     contents = _Contents()
@@ -82,12 +84,13 @@ def bag_files(path: Path) -> list[Path]:
 
     Parameters
     ----------
-    path : Path
+    path
         directory or file
 
     Raises
     ------
-    BagError : there is none, one is missing, or the bag is of a kind that cannot be read
+    BagError
+        there is none, one is missing, or the bag is of a kind that cannot be read
     """
     if path.is_file():
         return [path]

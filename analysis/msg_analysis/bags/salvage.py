@@ -27,14 +27,19 @@ class SalvageReport:
 
     Attributes
     ----------
-    kept_messages : in the new bag
-    kept_bytes, dropped_bytes : of the torn files: their whole records, and what follows them. Of a file that is
-        compressed as a whole: kept when unpacked; how many are dropped is not known (0)
-    lost_messages : in damaged chunks of files that still say how many they had; what was in a part that is cut off
-        cannot be known
-    damaged_chunks : chunks in the whole part whose content was lost
-    dropped_files : files of which nothing can be read
-    torn : what was there instead of the end of the file; None where all ended well
+    kept_messages
+        in the new bag
+    kept_bytes, dropped_bytes
+        of the torn files: their whole records, and what follows them. Of a file that is compressed as a whole: kept
+        when unpacked; how many are dropped is not known (0)
+    lost_messages
+        in damaged chunks of files that still say how many they had; what was in a part that is cut off cannot be known
+    damaged_chunks
+        chunks in the whole part whose content was lost
+    dropped_files
+        files of which nothing can be read
+    torn
+        what was there instead of the end of the file; None where all ended well
     """
 
     kept_messages: int
@@ -63,14 +68,15 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
 
     Parameters
     ----------
-    torn : str | Path
+    torn
         file or directory
-    out : str | Path
+    out
         directory of the new bag; must not exist
 
     Raises
     ------
-    BagError : no message can be read, it is still being recorded, or ``out`` exists or cannot be written
+    BagError
+        no message can be read, it is still being recorded, or ``out`` exists or cannot be written
     """
     out = Path(out).absolute()
     _refuse_living(Path(torn))
@@ -109,12 +115,13 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
 
     Parameters
     ----------
-    directory : str | Path
+    directory
         with .mcap files and no metadata.yaml
 
     Raises
     ------
-    BagError : it is a bag already, is still being recorded, or cannot be read or written
+    BagError
+        it is a bag already, is still being recorded, or cannot be read or written
     """
     directory = Path(directory).absolute()
     if (directory / METADATA_FILE).exists():

@@ -18,9 +18,10 @@ class MessageType:
 
     Attributes
     ----------
-    package, name : of the type
-    type_hash : RIHS01 hash of its description (REP-2016), as rosidl writes it to
-        ``share/<package>/msg/<name>.json``
+    package, name
+        of the type
+    type_hash
+        RIHS01 hash of its description (REP-2016), as rosidl writes it to ``share/<package>/msg/<name>.json``
     """
 
     package: str
@@ -74,9 +75,12 @@ class Topic:
 
     Attributes
     ----------
-    name : absolute
-    type : of its messages
-    latched : whether who comes late still gets the messages
+    name
+        absolute
+    type
+        of its messages
+    latched
+        whether who comes late still gets the messages
     """
 
     name: str
@@ -107,11 +111,11 @@ def network_topics(agents: int, namespace: str = "", *, truth: bool = False) -> 
 
     Parameters
     ----------
-    agents : int
+    agents
         their number m
-    namespace : str
+    namespace
         of the network, such as ``/lab``; empty for the root
-    truth : bool
+    truth
         whether the states are published with noise, and as they are on a topic of their own
     """
     root = "/" + namespace.strip("/") + "/" if namespace.strip("/") else "/"

@@ -36,11 +36,16 @@ class States:
 
     Attributes
     ----------
-    data : bytes in which they are, in the agents' own layout
-    start : (messages,) where the CDR bytes of each begin
-    head : (messages,) their beginnings
-    replicas : (messages,) length of ``state``
-    position : (messages,) place in the bag
+    data
+        bytes in which they are, in the agents' own layout
+    start
+        (messages,) where the CDR bytes of each begin
+    head
+        (messages,) their beginnings
+    replicas
+        (messages,) length of ``state``
+    position
+        (messages,) place in the bag
     """
 
     data: bytes
@@ -122,11 +127,11 @@ def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States
 
     Parameters
     ----------
-    batch : Batch
+    batch
         messages
-    chosen : IntArray
+    chosen
         indices of those that are states
-    position : int
+    position
         place in the bag of the first of them
 
     Returns

@@ -18,9 +18,11 @@ class Storage:
 
     Attributes
     ----------
-    compression : of the chunks of the files
-    split_size : bytes of messages after which the bag goes on in a new file; None: one file. A file gets larger by its
-        head, its summary and a chunk
+    compression
+        of the chunks of the files
+    split_size
+        bytes of messages after which the bag goes on in a new file; None: one file. A file gets larger by its head, its
+        summary and a chunk
     """
 
     compression: Compression = "zstd"

@@ -26,16 +26,17 @@ def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Sto
 
     Parameters
     ----------
-    trajectory : Trajectory
+    trajectory
         of the twin, or read from another bag; what is missing in it is missing in the bag
-    directory : str | Path
+    directory
         of the bag; must not exist
-    storage : Storage
+    storage
         compression and size of its files
 
     Raises
     ------
-    BagError : the directory exists or cannot be written
+    BagError
+        the directory exists or cannot be written
     """
     directory = Path(directory).absolute()
     if directory.exists():

@@ -45,16 +45,21 @@ class BagWriter:
 
     Parameters
     ----------
-    directory : of the bag; must not exist, or be empty
-    topics : what it will hold
-    record : the run record as JSON; kept in every file as well, so that a torn bag, or a single file of it, still tells
-        what run it is of
-    storage : compression, and whether the bag goes on in a new file when one is large enough. Each file is finished,
-        and on the disk, before the next one begins
+    directory
+        of the bag; must not exist, or be empty
+    topics
+        what it will hold
+    record
+        the run record as JSON; kept in every file as well, so that a torn bag, or a single file of it, still tells what
+        run it is of
+    storage
+        compression, and whether the bag goes on in a new file when one is large enough. Each file is finished, and on
+        the disk, before the next one begins
 
     Raises
     ------
-    BagError : the directory exists or cannot be made
+    BagError
+        the directory exists or cannot be made
     """
 
     def __init__(
@@ -135,16 +140,17 @@ class BagWriter:
 
         Parameters
         ----------
-        topic : str
+        topic
             absolute name of one of the bag's topics
-        data : bytes
+        data
             the message as CDR, with its encapsulation header
-        time_ns : int
+        time_ns
             simulated time [ns]; :func:`msg_analysis.bags.cdr.stamp_ns` takes it from the message's header
 
         Raises
         ------
-        BagError : the disk is full or the bag is closed; what was written before stays readable
+        BagError
+            the disk is full or the bag is closed; what was written before stays readable
         """
         channel = self._channels.get(topic)
         if channel is None or self._closed:
@@ -175,7 +181,8 @@ class BagWriter:
 
         Raises
         ------
-        BagError : the disk is full
+        BagError
+            the disk is full
         """
         try:
             self._mcap.flush()
@@ -187,12 +194,13 @@ class BagWriter:
 
         Parameters
         ----------
-        complete : bool
+        complete
             whether the recorder saw the end of the run
 
         Raises
         ------
-        BagError : the disk is full; the marker stays and the file can be salvaged
+        BagError
+            the disk is full; the marker stays and the file can be salvaged
         """
         if self._closed:
             return
@@ -234,7 +242,7 @@ def recording_pid(directory: Path) -> int | None:
 
     Parameters
     ----------
-    directory : Path
+    directory
         of a bag
     """
     try:

@@ -23,9 +23,12 @@ class LossTest:
 
     Attributes
     ----------
-    lost : messages
-    expected : number of messages times the probability
-    p : None where there was no message
+    lost
+        messages
+    expected
+        number of messages times the probability
+    p
+        None where there was no message
     """
 
     lost: int
@@ -50,11 +53,16 @@ class LossTally:
 
     Attributes
     ----------
-    probability : p
-    pairs : (links, 2) receiver and sender of every link that is in any graph
-    messages, lost : (links,) messages of each, and how many of them were lost
-    successive, successive_pairs : sum of xi xi' of successive messages of a link, and their number
-    same_step, same_step_pairs : sum of xi xi' of pairs of messages in one step, and their number
+    probability
+        p
+    pairs
+        (links, 2) receiver and sender of every link that is in any graph
+    messages, lost
+        (links,) messages of each, and how many of them were lost
+    successive, successive_pairs
+        sum of xi xi' of successive messages of a link, and their number
+    same_step, same_step_pairs
+        sum of xi xi' of pairs of messages in one step, and their number
     """
 
     def __init__(self, observation: Observation | Measurement) -> None:
@@ -145,8 +153,10 @@ class BroadcastSums:
 
     Attributes
     ----------
-    scatter : (m, m) sum of the products of the agents' noise
-    samples : number of published values, replicas counted
+    scatter
+        (m, m) sum of the products of the agents' noise
+    samples
+        number of published values, replicas counted
     """
 
     def __init__(self, observation: Observation) -> None:

@@ -18,12 +18,15 @@ def batch_interval(series: FloatArray, level: float = 0.95) -> tuple[float, floa
 
     Parameters
     ----------
-    series : (N,)
-    level : nominal coverage
+    series
+        (N,)
+    level
+        nominal coverage
 
     Returns
     -------
-    (low, high), or None for a series shorter than two values a batch
+    tuple[float, float] | None
+        (low, high), or None for a series shorter than two values a batch
     """
     length = len(series) // BATCHES
     if length < 2:

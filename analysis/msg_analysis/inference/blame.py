@@ -48,15 +48,23 @@ class Cause:
 
     Attributes
     ----------
-    kind : what it is about
-    words : a sentence
-    agent : number of the agent, from 1; None where it is not one
-    link : numbers of sender and receiver, or of both ends of an edge; None where it is not one link
-    graph : its name; of switching [from, to] or [from]; None where it is all of them
-    estimate, expected : what was measured and what the experiment says: a factor of a gain or of a variance (expected
-        1), a share, a rate
-    interval : 95 %, for this one cause
-    p : adjusted for all that could have been blamed; 0 where it is impossible otherwise
+    kind
+        what it is about
+    words
+        a sentence
+    agent
+        number of the agent, from 1; None where it is not one
+    link
+        numbers of sender and receiver, or of both ends of an edge; None where it is not one link
+    graph
+        its name; of switching [from, to] or [from]; None where it is all of them
+    estimate, expected
+        what was measured and what the experiment says: a factor of a gain or of a variance (expected 1), a share, a
+        rate
+    interval
+        95 %, for this one cause
+    p
+        adjusted for all that could have been blamed; 0 where it is impossible otherwise
     """
 
     kind: Kind
@@ -90,11 +98,16 @@ class Accused:
 
     Attributes
     ----------
-    names : of the graphs
-    chain, dt : of the graphs, and the time of a step
-    reference : of the leaders
-    innovations, transitions, loss, broadcast : sums over the runs; the latter None where there are none
-    loss_probability : what it should be
+    names
+        of the graphs
+    chain, dt
+        of the graphs, and the time of a step
+    reference
+        of the leaders
+    innovations, transitions, loss, broadcast
+        sums over the runs; the latter None where there are none
+    loss_probability
+        what it should be
     """
 
     names: Sequence[str]
@@ -112,9 +125,12 @@ def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list
 
     Parameters
     ----------
-    accused : the runs
-    level : chance of blaming anything where nothing is wrong
-    rejected : names of the tests that reject
+    accused
+        the runs
+    level
+        chance of blaming anything where nothing is wrong
+    rejected
+        names of the tests that reject
     """
     sums, names = accused.innovations, accused.names
     still = suspects.frozen(sums)

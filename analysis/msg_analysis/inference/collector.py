@@ -36,17 +36,24 @@ class StepCollector:
 
     Parameters
     ----------
-    agents : their number m
-    modes : number of graphs
-    last : last step of the run
-    lockstep : whether all agents make a step with the same graph; then a step is ready only with the one after it,
-        which says which graph that was. Otherwise the graph is not asked for
+    agents
+        their number m
+    modes
+        number of graphs
+    last
+        last step of the run
+    lockstep
+        whether all agents make a step with the same graph; then a step is ready only with the one after it, which says
+        which graph that was. Otherwise the graph is not asked for
 
     Attributes
     ----------
-    refused : states, or steps, that do not count, by reason
-    newest : largest step that anything came of; -1: none
-    whole : largest step that came whole; -1: none
+    refused
+        states, or steps, that do not count, by reason
+    newest
+        largest step that anything came of; -1: none
+    whole
+        largest step that came whole; -1: none
     """
 
     def __init__(self, agents: int, modes: int, last: int, *, lockstep: bool) -> None:
@@ -63,10 +70,14 @@ class StepCollector:
 
         Parameters
         ----------
-        agent : index from 0
-        step : k
-        mode : graph of the step that led there, from 1; 0 at step 0
-        payload : its numbers
+        agent
+            index from 0
+        step
+            k
+        mode
+            graph of the step that led there, from 1; 0 at step 0
+        payload
+            its numbers
         """
         row = self._rows.get(step)
         if row is None:
@@ -98,10 +109,9 @@ class StepCollector:
 
         Returns
         -------
-        steps : (b,) k
-        modes : (b,) graph of the step k -> k+1, from 0; 0 if it is not asked for
-        states : (b, m, width) x(k)
-        after : (b, m, width) x(k+1); x(k) if the graph is not asked for
+        tuple[IntArray, IntArray, FloatArray, FloatArray]
+            steps : (b,) k modes : (b,) graph of the step k -> k+1, from 0; 0 if it is not asked for states : (b, m,
+            width) x(k) after : (b, m, width) x(k+1); x(k) if the graph is not asked for
         """
         ready, self._ready = self._ready, []
         steps = np.array([entry[0] for entry in ready], dtype=np.int64)

@@ -57,24 +57,41 @@ class Comparison:
 
     Attributes
     ----------
-    trajectory : what was compared
-    level : chance of a false "disagrees"
-    steps : steps used: all, or those before the first gap
-    system_error, node_errors, covariance, innovations, switching : one test or several each
-    continuous_error : the paper's continuous-time system error; None where it has none
-    batch : model-free interval for the system error
-    tests : the family, in the order of the report
-    running : "time" [simulated time], "system_error" and "standard_error" of the mean up to then (400 points)
-    loss : of the messages that were lost; None where none can be
-    p_broadcast : of the noise in what was published; None without
-    unpredicted : why there is no prediction; None where there is one
-    transient : steps at the start that are left out of the measured errors; None with a prediction, which knows them
-    timing, laws : in real time: how time was kept, and which laws the log supports; None in lockstep. The errors and
-        the covariance are then held against the first of the laws that there is
-    given : errors given the path of the graphs; None where they are not had
-    order : which agents are more certain than which; None where that is not known
-    blame : what is wrong, where the verdict is "disagrees"
-    pool : the runs, where they are several; ``trajectory`` has then no data, but the account of what is missing
+    trajectory
+        what was compared
+    level
+        chance of a false "disagrees"
+    steps
+        steps used: all, or those before the first gap
+    system_error, node_errors, covariance, innovations, switching
+        one test or several each
+    continuous_error
+        the paper's continuous-time system error; None where it has none
+    batch
+        model-free interval for the system error
+    tests
+        the family, in the order of the report
+    running
+        "time" [simulated time], "system_error" and "standard_error" of the mean up to then (400 points)
+    loss
+        of the messages that were lost; None where none can be
+    p_broadcast
+        of the noise in what was published; None without
+    unpredicted
+        why there is no prediction; None where there is one
+    transient
+        steps at the start that are left out of the measured errors; None with a prediction, which knows them
+    timing, laws
+        in real time: how time was kept, and which laws the log supports; None in lockstep. The errors and the
+        covariance are then held against the first of the laws that there is
+    given
+        errors given the path of the graphs; None where they are not had
+    order
+        which agents are more certain than which; None where that is not known
+    blame
+        what is wrong, where the verdict is "disagrees"
+    pool
+        the runs, where they are several; ``trajectory`` has then no data, but the account of what is missing
     """
 
     trajectory: Trajectory
@@ -184,16 +201,18 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
 
     Parameters
     ----------
-    trajectory : from a bag or from the twin. If something is missing, the numbers are those of the complete
-        beginning
-    level : chance of calling a run that follows its law one that disagrees
+    trajectory
+        from a bag or from the twin. If something is missing, the numbers are those of the complete beginning
+    level
+        chance of calling a run that follows its law one that disagrees
 
     Where the law has no prediction (a protocol that is not linear, or not here), the run is measured, and only its
     graphs and losses are tested.
 
     Raises
     ------
-    InputError : no prediction (too large, unbounded), or a log that does not say what is needed
+    InputError
+        no prediction (too large, unbounded), or a log that does not say what is needed
     """
     protocol = trajectory.record.experiment.protocol
     unpredicted = protocol.unpredictable() if protocol else None
@@ -219,11 +238,16 @@ def judge(
 
     Parameters
     ----------
-    trajectory : of the run; of several runs, one that has the account of what is missing
-    prediction : of their experiment
-    evidence : of all of them
-    level : chance of a false "disagrees"
-    more : names and p-values of further tests of the same law
+    trajectory
+        of the run; of several runs, one that has the account of what is missing
+    prediction
+        of their experiment
+    evidence
+        of all of them
+    level
+        chance of a false "disagrees"
+    more
+        names and p-values of further tests of the same law
     """
     means = evidence.means
     system_error, node_errors = estimates(means, prediction.system)

@@ -21,11 +21,16 @@ class Estimate:
 
     Attributes
     ----------
-    measured, predicted : time mean over the run, and its exact expectation
-    standard_error : of the measured one, the martingale one
-    z : (measured - predicted) / standard_error
-    p : two-sided, of z
-    p_holm : adjusted over the nodes; None for the system error
+    measured, predicted
+        time mean over the run, and its exact expectation
+    standard_error
+        of the measured one, the martingale one
+    z
+        (measured - predicted) / standard_error
+    p
+        two-sided, of z
+    p_holm
+        adjusted over the nodes; None for the system error
     """
 
     measured: float | None = None
@@ -65,8 +70,10 @@ def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Esti
 
     Parameters
     ----------
-    means : what was measured, and what is expected
-    system : whose second moments these are
+    means
+        what was measured, and what is expected
+    system
+        whose second moments these are
     """
     combinations = np.vstack([means.trace, means.nodes])
     measured, predicted = combinations @ means.measured, combinations @ means.predicted
@@ -83,7 +90,8 @@ def beside(measured: FloatArray, predicted: FloatArray, errors: FloatArray) -> t
 
     Parameters
     ----------
-    measured, predicted, errors : (1 + nodes,) first of the system, then of the nodes; errors are standard errors
+    measured, predicted, errors
+        (1 + nodes,) first of the system, then of the nodes; errors are standard errors
     """
     found = [estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
     tested = [i for i, entry in enumerate(found) if i > 0 and entry.p is not None]
@@ -101,9 +109,12 @@ def estimate(measured: float, predicted: float, error: float, scale: float) -> E
 
     Parameters
     ----------
-    measured, predicted : the error
-    error : standard error of the measured one
-    scale : of all errors: a standard error that is nothing but rounding next to it counts as none
+    measured, predicted
+        the error
+    error
+        standard error of the measured one
+    scale
+        of all errors: a standard error that is nothing but rounding next to it counts as none
     """
     if error <= 1e-12 * scale or error == 0.0:  # without noise: nothing but rounding
         return Estimate(float(measured), float(predicted), float(error))

@@ -18,8 +18,10 @@ class Order:
 
     Attributes
     ----------
-    position : (N, m) place of the event in which agent i makes x_i(k+1)
-    contradiction : why the times in the log cannot be those of a cause and its effect; None where they can
+    position
+        (N, m) place of the event in which agent i makes x_i(k+1)
+    contradiction
+        why the times in the log cannot be those of a cause and its effect; None where they can
     """
 
     position: IntArray

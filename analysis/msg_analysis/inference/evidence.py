@@ -23,13 +23,20 @@ class Evidence:
 
     Attributes
     ----------
-    steps : of all runs
-    means : time means, and what is expected of them
-    decisive : whether they are held against a law that is exact
-    given : errors given the path; None where they are not had
-    innovations, transitions : of all runs
-    loss, broadcast : None where nothing is lost, or nothing is noisy
-    timing, laws : of one run in real time
+    steps
+        of all runs
+    means
+        time means, and what is expected of them
+    decisive
+        whether they are held against a law that is exact
+    given
+        errors given the path; None where they are not had
+    innovations, transitions
+        of all runs
+    loss, broadcast
+        None where nothing is lost, or nothing is noisy
+    timing, laws
+        of one run in real time
     """
 
     steps: int
@@ -49,8 +56,10 @@ class Evidence:
 
         Parameters
         ----------
-        observation : of the run
-        level : at which laws of a run in real time are tested
+        observation
+            of the run
+        level
+            at which laws of a run in real time are tested
         """
         laws, timing, position, given = None, None, None, None
         if observation.timers:

@@ -16,12 +16,15 @@ def covariance_statistic(scatter: FloatArray, samples: int) -> tuple[float, floa
 
     Parameters
     ----------
-    scatter : (r, r) sum of e e^T
-    samples : number of vectors
+    scatter
+        (r, r) sum of e e^T
+    samples
+        number of vectors
 
     Returns
     -------
-    (inf, degrees of freedom) where the vectors do not span their space
+    tuple[float, float]
+        (inf, degrees of freedom) where the vectors do not span their space
     """
     rank = len(scatter)
     if samples < 10 * rank:

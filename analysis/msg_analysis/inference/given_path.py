@@ -36,11 +36,16 @@ class GivenPath:
 
     Attributes
     ----------
-    measured : (m,) time means over the run
-    expected : (m,) their exact expectation given the path
-    predicted : (m,) their expectation over all paths
-    covariance : (m, m) of measured - expected
-    unconditional : variance of the measured system error over all paths
+    measured
+        (m,) time means over the run
+    expected
+        (m,) their exact expectation given the path
+    predicted
+        (m,) their expectation over all paths
+    covariance
+        (m, m) of measured - expected
+    unconditional
+        variance of the measured system error over all paths
     """
 
     measured: FloatArray
@@ -84,8 +89,10 @@ def given_path(observation: Observation, means: TimeMeans) -> GivenPath | None:
 
     Parameters
     ----------
-    observation : of the run
-    means : its time means over all paths
+    observation
+        of the run
+    means
+        its time means over all paths
     """
     system, steps = observation.prediction.system, observation.steps
     if symmetric.size(system.dimension) > MAX_JOINT or not means.joint or observation.timers:

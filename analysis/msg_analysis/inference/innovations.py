@@ -36,10 +36,14 @@ class InnovationTests:
 
     Attributes
     ----------
-    p_covariance : covariance of the innovations against N_g; 0 if anything moves where there is no noise
-    p_whiteness : correlation in time (lags 1..10) and between replicas
-    p_gain : regression on what the agents heard: wrong gains, references, offsets
-    p_common_gain : the same for one factor of all gains: messages that are ignored
+    p_covariance
+        covariance of the innovations against N_g; 0 if anything moves where there is no noise
+    p_whiteness
+        correlation in time (lags 1..10) and between replicas
+    p_gain
+        regression on what the agents heard: wrong gains, references, offsets
+    p_common_gain
+        the same for one factor of all gains: messages that are ignored
     """
 
     p_covariance: float | None
@@ -54,8 +58,10 @@ class _Directions:
 
     Attributes
     ----------
-    whitener : (r, m)
-    quiet : (m, m - r) orthonormal basis of the directions without noise
+    whitener
+        (r, m)
+    quiet
+        (m, m - r) orthonormal basis of the directions without noise
     """
 
     whitener: FloatArray
@@ -67,16 +73,26 @@ class InnovationSums:
 
     Attributes
     ----------
-    noises : (n, m, m) what their covariance should be
-    samples : (n,) number of innovations, replicas counted, of each graph
-    scatter : (n, m, m) sum of e e^T
-    still : (n, m) steps in which no replica of an agent changed
-    quiet : largest |e| in directions without noise
-    largest : largest |x|
-    replicas : of a run
-    terms : what the innovations were regressed on
-    score, covariance : (K,), (K, K) of that regression
-    gram : (K, K) see ``StateRegression.gram``; None where it cannot be had
+    noises
+        (n, m, m) what their covariance should be
+    samples
+        (n,) number of innovations, replicas counted, of each graph
+    scatter
+        (n, m, m) sum of e e^T
+    still
+        (n, m) steps in which no replica of an agent changed
+    quiet
+        largest |e| in directions without noise
+    largest
+        largest |x|
+    replicas
+        of a run
+    terms
+        what the innovations were regressed on
+    score, covariance
+        (K,), (K, K) of that regression
+    gram
+        (K, K) see ``StateRegression.gram``; None where it cannot be had
     """
 
     def __init__(self, observation: Observation, position: IntArray | None = None) -> None:
@@ -200,7 +216,8 @@ def innovation_tests(observation: Observation, position: IntArray | None = None)
 
     Parameters
     ----------
-    position : (N, m) in real time, when the states were made (``events.Order.position``)
+    position
+        (N, m) in real time, when the states were made (``events.Order.position``)
     """
     return InnovationSums(observation, position).tests()
 
@@ -289,8 +306,10 @@ def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, i
 
     Parameters
     ----------
-    vector : (q,)
-    covariance : (q, q)
+    vector
+        (q,)
+    covariance
+        (q, q)
     """
     variances = np.diag(covariance)
     alive = np.flatnonzero(variances > 1e-24 * variances.max(initial=0.0))

@@ -30,9 +30,12 @@ class Law:
 
     Attributes
     ----------
-    system_error : measured, and predicted by this law
-    supported : whether the log goes with it; None where that cannot be said
-    why : in words
+    system_error
+        measured, and predicted by this law
+    supported
+        whether the log goes with it; None where that cannot be said
+    why
+        in words
     """
 
     system_error: Estimate
@@ -50,9 +53,12 @@ class Laws:
 
     Attributes
     ----------
-    pattern : given the values and graphs that the agents say they used; exact whatever the timing
-    sequential : nobody is late, everything is heard at once
-    continuous : the paper's
+    pattern
+        given the values and graphs that the agents say they used; exact whatever the timing
+    sequential
+        nobody is late, everything is heard at once
+    continuous
+        the paper's
     """
 
     pattern: Law
@@ -94,10 +100,14 @@ def measure_laws(observation: Observation, order: Order, timing: Timing, level: 
 
     Parameters
     ----------
-    observation : of a run in real time
-    order : of its events
-    timing : of the run
-    level : chance of not supporting a law that holds
+    observation
+        of a run in real time
+    order
+        of its events
+    timing
+        of the run
+    level
+        chance of not supporting a law that holds
     """
     sequential = time_means(replace(observation, states=sampled(observation)))
     error, p = _least(observation, sequential)

@@ -47,17 +47,28 @@ class TimeMeans:
 
     Attributes
     ----------
-    second_moments : (d, d) time mean of y y^T
-    expected_moments : (d, d) its exact expectation under the run's start and length
-    joint : whether what follows is about all entries of y y^T, packed (q = p); else the node errors (q = m)
-    measured : (q,) time means, replicas averaged
-    predicted : (q,) their exact expectation under the run's start and length
-    covariance : (q, q) of measured under the model
-    squares : number of steps whose squares make up ``covariance``; 0 where it is known from the model
-    nodes : (m, q) the node errors as combinations of them; (0, q) where they are too many
-    trace : (q,) the system error as a combination of them
-    system_series : (N,) system error of every step, replicas averaged
-    system_variances : (N,) of the system error: Var(D_k | y_k, g_k), or what stands for it with lost messages
+    second_moments
+        (d, d) time mean of y y^T
+    expected_moments
+        (d, d) its exact expectation under the run's start and length
+    joint
+        whether what follows is about all entries of y y^T, packed (q = p); else the node errors (q = m)
+    measured
+        (q,) time means, replicas averaged
+    predicted
+        (q,) their exact expectation under the run's start and length
+    covariance
+        (q, q) of measured under the model
+    squares
+        number of steps whose squares make up ``covariance``; 0 where it is known from the model
+    nodes
+        (m, q) the node errors as combinations of them; (0, q) where they are too many
+    trace
+        (q,) the system error as a combination of them
+    system_series
+        (N,) system error of every step, replicas averaged
+    system_variances
+        (N,) of the system error: Var(D_k | y_k, g_k), or what stands for it with lost messages
     """
 
     second_moments: FloatArray
@@ -79,11 +90,16 @@ class Value:
 
     Attributes
     ----------
-    probability : (n,) P_gj
-    surprises : (n, q, p + 1): E[f(next) | next graph j] - E[f(next)] = surprises[j] @ a
-    forms : (n, q, d, d) Y_j
-    weights : (d, d) W_g
-    noise : (d, d) N_g
+    probability
+        (n,) P_gj
+    surprises
+        (n, q, p + 1): E[f(next) | next graph j] - E[f(next)] = surprises[j] @ a
+    forms
+        (n, q, d, d) Y_j
+    weights
+        (d, d) W_g
+    noise
+        (d, d) N_g
     """
 
     probability: FloatArray
@@ -97,7 +113,8 @@ class Value:
 
         Parameters
         ----------
-        a : (b, p + 1) of some steps
+        a
+            (b, p + 1) of some steps
         """
         total = np.zeros((self.forms.shape[1],) * 2)
         for probability, surprise in zip(self.probability, self.surprises, strict=True):
@@ -112,7 +129,8 @@ class Value:
 
         Parameters
         ----------
-        total : (p + 1,) sum of a over the steps
+        total
+            (p + 1,) sum of a over the steps
         """
         moved = self.weights @ symmetric.unpack(total[:-1], len(self.weights)) @ self.weights.T
         seen = 2.0 * total[-1] * self.noise + 4.0 * moved
@@ -148,10 +166,14 @@ class SharedValue:
 
     Attributes
     ----------
-    probability : (n,) P_gj
-    surprises : (n, q, p + 1): f(next) - F_k = surprises[j] @ b for the next graph j
-    reached : (q, p + 1): F_k = reached @ b
-    expected : (q, p + 1): E[f(next)] = expected @ a
+    probability
+        (n,) P_gj
+    surprises
+        (n, q, p + 1): f(next) - F_k = surprises[j] @ b for the next graph j
+    reached
+        (q, p + 1): F_k = reached @ b
+    expected
+        (q, p + 1): E[f(next)] = expected @ a
     """
 
     probability: FloatArray
@@ -275,9 +297,9 @@ def forms_of(
 
     Returns
     -------
-    forms : (q, p) on packed y y^T
-    nodes : (m, q) the node errors as combinations of them; (0, q) if only the system error is estimated
-    trace : (q,) the system error, which is the sum of the node errors
+    tuple[FloatArray, FloatArray, FloatArray]
+        forms : (q, p) on packed y y^T nodes : (m, q) the node errors as combinations of them; (0, q) if only the system
+        error is estimated trace : (q,) the system error, which is the sum of the node errors
     """
     per_node = symmetric.pack(system.lift[:, :, None] * system.lift[:, None, :])
     if kind == "joint":

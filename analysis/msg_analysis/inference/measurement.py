@@ -22,11 +22,16 @@ class Measurement:
 
     Attributes
     ----------
-    first : step from which on it is measured
-    step : who hears whom, and how the graphs switch
-    deviations : (N - first, m, R) of the agents from the reference, or in consensus from their mean
-    modes : (N,) g(0..N-1)
-    lost : (N, m, D) see ``Trajectory.lost``
+    first
+        step from which on it is measured
+    step
+        who hears whom, and how the graphs switch
+    deviations
+        (N - first, m, R) of the agents from the reference, or in consensus from their mean
+    modes
+        (N,) g(0..N-1)
+    lost
+        (N, m, D) see ``Trajectory.lost``
     """
 
     first: int

@@ -14,11 +14,13 @@ def holm(p_values: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    p_values : (q,)
+    p_values
+        (q,)
 
     Returns
     -------
-    (q,) in the order given
+    FloatArray
+        (q,) in the order given
     """
     order = np.argsort(p_values)
     stepped = p_values[order] * np.arange(len(p_values), 0, -1)

@@ -25,9 +25,12 @@ class Timers:
 
     Attributes
     ----------
-    graphs : (N, m) index of the graph that the agent used
-    used : (N, m, D) see ``Trajectory.used``
-    made : (N + 1, m) [ns of simulated time] see ``Trajectory.made``
+    graphs
+        (N, m) index of the graph that the agent used
+    used
+        (N, m, D) see ``Trajectory.used``
+    made
+        (N + 1, m) [ns of simulated time] see ``Trajectory.made``
     """
 
     graphs: IntArray
@@ -41,13 +44,20 @@ class Observation:
 
     Attributes
     ----------
-    prediction : of the experiment that the record says was run
-    states : (N + 1, m, R) x(0..N), as of ``bounded``
-    modes : (N,) g(0..N-1)
-    start : (m, R) x(0) of the record
-    published : (N + 1, m, R) what others heard of x(0..N), where that is not the truth; else None
-    lost : (N, m, D) see ``Trajectory.lost``
-    timers : in real time; None in lockstep
+    prediction
+        of the experiment that the record says was run
+    states
+        (N + 1, m, R) x(0..N), as of ``bounded``
+    modes
+        (N,) g(0..N-1)
+    start
+        (m, R) x(0) of the record
+    published
+        (N + 1, m, R) what others heard of x(0..N), where that is not the truth; else None
+    lost
+        (N, m, D) see ``Trajectory.lost``
+    timers
+        in real time; None in lockstep
     """
 
     prediction: Prediction
@@ -64,7 +74,8 @@ class Observation:
 
         Raises
         ------
-        InputError : a run in real time whose log does not say what the agents used
+        InputError
+            a run in real time whose log does not say what the agents used
         """
         real_time = trajectory.record.experiment.run.pace == "realtime"
         steps = _known_steps(trajectory) if real_time else trajectory.prefix
@@ -107,7 +118,8 @@ class Observation:
 
         Parameters
         ----------
-        numbers_per_step : size of the largest temporary array, per step
+        numbers_per_step
+            size of the largest temporary array, per step
         """
         length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
         for first in range(0, self.steps, length):

@@ -36,12 +36,18 @@ class LiveReport:
 
     Attributes
     ----------
-    first, last : first and last step that went into the errors; -1: none did
-    steps : how many did
-    newest : largest step that anything has come of; -1: nothing has
-    system, nodes : measured beside predicted
-    note : why there is no prediction, or no standard error; None where there are both
-    refused : states or steps that do not count, by reason
+    first, last
+        first and last step that went into the errors; -1: none did
+    steps
+        how many did
+    newest
+        largest step that anything has come of; -1: nothing has
+    system, nodes
+        measured beside predicted
+    note
+        why there is no prediction, or no standard error; None where there are both
+    refused
+        states or steps that do not count, by reason
     """
 
     first: int
@@ -67,11 +73,13 @@ class LiveEstimate:
 
     Parameters
     ----------
-    record : of the run
+    record
+        of the run
 
     Raises
     ------
-    InputError : no prediction (too large, unbounded)
+    InputError
+        no prediction (too large, unbounded)
     """
 
     def __init__(self, record: RunRecord) -> None:
@@ -114,13 +122,17 @@ class RunningErrors:
 
     Parameters
     ----------
-    record : of the run
-    prediction : of its experiment; None: the errors are only measured
+    record
+        of the run
+    prediction
+        of its experiment; None: the errors are only measured
 
     Attributes
     ----------
-    first, last, count : first and last step that was added, and how many were; -1, -1, 0 at first
-    nodes_judged : whether there are standard errors of the nodes too
+    first, last, count
+        first and last step that was added, and how many were; -1, -1, 0 at first
+    nodes_judged
+        whether there are standard errors of the nodes too
     """
 
     def __init__(self, record: RunRecord, prediction: Prediction | None) -> None:
@@ -144,9 +156,12 @@ class RunningErrors:
 
         Parameters
         ----------
-        steps : (b,) k, each once ever
-        modes : (b,) graph of the step k -> k+1, from 0
-        states, after : (b, m, width) x(k), x(k+1)
+        steps
+            (b,) k, each once ever
+        modes
+            (b,) graph of the step k -> k+1, from 0
+        states, after
+            (b, m, width) x(k), x(k+1)
         """
         if not len(steps):
             return
@@ -192,7 +207,8 @@ class _Judge:
 
     Attributes
     ----------
-    nodes : whether of the node errors too, and not only of the system error
+    nodes
+        whether of the node errors too, and not only of the system error
     """
 
     def __init__(self, prediction: Prediction, replicas: int) -> None:
@@ -270,7 +286,8 @@ class _Expected:
 
     Attributes
     ----------
-    total : (m,)
+    total
+        (m,)
     """
 
     def __init__(self, prediction: Prediction) -> None:

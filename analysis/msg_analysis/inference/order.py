@@ -26,10 +26,14 @@ class Distinction:
 
     Attributes
     ----------
-    better, worse : the one with the smaller measured error, and the other
-    difference, standard_error : of the measured errors, worse less better
-    confidence : 1 - p, adjusted for all pairs (Holm)
-    predicted : whether theory has them in this order (True), in the other (False), or equal (None)
+    better, worse
+        the one with the smaller measured error, and the other
+    difference, standard_error
+        of the measured errors, worse less better
+    confidence
+        1 - p, adjusted for all pairs (Holm)
+    predicted
+        whether theory has them in this order (True), in the other (False), or equal (None)
     """
 
     better: int
@@ -57,11 +61,16 @@ class Order:
 
     Attributes
     ----------
-    ranking : numbers from 1, smallest measured error first
-    predicted_ranking : the same of the predicted errors; None without a prediction
-    distinctions : pairs that can be told apart, surest first
-    pairs : that were looked at
-    level : chance that any distinction is wrong
+    ranking
+        numbers from 1, smallest measured error first
+    predicted_ranking
+        the same of the predicted errors; None without a prediction
+    distinctions
+        pairs that can be told apart, surest first
+    pairs
+        that were looked at
+    level
+        chance that any distinction is wrong
     """
 
     ranking: tuple[int, ...]
@@ -103,8 +112,10 @@ def order_of_nodes(means: TimeMeans, level: float) -> Order | None:
 
     Parameters
     ----------
-    means : of a run, or of several
-    level : chance of telling any pair apart wrongly
+    means
+        of a run, or of several
+    level
+        chance of telling any pair apart wrongly
     """
     if not len(means.nodes):
         return None
@@ -117,10 +128,14 @@ def order_of(measured: FloatArray, covariance: FloatArray, predicted: FloatArray
 
     Parameters
     ----------
-    measured : (q,) estimates
-    covariance : (q, q) of them
-    predicted : (q,) what they should be, or None
-    level : chance of telling any pair apart wrongly
+    measured
+        (q,) estimates
+    covariance
+        (q, q) of them
+    predicted
+        (q,) what they should be, or None
+    level
+        chance of telling any pair apart wrongly
     """
     q = len(measured)
     first, second = np.triu_indices(q, 1)

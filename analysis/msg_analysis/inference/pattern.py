@@ -47,12 +47,15 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
 
     Parameters
     ----------
-    observation : of a run in real time
-    means : what ``pattern_means`` says of it
+    observation
+        of a run in real time
+    means
+        what ``pattern_means`` says of it
 
     Returns
     -------
-    the quotient less 1; None where there is no error to speak of
+    float | None
+        the quotient less 1; None where there is no error to speak of
     """
     experiment = observation.prediction.experiment
     graphs, used, made = IdealTimers(experiment, observation.step).log(observation.modes)
@@ -68,8 +71,10 @@ def pattern_means(observation: Observation, order: Order) -> TimeMeans:
 
     Parameters
     ----------
-    observation : of a run in real time
-    order : of its events
+    observation
+        of a run in real time
+    order
+        of its events
 
     Raises
     ------

@@ -31,8 +31,10 @@ class Period:
 
     Attributes
     ----------
-    matrix : (S', S)
-    noise : (S', S') covariance
+    matrix
+        (S', S)
+    noise
+        (S', S') covariance
     """
 
     matrix: FloatArray
@@ -44,8 +46,10 @@ class Periods:
 
     Parameters
     ----------
-    observation : in real time
-    position : (N, m) order in which the states were made
+    observation
+        in real time
+    position
+        (N, m) order in which the states were made
     """
 
     def __init__(self, observation: Observation, position: IntArray) -> None:
@@ -157,8 +161,10 @@ class _Live:
 
     Parameters
     ----------
-    entries : of the stack
-    agents : m; keys from there on are numbers of the noise, fresh and of variance 1 where they are not known yet
+    entries
+        of the stack
+    agents
+        m; keys from there on are numbers of the noise, fresh and of variance 1 where they are not known yet
     """
 
     def __init__(self, entries: int, agents: int) -> None:

@@ -28,12 +28,18 @@ class Member:
 
     Attributes
     ----------
-    name : of its bag
-    record : of the run
-    steps : used: all, or those before the first gap; 0 where these are too few
-    completeness : of the bag
-    system_error : measured and predicted
-    verdict : on this run alone
+    name
+        of its bag
+    record
+        of the run
+    steps
+        used: all, or those before the first gap; 0 where these are too few
+    completeness
+        of the bag
+    system_error
+        measured and predicted
+    verdict
+        on this run alone
     """
 
     name: str
@@ -66,8 +72,10 @@ class Pool:
 
     Attributes
     ----------
-    members : one for each run
-    chi2, dof, p : whether their system errors differ by more than chance makes them; None with less than two
+    members
+        one for each run
+    chi2, dof, p
+        whether their system errors differ by more than chance makes them; None with less than two
     """
 
     members: tuple[Member, ...]
@@ -88,12 +96,15 @@ def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.0
 
     Parameters
     ----------
-    runs : name and trajectory, one after the other; none is kept
-    level : chance of calling runs that follow their law ones that disagree
+    runs
+        name and trajectory, one after the other; none is kept
+    level
+        chance of calling runs that follow their law ones that disagree
 
     Raises
     ------
-    InputError : experiments that differ, a run that is there twice, or no prediction
+    InputError
+        experiments that differ, a run that is there twice, or no prediction
     """
     total: Evidence | None = None
     prediction: Prediction | None = None

@@ -24,10 +24,14 @@ class Rate:
 
     Attributes
     ----------
-    jumps : (from, to) of which they are, from 0
-    origin : the graph that is left, where it is all jumps of one; None for all
-    factor, interval : over what they should be; 95 % by the likelihood ratio
-    log_p : adjusted, see ``selection``
+    jumps
+        (from, to) of which they are, from 0
+    origin
+        the graph that is left, where it is all jumps of one; None for all
+    factor, interval
+        over what they should be; 95 % by the likelihood ratio
+    log_p
+        adjusted, see ``selection``
     """
 
     jumps: tuple[tuple[int, int], ...]
@@ -42,10 +46,14 @@ def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, l
 
     Parameters
     ----------
-    counts : (n, n) of transitions from step to step
-    chain : what it should be
-    dt : time of a step
-    families, level : see ``selection.select``
+    counts
+        (n, n) of transitions from step to step
+    chain
+        what it should be
+    dt
+        time of a step
+    families, level
+        see ``selection.select``
     """
     n = chain.modes
     transition = chain.transition(dt)

@@ -30,8 +30,10 @@ class Neighbours:
 
     Attributes
     ----------
-    senders : (n, m, D) the d-th neighbour, ascending; the agent itself beyond their number
-    count : (n, m) their number
+    senders
+        (n, m, D) the d-th neighbour, ascending; the agent itself beyond their number
+    count
+        (n, m) their number
     """
 
     senders: IntArray
@@ -66,15 +68,24 @@ class Reception:
 
     Attributes
     ----------
-    modes : (b,) graphs of the network
-    graphs : (b, m) graphs that the agents used; in lockstep those of the network
-    states : (b, m, R) x
-    published : (N + 1, m, R) what the agents published, of all steps
-    used : (b, m, D) step of the value of the d-th neighbour that was used; any where none came
-    senders : (b, m, D) who that neighbour is
-    weights : (b, m, D) nominal weights of what came; 0 for others
-    own : (b, m) weight of an agent's own state, which stands for what did not come too
-    link_variance : (b, m) of the link noise in what each agent heard
+    modes
+        (b,) graphs of the network
+    graphs
+        (b, m) graphs that the agents used; in lockstep those of the network
+    states
+        (b, m, R) x
+    published
+        (N + 1, m, R) what the agents published, of all steps
+    used
+        (b, m, D) step of the value of the d-th neighbour that was used; any where none came
+    senders
+        (b, m, D) who that neighbour is
+    weights
+        (b, m, D) nominal weights of what came; 0 for others
+    own
+        (b, m) weight of an agent's own state, which stands for what did not come too
+    link_variance
+        (b, m) of the link noise in what each agent heard
     """
 
     modes: IntArray
@@ -132,7 +143,8 @@ class Reception:
 
         Parameters
         ----------
-        order : (b, m) agents of each step, first to last
+        order
+            (b, m) agents of each step, first to last
         """
         if order is None and (self.graphs == self.modes[:, None]).all():
             for mode in np.unique(self.modes):
@@ -181,9 +193,12 @@ class Equalizer:
 
     Attributes
     ----------
-    possible : whether every step so far could be brought there
-    chi2, dof : sum of e^T N^+ e, and how many numbers have gone into it
-    quiet : largest innovation in directions without noise
+    possible
+        whether every step so far could be brought there
+    chi2, dof
+        sum of e^T N^+ e, and how many numbers have gone into it
+    quiet
+        largest innovation in directions without noise
     """
 
     def __init__(self, step: StepModel, full: FloatArray) -> None:
@@ -252,9 +267,12 @@ class HeardRegression:
 
     Parameters
     ----------
-    observation : of the run
-    most : largest number of regressors
-    position : (N, m) when the states were made; needed in real time, if the noise is correlated
+    observation
+        of the run
+    most
+        largest number of regressors
+    position
+        (N, m) when the states were made; needed in real time, if the noise is correlated
     """
 
     def __init__(self, observation: Observation, most: int, position: IntArray | None = None) -> None:

@@ -22,11 +22,16 @@ class Term:
 
     Attributes
     ----------
-    kind : "constant"; "link": x_j - x_i; "lead": x_i less the reference; "pull": all that pulls the agent, together
-    agent : i
-    graph : the graph in whose steps it is not 0; None for all of them
-    sender : j of a link
-    weight : what multiplies it in the law, so that a gain that is wrong by a share s has the coefficient s * weight
+    kind
+        "constant"; "link": x_j - x_i; "lead": x_i less the reference; "pull": all that pulls the agent, together
+    agent
+        i
+    graph
+        the graph in whose steps it is not 0; None for all of them
+    sender
+        j of a link
+    weight
+        what multiplies it in the law, so that a gain that is wrong by a share s has the coefficient s * weight
     """
 
     kind: Literal["constant", "link", "lead", "pull"]
@@ -98,12 +103,15 @@ def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[T
 
     Parameters
     ----------
-    step : whose law it is
-    most : largest number of regressors K
+    step
+        whose law it is
+    most
+        largest number of regressors K
 
     Returns
     -------
-    rows (K,), inputs (n, K, m + 1), and what each of them is
+    tuple[IntArray, FloatArray, list[Term]]
+        rows (K,), inputs (n, K, m + 1), and what each of them is
     """
     n, m = step.modes, step.agents
     terms = [Term("constant", i) for i in range(m)]

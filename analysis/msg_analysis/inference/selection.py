@@ -24,8 +24,10 @@ class Candidate:
 
     Attributes
     ----------
-    part, what : what it is, for those who made it
-    direction : (K,) change of the parameters for a change by 1
+    part, what
+        what it is, for those who made it
+    direction
+        (K,) change of the parameters for a change by 1
     """
 
     part: str
@@ -39,9 +41,12 @@ class Selected:
 
     Attributes
     ----------
-    part, what : of the candidate
-    estimate, standard_error : of the change, with all others that were found
-    log_p : logarithm of the p-value, adjusted for all candidates
+    part, what
+        of the candidate
+    estimate, standard_error
+        of the change, with all others that were found
+    log_p
+        logarithm of the p-value, adjusted for all candidates
     """
 
     part: str
@@ -67,15 +72,21 @@ def select(
 
     Parameters
     ----------
-    score : (K,) with mean information @ change
-    information : (K, K) covariance of the score where nothing is wrong
-    classes : candidates, class by class
-    families : number of classes, those of other scores included
-    level : chance of finding anything where nothing is wrong
+    score
+        (K,) with mean information @ change
+    information
+        (K, K) covariance of the score where nothing is wrong
+    classes
+        candidates, class by class
+    families
+        number of classes, those of other scores included
+    level
+        chance of finding anything where nothing is wrong
 
     Returns
     -------
-    what was found, and the change (K,) of the parameters that it makes together
+    tuple[list[Selected], FloatArray]
+        what was found, and the change (K,) of the parameters that it makes together
     """
     candidates, penalties = _distinct(classes, families)
     if not candidates:

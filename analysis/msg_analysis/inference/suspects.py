@@ -28,9 +28,12 @@ class Suspects:
 
     Attributes
     ----------
-    score : (K,)
-    information : (K, K)
-    classes : candidates, class by class, the more specific ones of equal ones first
+    score
+        (K,)
+    information
+        (K, K)
+    classes
+        candidates, class by class, the more specific ones of equal ones first
     """
 
     score: FloatArray
@@ -53,8 +56,10 @@ def gains(sums: InnovationSums, pardoned: Iterable[int]) -> Suspects | None:
 
     Parameters
     ----------
-    sums : of the innovations
-    pardoned : agents that are left out
+    sums
+        of the innovations
+    pardoned
+        agents that are left out
     """
     if sums.gram is None or len(sums.terms) > MAX_PARAMETERS:
         return None
@@ -121,9 +126,12 @@ def noise(sums: InnovationSums, pardoned: Iterable[int], change: FloatArray) -> 
 
     Parameters
     ----------
-    sums : of the innovations
-    pardoned : agents that are left out
-    change : (K,) coefficients of the regression that were found, whose part of the innovations is no noise
+    sums
+        of the innovations
+    pardoned
+        agents that are left out
+    change
+        (K,) coefficients of the regression that were found, whose part of the innovations is no noise
     """
     n, m = sums.still.shape
     out = np.zeros(m, np.bool_)

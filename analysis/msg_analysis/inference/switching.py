@@ -24,9 +24,12 @@ class SwitchingTest:
 
     Attributes
     ----------
-    counts : (n, n) observed
-    expected : (n, n) visits of the row times P
-    p : None where the chain leaves nothing to test; 0 if a transition happened that P forbids
+    counts
+        (n, n) observed
+    expected
+        (n, n) visits of the row times P
+    p
+        None where the chain leaves nothing to test; 0 if a transition happened that P forbids
     """
 
     counts: IntArray
@@ -40,8 +43,10 @@ class Transitions:
 
     Attributes
     ----------
-    counts : (n, n) of all runs
-    paths : first graph and number of transitions of each run
+    counts
+        (n, n) of all runs
+    paths
+        first graph and number of transitions of each run
     """
 
     counts: IntArray
@@ -104,8 +109,10 @@ def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
 
     Parameters
     ----------
-    modes : (N,) from 0
-    transition : (n, n) P
+    modes
+        (N,) from 0
+    transition
+        (n, n) P
     """
     return Transitions.of(modes, len(transition)).test(transition)
 
@@ -124,9 +131,12 @@ def simulate_counts(
 
     Parameters
     ----------
-    transition : (n, n) P
-    first : first graph
-    transitions : of every path
+    transition
+        (n, n) P
+    first
+        first graph
+    transitions
+        of every path
     """
     n = len(transition)
     leaving = 1.0 - np.diag(transition)

@@ -42,17 +42,28 @@ class Timing:
 
     Attributes
     ----------
-    period_ms : between two steps of an agent, as it should be
-    lateness_ms : of a step after it was due
-    steps, missed : steps of all agents, and how many of them were made more than a period after they were due
-    jitter_ms : how far the time between two successive steps of an agent is from the period, either way
-    staleness_ms : age of the values that were used, when they were used
-    staleness_steps : the same, in steps of the new state less that of the value; 0 or 1 with ideal timers
-    uses : values of neighbours that were used
-    ideal_uses : how many of them were the ones that ideal timers would have used
-    never_heard : how often nothing had been heard yet of a neighbour
-    outdated_graphs : steps for which an agent used another graph than the network's of that time
-    histogram : of lateness: edges [ms] (BINS + 1,) and counts (BINS,); beyond the last edge there is nothing
+    period_ms
+        between two steps of an agent, as it should be
+    lateness_ms
+        of a step after it was due
+    steps, missed
+        steps of all agents, and how many of them were made more than a period after they were due
+    jitter_ms
+        how far the time between two successive steps of an agent is from the period, either way
+    staleness_ms
+        age of the values that were used, when they were used
+    staleness_steps
+        the same, in steps of the new state less that of the value; 0 or 1 with ideal timers
+    uses
+        values of neighbours that were used
+    ideal_uses
+        how many of them were the ones that ideal timers would have used
+    never_heard
+        how often nothing had been heard yet of a neighbour
+    outdated_graphs
+        steps for which an agent used another graph than the network's of that time
+    histogram
+        of lateness: edges [ms] (BINS + 1,) and counts (BINS,); beyond the last edge there is nothing
     """
 
     period_ms: float

@@ -23,15 +23,20 @@ class AgentLaw:
 
     Parameters
     ----------
-    record : of the run
-    model : its step model
-    agent : index of the agent from 0
+    record
+        of the run
+    model
+        its step model
+    agent
+        index of the agent from 0
 
     Attributes
     ----------
-    step, state : k and x(k)
-    heard : for the neighbours of the step that led here, ascending: the step of the value that was used, or ``LOST``;
-        empty when all of them were of the step before
+    step, state
+        k and x(k)
+    heard
+        for the neighbours of the step that led here, ascending: the step of the value that was used, or ``LOST``; empty
+        when all of them were of the step before
     """
 
     def __init__(self, record: RunRecord, model: StepModel, agent: int) -> None:
@@ -65,12 +70,15 @@ class AgentLaw:
 
         Parameters
         ----------
-        mode : index of g(k) from 0
-        heard : what the mode's neighbours, ascending, published of x_j(k)
+        mode
+            index of g(k) from 0
+        heard
+            what the mode's neighbours, ascending, published of x_j(k)
 
         Returns
         -------
-        x(k+1)
+        bytes
+            x(k+1)
         """
         before = self._own[mode]
         values = [*heard[:before], self.state, *heard[before:]]
@@ -124,13 +132,17 @@ class ProtocolLaw:
 
     Parameters
     ----------
-    record : of the run
-    model : its wiring
-    agent : index of the agent from 0
+    record
+        of the run
+    model
+        its wiring
+    agent
+        index of the agent from 0
 
     Attributes
     ----------
-    step, state, heard : see AgentLaw; the state is all of it, row by row
+    step, state, heard
+        see AgentLaw; the state is all of it, row by row
     """
 
     def __init__(self, record: RunRecord, model: Wiring, agent: int) -> None:

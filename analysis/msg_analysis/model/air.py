@@ -28,7 +28,8 @@ class Air:
 
     Parameters
     ----------
-    experiment : with its ``noise`` and ``run``
+    experiment
+        with its ``noise`` and ``run``
     """
 
     def __init__(self, experiment: Experiment) -> None:

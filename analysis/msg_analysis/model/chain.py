@@ -23,11 +23,13 @@ def stationary_law(matrix: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    matrix : (n, n) generator (rows sum to 0) or transition matrix (rows sum to 1); only off-diagonal entries are used
+    matrix
+        (n, n) generator (rows sum to 0) or transition matrix (rows sum to 1); only off-diagonal entries are used
 
     Returns
     -------
-    (n,) probabilities
+    FloatArray
+        (n,) probabilities
     """
     rates = np.array(matrix, dtype=float)
     n = len(rates)
@@ -46,8 +48,10 @@ class MarkovChain:
 
     Attributes
     ----------
-    time : "continuous" (matrix is the generator Gamma [1 / unit of time]) or "discrete" (matrix is P, one jump a step)
-    matrix : (n, n)
+    time
+        "continuous" (matrix is the generator Gamma [1 / unit of time]) or "discrete" (matrix is P, one jump a step)
+    matrix
+        (n, n)
     """
 
     time: Time
@@ -99,8 +103,10 @@ class MarkovChain:
 
         Parameters
         ----------
-        initial : (n,) law of the first graph
-        random : the stream to draw from; equal streams give equal paths
+        initial
+            (n,) law of the first graph
+        random
+            the stream to draw from; equal streams give equal paths
         """
         off_diagonal = self.matrix - np.diag(np.diag(self.matrix))
         leaving = off_diagonal.sum(axis=1)

@@ -56,7 +56,8 @@ def read_yaml(path: Path) -> Any:
 
     Raises
     ------
-    InputError : the file cannot be read, is not YAML in UTF-8, or has a key twice; names file and line
+    InputError
+        the file cannot be read, is not YAML in UTF-8, or has a key twice; names file and line
     """
     try:
         text = path.read_text(encoding="utf-8")

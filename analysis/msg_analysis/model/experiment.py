@@ -34,12 +34,18 @@ class Experiment:
 
     Attributes
     ----------
-    spec : the document, normalised: defaults written out, number of agents known, GraphML files read
-    graph_list : the n graphs, in the order of the modes
-    chain : the Markov chain that switches between them
-    noise_gain : (n, m, m) F_i; Q_i = F_i F_i^T
-    source : where it came from, for messages
-    protocol : what the agents do instead of the built-in law, if anything
+    spec
+        the document, normalised: defaults written out, number of agents known, GraphML files read
+    graph_list
+        the n graphs, in the order of the modes
+    chain
+        the Markov chain that switches between them
+    noise_gain
+        (n, m, m) F_i; Q_i = F_i F_i^T
+    source
+        where it came from, for messages
+    protocol
+        what the agents do instead of the built-in law, if anything
     """
 
     spec: ExperimentSpec
@@ -64,8 +70,10 @@ class Experiment:
 
         Raises
         ------
-        InputError : the file cannot be read or is not YAML
-        ExperimentError : the experiment is not valid; names every mistake
+        InputError
+            the file cannot be read or is not YAML
+        ExperimentError
+            the experiment is not valid; names every mistake
         """
         path = Path(path)
         return cls.parse(read_yaml(path), source=str(path), directory=path.parent)
@@ -83,14 +91,19 @@ class Experiment:
 
         Parameters
         ----------
-        mapping : the document, as a YAML or JSON reader gives it
-        source : where it came from, for messages
-        directory : what the paths in it are relative to; by default the current directory
-        recorded : of a recorded run, the protocol that was used, which need not be installed
+        mapping
+            the document, as a YAML or JSON reader gives it
+        source
+            where it came from, for messages
+        directory
+            what the paths in it are relative to; by default the current directory
+        recorded
+            of a recorded run, the protocol that was used, which need not be installed
 
         Raises
         ------
-        ExperimentError : names every mistake in the document
+        ExperimentError
+            names every mistake in the document
         """
         if not isinstance(mapping, Mapping):
             raise ExperimentError(
@@ -131,11 +144,13 @@ class Experiment:
 
         Parameters
         ----------
-        changes : keys of ``run`` (seed, duration, pace, ...) and their new values
+        changes
+            keys of ``run`` (seed, duration, pace, ...) and their new values
 
         Raises
         ------
-        ExperimentError : names the key
+        ExperimentError
+            names the key
         """
         document = self.to_document()
         document["run"].update(changes)
@@ -146,7 +161,8 @@ class Experiment:
 
         Parameters
         ----------
-        purpose : "run" (simulate or run it) or "predict" (exact for any noise)
+        purpose
+            "run" (simulate or run it) or "predict" (exact for any noise)
         """
         lines = []
         if self.run.pace == "realtime":
@@ -174,7 +190,8 @@ class Experiment:
 
         Raises
         ------
-        NotAvailableError : lists it
+        NotAvailableError
+            lists it
         """
         lines = self.unavailable(purpose)
         if lines and self.protocol and lines == self.protocol.unavailable(purpose):

@@ -18,12 +18,15 @@ def hops(leads: BoolArray, sources: Collection[int]) -> IntArray:
 
     Parameters
     ----------
-    leads : (v, v) whether an arc leads from i to j
-    sources : indices of vertices
+    leads
+        (v, v) whether an arc leads from i to j
+    sources
+        indices of vertices
 
     Returns
     -------
-    (v,)
+    IntArray
+        (v,)
     """
     level = np.full(len(leads), -1)
     front, distance = np.array(sorted(sources), dtype=int), 0
@@ -39,9 +42,11 @@ class Graph:
 
     Attributes
     ----------
-    name : name of the graph in the experiment file
-    adjacency : (m, m), zero diagonal; ``adjacency[i, j]`` [1 / unit of time] is the weight with which agent i+1
-        listens to agent j+1. Symmetric for an undirected graph.
+    name
+        name of the graph in the experiment file
+    adjacency
+        (m, m), zero diagonal; ``adjacency[i, j]`` [1 / unit of time] is the weight with which agent i+1 listens to
+        agent j+1. Symmetric for an undirected graph.
     """
 
     name: str

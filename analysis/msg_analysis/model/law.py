@@ -17,8 +17,10 @@ def weighted_sum(weights: Sequence[float | FloatArray], values: Sequence[FloatAr
 
     Parameters
     ----------
-    weights : numbers, or arrays that broadcast against the values
-    values : arrays of one shape, at least one
+    weights
+        numbers, or arrays that broadcast against the values
+    values
+        arrays of one shape, at least one
     """
     terms = zip(values, weights, strict=True)
     value, weight = next(terms)
@@ -33,9 +35,12 @@ def step(weights: Sequence[float | FloatArray], values: Sequence[FloatArray], dr
 
     Parameters
     ----------
-    weights : the non-zero W_ij of row i, j ascending (for many rows at once: columns, padded with zeros)
-    values : the matching x_j(k), each one entry per replica
-    drive : noise_i(k) + offset_i, the offset being what a reference adds to the row; like one of the values
+    weights
+        the non-zero W_ij of row i, j ascending (for many rows at once: columns, padded with zeros)
+    values
+        the matching x_j(k), each one entry per replica
+    drive
+        noise_i(k) + offset_i, the offset being what a reference adds to the row; like one of the values
     """
     total = weighted_sum(weights, values)
     total += drive

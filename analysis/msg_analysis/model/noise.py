@@ -18,9 +18,12 @@ class ProcessNoise:
 
     Parameters
     ----------
-    seed : the experiment's seed
-    noise_gain : (n, m, m) B_g of the step model
-    replicas : entries of each state
+    seed
+        the experiment's seed
+    noise_gain
+        (n, m, m) B_g of the step model
+    replicas
+        entries of each state
     """
 
     def __init__(self, seed: int, noise_gain: FloatArray, replicas: int) -> None:

@@ -22,9 +22,12 @@ class Sojourn:
 
     Attributes
     ----------
-    sequence : number of the sojourn from 0
-    mode : index of the graph from 0
-    first_step, last_step : the steps k -> k+1 with first_step <= k <= last_step use it
+    sequence
+        number of the sojourn from 0
+    mode
+        index of the graph from 0
+    first_step, last_step
+        the steps k -> k+1 with first_step <= k <= last_step use it
     """
 
     sequence: int
@@ -41,7 +44,8 @@ def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
 
     Parameters
     ----------
-    initial : (n,) law of g(0)
+    initial
+        (n,) law of g(0)
     """
     steps = experiment.steps
     time = 0.0

@@ -30,8 +30,10 @@ def combine_with_numpy(weights: Sequence[float], payloads: Sequence[bytes], driv
 
     Parameters
     ----------
-    weights : a tuple of numbers, at least one
-    payloads : a list, one for each weight, all of the size of the drive
+    weights
+        a tuple of numbers, at least one
+    payloads
+        a list, one for each weight, all of the size of the drive
     """
     return to_payload(step(weights, [from_payload(payload) for payload in payloads], from_payload(drive)))
 

@@ -23,8 +23,10 @@ class ExperimentError(InputError):
 
     Attributes
     ----------
-    source : file or topic that it came from
-    problems : one line each
+    source
+        file or topic that it came from
+    problems
+        one line each
     """
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
@@ -46,10 +48,14 @@ def problem(key: str, value: object, wanted: str, remedy: str) -> str:
 
     Parameters
     ----------
-    key : dotted key
-    value : what stands there; a text is taken as it is
-    wanted : what was expected
-    remedy : what to do
+    key
+        dotted key
+    value
+        what stands there; a text is taken as it is
+    wanted
+        what was expected
+    remedy
+        what to do
     """
     return f"{key}: {value if isinstance(value, str) else show(value)}: {wanted}: {remedy}"
 
@@ -101,9 +107,12 @@ def translate(error: ErrorDetails, root: type[BaseModel] = ExperimentSpec, secti
 
     Parameters
     ----------
-    error : of the validation of ``root``
-    root : model of the whole document, or of a section
-    section : key of that section
+    error
+        of the validation of ``root``
+    root
+        model of the whole document, or of a section
+    section
+        key of that section
     """
     kind, location, value = error["type"], error["loc"], error["input"]
     if not location:

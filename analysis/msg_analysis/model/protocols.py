@@ -33,11 +33,16 @@ class ProtocolInfo:
 
     Attributes
     ----------
-    name : in the experiment, and of the entry point
-    package, version : that offers it
-    linear : whether it declares the matrix of a step
-    states : numbers S of an agent's state, for each replica
-    hidden : whether others hear something else than the whole state
+    name
+        in the experiment, and of the entry point
+    package, version
+        that offers it
+    linear
+        whether it declares the matrix of a step
+    states
+        numbers S of an agent's state, for each replica
+    hidden
+        whether others hear something else than the whole state
     """
 
     name: str
@@ -75,10 +80,14 @@ class ChosenProtocol:
 
     Attributes
     ----------
-    info : what it is; of a recorded run, what it was
-    kind, parameters : its class and its own parameters; None where it is not here
-    absent : that it is not here and why, for people; None where it is
-    network : that it is for, once that is known
+    info
+        what it is; of a recorded run, what it was
+    kind, parameters
+        its class and its own parameters; None where it is not here
+    absent
+        that it is not here and why, for people; None where it is
+    network
+        that it is for, once that is known
     """
 
     info: ProtocolInfo
@@ -114,7 +123,8 @@ class ChosenProtocol:
 
         Raises
         ------
-        InputError : it is not here, or not linear; it fails, or what it says is wrong
+        InputError
+            it is not here, or not linear; it fails, or what it says is wrong
         """
         reason = self.unpredictable()
         if reason:
@@ -157,7 +167,8 @@ class ChosenProtocol:
 
         Raises
         ------
-        ProtocolError : with ``where`` ("" for nowhere in particular) and what was raised
+        ProtocolError
+            with ``where`` ("" for nowhere in particular) and what was raised
         """
         try:
             return call()
@@ -172,12 +183,15 @@ class AgentProtocol:
 
     Parameters
     ----------
-    chosen : a protocol that is not linear
-    agent : index from 0
+    chosen
+        a protocol that is not linear
+    agent
+        index from 0
 
     Raises
     ------
-    InputError : it is not here, or fails
+    InputError
+        it is not here, or fails
     """
 
     def __init__(self, chosen: ChosenProtocol, agent: int) -> None:
@@ -251,8 +265,10 @@ def find(spec: ProtocolSpec, recorded: ProtocolInfo | None = None) -> tuple[Chos
 
     Parameters
     ----------
-    spec : of the experiment
-    recorded : of a run that was recorded, what was used then: need not be here
+    spec
+        of the experiment
+    recorded
+        of a run that was recorded, what was used then: need not be here
     """
     chosen, found = _find(spec)
     if recorded is None:
@@ -313,9 +329,12 @@ def bind(
 
     Parameters
     ----------
-    chosen : found by ``find``
-    experiment : which may not know it yet
-    recorded : see ``find``
+    chosen
+        found by ``find``
+    experiment
+        which may not know it yet
+    recorded
+        see ``find``
     """
     if chosen.absent:
         return chosen, []

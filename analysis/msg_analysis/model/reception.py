@@ -27,8 +27,10 @@ class Reception:
 
     Parameters
     ----------
-    experiment : with its noise on the air
-    model : its step model
+    experiment
+        with its noise on the air
+    model
+        its step model
     """
 
     def __init__(self, experiment: Experiment, model: StepModel) -> None:
@@ -45,9 +47,12 @@ class Reception:
 
         Parameters
         ----------
-        k : of the step; must not go back to an earlier block of steps
-        mode : of g(k)
-        state : (m, replicas) x(k)
+        k
+            of the step; must not go back to an earlier block of steps
+        mode
+            of g(k)
+        state
+            (m, replicas) x(k)
         """
         within = self._draw(k)
         air, (columns, _), used = self._air, self._padded[mode], self._used[mode]
@@ -61,8 +66,10 @@ class Reception:
 
         Parameters
         ----------
-        states : (N + 1, m, replicas)
-        modes : (N,)
+        states
+            (N + 1, m, replicas)
+        modes
+            (N,)
         """
         air, agents = self._air, self._model.agents
         published = None

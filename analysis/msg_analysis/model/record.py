@@ -42,11 +42,15 @@ class RunRecord:
 
     Attributes
     ----------
-    run : run id
-    experiment : what is run
-    start : (m, width) x(0). Computed once and carried along, because it comes out of linear algebra whose last bits
-        depend on the machine
-    versions : versions of the software that started the run
+    run
+        run id
+    experiment
+        what is run
+    start
+        (m, width) x(0). Computed once and carried along, because it comes out of linear algebra whose last bits depend
+        on the machine
+    versions
+        versions of the software that started the run
     """
 
     run: uuid.UUID
@@ -73,12 +77,15 @@ class RunRecord:
 
         Parameters
         ----------
-        text : what ``to_json`` wrote
-        source : where it came from, for messages
+        text
+            what ``to_json`` wrote
+        source
+            where it came from, for messages
 
         Raises
         ------
-        InputError : not a run record, of another format, or with an invalid experiment in it
+        InputError
+            not a run record, of another format, or with an invalid experiment in it
         """
         try:
             document: Any = json.loads(text)

@@ -24,13 +24,17 @@ class Sections:
 
     Parameters
     ----------
-    mapping : the document
-    recorded : of a recorded run, the protocol that was used, which need not be installed
+    mapping
+        the document
+    recorded
+        of a recorded run, the protocol that was used, which need not be installed
 
     Attributes
     ----------
-    problems : the mistakes found so far
-    values, agents, graphs, chain, noise_gain, protocol : what is known so far
+    problems
+        the mistakes found so far
+    values, agents, graphs, chain, noise_gain, protocol
+        what is known so far
     """
 
     def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:

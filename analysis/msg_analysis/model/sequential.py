@@ -42,8 +42,10 @@ def sequential(step: StepModel, phase: FloatArray) -> StepModel:
 
     Parameters
     ----------
-    step : the synchronous step, without loss, delay or noise on the air
-    phase : (m,) all different
+    step
+        the synchronous step, without loss, delay or noise on the air
+    phase
+        (m,) all different
     """
     weights, offsets, gain = np.empty_like(step.weights), np.empty_like(step.offsets), np.empty_like(step.noise_gain)
     done = np.zeros(step.agents, dtype=bool)

@@ -24,11 +24,16 @@ class Wiring:
 
     Attributes
     ----------
-    links : (n, m, m) whether agent i uses what agent j publishes; the diagonal means nothing
-    chain : the Markov chain that switches between the graphs
-    initial : (n,) law of g(0)
-    dt : simulated time of a step
-    loss : probability that a directed message is ignored in a step
+    links
+        (n, m, m) whether agent i uses what agent j publishes; the diagonal means nothing
+    chain
+        the Markov chain that switches between the graphs
+    initial
+        (n,) law of g(0)
+    dt
+        simulated time of a step
+    loss
+        probability that a directed message is ignored in a step
     """
 
     links: BoolArray
@@ -89,17 +94,26 @@ class StepModel(Wiring):
 
     Attributes
     ----------
-    weights : (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
-    nominal : (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time), or
-        what a linear protocol says; rows of grounded leaders are zero
-    offsets : (n, m) what the reference adds, so that the reference is a fixed point
-    noise_gain : (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
-    noise : (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
-    delay : age d, in steps, of the states of others that a step uses
-    loss_variance : (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and
-        their spread adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
-    grounded : (m,) True for leaders of infinite gain
-    reference : what tracking agents should hold; 0 for consensus
+    weights
+        (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
+    nominal
+        (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time), or what a
+        linear protocol says; rows of grounded leaders are zero
+    offsets
+        (n, m) what the reference adds, so that the reference is a fixed point
+    noise_gain
+        (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
+    noise
+        (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
+    delay
+        age d, in steps, of the states of others that a step uses
+    loss_variance
+        (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and their spread
+        adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
+    grounded
+        (m,) True for leaders of infinite gain
+    reference
+        what tracking agents should hold; 0 for consensus
     """
 
     weights: FloatArray
@@ -142,7 +156,8 @@ def build_step_model(experiment: Experiment) -> StepModel:
 
     Raises
     ------
-    InputError : the experiment has a protocol that is not linear, not here, or fails
+    InputError
+        the experiment has a protocol that is not linear, not here, or fails
     """
     agents, dt = experiment.agents, experiment.step_length
     grounded = np.isinf(experiment.leader_gains)

@@ -23,12 +23,15 @@ class StepClock:
 
     Parameters
     ----------
-    dt : length of a step [units of simulated time, written as seconds]; its decimal text counts: 0.1 is one tenth
-    phase : part of a step, in [0, 1)
+    dt
+        length of a step [units of simulated time, written as seconds]; its decimal text counts: 0.1 is one tenth
+    phase
+        part of a step, in [0, 1)
 
     Attributes
     ----------
-    step_ns : dt [ns], as near as a float comes
+    step_ns
+        dt [ns], as near as a float comes
     """
 
     def __init__(self, dt: float, phase: float = 0.0) -> None:

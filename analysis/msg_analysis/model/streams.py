@@ -34,10 +34,14 @@ def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.r
 
     Parameters
     ----------
-    seed : the experiment's seed, >= 0
-    stream : what the numbers are for
-    agent : index of the agent from 0 (0 where the stream belongs to nobody), or number of the link
-    block : number of the block of steps, step // STEPS_PER_BLOCK
+    seed
+        the experiment's seed, >= 0
+    stream
+        what the numbers are for
+    agent
+        index of the agent from 0 (0 where the stream belongs to nobody), or number of the link
+    block
+        number of the block of steps, step // STEPS_PER_BLOCK
     """
     key = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     return np.random.Generator(np.random.Philox(key=key, counter=[0, block, agent, int(stream)]))

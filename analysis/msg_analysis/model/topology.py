@@ -29,8 +29,10 @@ def links(spec: GraphSpec, agents: int) -> list[Link]:
 
     Parameters
     ----------
-    spec : the graph, not a GraphML file (see ``read_graphml``)
-    agents : number of agents m
+    spec
+        the graph, not a GraphML file (see ``read_graphml``)
+    agents
+        number of agents m
     """
     if spec.edges is not None or spec.arcs is not None:
         return list(spec.edges or spec.arcs or [])
@@ -88,7 +90,8 @@ def read_graphml(name: str, file: Path) -> tuple[GraphSpec, int, list[str]]:
 
     Returns
     -------
-    the graph, the number of agents it has, and problems (then the rest means nothing)
+    tuple[GraphSpec, int, list[str]]
+        the graph, the number of agents it has, and problems (then the rest means nothing)
     """
     import networkx as nx  # here, since every process of a run would wait for it
 

@@ -18,11 +18,16 @@ class Completeness:
 
     Attributes
     ----------
-    expected, received, missing : states; received counts each (agent, step) once
-    duplicates : states that came again
-    out_of_order : states that came after a later one of the same agent
-    refused : messages that are no part of this run, by reason
-    missing_modes : steps whose graph is not known
+    expected, received, missing
+        states; received counts each (agent, step) once
+    duplicates
+        states that came again
+    out_of_order
+        states that came after a later one of the same agent
+    refused
+        messages that are no part of this run, by reason
+    missing_modes
+        steps whose graph is not known
     """
 
     expected: int
@@ -45,23 +50,32 @@ class Trajectory:
 
     Attributes
     ----------
-    record : what the run was started from
-    states : (N + 1, m, width); NaN where a state is missing. The width is the number of replicas, or as many times that
-        as a protocol's state has numbers: those of the first come first, and are the agents' values
-    modes : (N,) index from 0 of the graph used in the step k -> k+1; -1 where not known
-    agent_modes : (N + 1, m) graph that each agent says it used in the step that led to this state (from 0; -1 at
-        step 0 and where missing), or None where nobody logged it
-    published : (N + 1, m, replicas) what the agents published of their states, NaN where missing; None where that is
-        the states themselves
-    lost : (N, m, D) whether in the step k -> k+1 agent i did not get the message of its d-th neighbour, ascending,
-        under the graph of that step (see ``StepModel.neighbours``); D is the largest number of neighbours. None
-        where messages cannot be lost
-    used : (N, m, D) in real time: step of the value of the d-th neighbour, ascending under the graph
-        ``agent_modes[k + 1, i]``, that went into x_i(k+1); -1 where nothing had been heard and the agent's own value
-        took its place, where the state is missing, and beyond the last neighbour. None in lockstep
-    made : (N + 1, m) in real time: simulated time [ns] at which the state was made; 0 for x(0), -1 where missing.
-        Later than that of all values that went into it. None in lockstep
-    completeness : the account of what is there
+    record
+        what the run was started from
+    states
+        (N + 1, m, width); NaN where a state is missing. The width is the number of replicas, or as many times that as a
+        protocol's state has numbers: those of the first come first, and are the agents' values
+    modes
+        (N,) index from 0 of the graph used in the step k -> k+1; -1 where not known
+    agent_modes
+        (N + 1, m) graph that each agent says it used in the step that led to this state (from 0; -1 at step 0 and where
+        missing), or None where nobody logged it
+    published
+        (N + 1, m, replicas) what the agents published of their states, NaN where missing; None where that is the states
+        themselves
+    lost
+        (N, m, D) whether in the step k -> k+1 agent i did not get the message of its d-th neighbour, ascending, under
+        the graph of that step (see ``StepModel.neighbours``); D is the largest number of neighbours. None where
+        messages cannot be lost
+    used
+        (N, m, D) in real time: step of the value of the d-th neighbour, ascending under the graph ``agent_modes[k + 1,
+        i]``, that went into x_i(k+1); -1 where nothing had been heard and the agent's own value took its place, where
+        the state is missing, and beyond the last neighbour. None in lockstep
+    made
+        (N + 1, m) in real time: simulated time [ns] at which the state was made; 0 for x(0), -1 where missing. Later
+        than that of all values that went into it. None in lockstep
+    completeness
+        the account of what is there
     """
 
     record: RunRecord

@@ -163,7 +163,8 @@ def _widest_reaching(leads: BoolArray) -> list[int]:
 
     Parameters
     ----------
-    leads : (v, v) whether an arc leads from i to j
+    leads
+        (v, v) whether an arc leads from i to j
     """
     known = np.zeros(len(leads), dtype=bool)
     widest, reached = 0, known.copy()
@@ -261,12 +262,15 @@ def stability_limit(graph: Graph, gains: FloatArray) -> float:
 
     Parameters
     ----------
-    graph : one mode
-    gains : (m,) kappa; rows and columns of agents with infinite gain are deleted
+    graph
+        one mode
+    gains
+        (m,) kappa; rows and columns of agents with infinite gain are deleted
 
     Returns
     -------
-    min over non-zero eigenvalues of 2 Re(lambda) / |lambda|^2, which is 2 / lambda_max for symmetric Z
+    float
+        min over non-zero eigenvalues of 2 Re(lambda) / |lambda|^2, which is 2 / lambda_max for symmetric Z
     """
     follows = np.isfinite(gains)
     z = (graph.laplacian + np.diag(np.where(follows, gains, 0.0)))[np.ix_(follows, follows)]

@@ -8,7 +8,8 @@ def percent(share: float) -> str:
 
     Parameters
     ----------
-    share : from 0 to 1
+    share
+        from 0 to 1
     """
     value = 100.0 * share
     if 0.0 < value < 0.01:
@@ -21,6 +22,7 @@ def counted(number: int, thing: str) -> str:
 
     Parameters
     ----------
-    number, thing : how many, and one of them; several get an s
+    number, thing
+        how many, and one of them; several get an s
     """
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"

@@ -21,8 +21,10 @@ def print_bag(document: dict[str, Any], console: Console) -> None:
 
     Parameters
     ----------
-    document : of ``msg_analysis.report.info.describe_bag``
-    console : where to print
+    document
+        of ``msg_analysis.report.info.describe_bag``
+    console
+        where to print
     """
     facts = fact_table(console, document["bag"])
     if document["recording"]:
@@ -83,8 +85,10 @@ def print_salvage(document: dict[str, Any], console: Console) -> None:
 
     Parameters
     ----------
-    document : of ``msg_analysis.report.info.describe_salvage``
-    console : where to print
+    document
+        of ``msg_analysis.report.info.describe_salvage``
+    console
+        where to print
     """
     facts = fact_table(console, document["bag"])
     facts.add_row("kept", counted(document["kept_messages"], "message"))

@@ -63,9 +63,9 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> str:
 
     Parameters
     ----------
-    nodes : Sequence[Mapping[str, Any]]
-        ``node_errors`` of a comparison
-    level : float
+    nodes
+        Sequence[Mapping[str, Any]] ``node_errors`` of a comparison
+    level
         below which an adjusted p counts as a disagreement
     """
     agents = np.arange(1, len(nodes) + 1)
@@ -110,9 +110,9 @@ def running_estimate(running: Mapping[str, FloatArray], predicted: float | None)
 
     Parameters
     ----------
-    running : Mapping[str, FloatArray]
-        "time", "system_error" and "standard_error", (points,) each
-    predicted : float | None
+    running
+        Mapping[str, FloatArray] "time", "system_error" and "standard_error", (points,) each
+    predicted
         system error
     """
     time, mean, error = running["time"], running["system_error"], running["standard_error"]
@@ -139,8 +139,8 @@ def lateness(timing: Mapping[str, Any]) -> str:
 
     Parameters
     ----------
-    timing : Mapping[str, Any]
-        ``timing`` of a comparison
+    timing
+        Mapping[str, Any] ``timing`` of a comparison
     """
     edges = np.array(timing["histogram"]["lateness_ms"])
     counts = np.array(timing["histogram"]["steps"])
@@ -164,7 +164,7 @@ def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> st
 
     Parameters
     ----------
-    measured, predicted : FloatArray | None
+    measured, predicted
         (m, m) each
     """
     panels = [
@@ -206,13 +206,13 @@ def active_graph(modes: IntArray, names: Sequence[str], stationary: FloatArray, 
 
     Parameters
     ----------
-    modes : IntArray
+    modes
         (steps,) index of the graph; -1 where not known
-    names : Sequence[str]
-        of the graphs
-    stationary : FloatArray
+    names
+        Sequence[str] of the graphs
+    stationary
         (n,) predicted shares
-    dt : float
+    dt
         length of a step [units of simulated time]
     """
     starts = np.flatnonzero(np.diff(modes, prepend=-2))
@@ -258,7 +258,7 @@ def graphs(experiment: Experiment) -> str:
 
     Parameters
     ----------
-    experiment : Experiment
+    experiment
         whose graphs are drawn (the first eight)
     """
     chosen = experiment.graph_list[:_GRAPHS]
@@ -289,17 +289,17 @@ def draw_graph(
 
     Parameters
     ----------
-    axes : Axes
+    axes
         where
-    graph : Graph
+    graph
         what
-    places : Mapping[int, FloatArray]
-        (2,) of every agent, from 0
-    colour : str
+    places
+        Mapping[int, FloatArray] (2,) of every agent, from 0
+    colour
         of the links, and of the agents
-    leaders : Set[int]
-        agents from 0
-    size : float | None
+    leaders
+        Set[int] agents from 0
+    size
         area of an agent [points^2]; by default what fits the number of agents
     """
     agents = graph.agents

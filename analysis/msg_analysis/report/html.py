@@ -45,18 +45,19 @@ def write_report(
 
     Parameters
     ----------
-    comparison : Comparison
+    comparison
         the result
-    trajectory : Trajectory
+    trajectory
         what was compared
-    path : str | Path
+    path
         of the HTML file; replaced where it exists
     restarts, strangers
         of the network, see ``render``
 
     Raises
     ------
-    InputError : the file cannot be written
+    InputError
+        the file cannot be written
     """
     path = Path(path)
     html = render(comparison, trajectory, restarts=restarts, strangers=strangers)
@@ -83,14 +84,14 @@ def render(
 
     Parameters
     ----------
-    comparison : Comparison
+    comparison
         the result
-    trajectory : Trajectory
+    trajectory
         what was compared
-    restarts : Sequence[str]
-        processes that were started again during the run, a line each
-    strangers : Sequence[Mapping[str, Any]]
-        messages that the nodes refused: ``node``, ``topic``, ``reason``, ``count``
+    restarts
+        Sequence[str] processes that were started again during the run, a line each
+    strangers
+        Sequence[Mapping[str, Any]] messages that the nodes refused: ``node``, ``topic``, ``reason``, ``count``
     """
     document = comparison.to_json()
     experiment = trajectory.record.experiment

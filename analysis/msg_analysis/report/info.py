@@ -25,12 +25,13 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
 
     Returns
     -------
-    ``name``, ``problem``, ``time``, ``agents``, ``leaders``, ``protocol`` (``name``, ``package``, ``version``,
-    ``linear``, ``states``, ``hidden``, ``parameters``, ``absent``), ``noise``, ``run`` (with ``steps``),
-    ``switching`` (``matrix``, ``initial``), ``graphs`` (each ``name``, ``edges`` or ``arcs``,
-    ``algebraic_connectivity``, ``stationary``, ``mean_holding_time``, ``stability_limit``),
-    ``stability_limit``, ``predicted_system_error``, ``memory`` [bytes], ``unavailable``. None stands for what
-    is infinite or cannot be computed, or, for the stability limits, is not known (with a delay or a protocol).
+    dict[str, Any]
+        ``name``, ``problem``, ``time``, ``agents``, ``leaders``, ``protocol`` (``name``, ``package``, ``version``,
+        ``linear``, ``states``, ``hidden``, ``parameters``, ``absent``), ``noise``, ``run`` (with ``steps``),
+        ``switching`` (``matrix``, ``initial``), ``graphs`` (each ``name``, ``edges`` or ``arcs``,
+        ``algebraic_connectivity``, ``stationary``, ``mean_holding_time``, ``stability_limit``), ``stability_limit``,
+        ``predicted_system_error``, ``memory`` [bytes], ``unavailable``. None stands for what is infinite or cannot be
+        computed, or, for the stability limits, is not known (with a delay or a protocol).
     """
     document = experiment.to_document()
     chain = experiment.chain
@@ -79,19 +80,22 @@ def describe_bag(path: Path) -> dict[str, Any]:
 
     Parameters
     ----------
-    path : bag directory or MCAP file
+    path
+        bag directory or MCAP file
 
     Returns
     -------
-    ``bag``, ``recording`` (process that is writing it, or None), ``problem`` (why no run can be made of it; then what
-    is said of the run is None), ``run``, ``experiment``, ``seed``, ``agents``, ``replicas``, ``steps``,
-    ``simulated_time``, ``completeness``, ``prefix``, ``topics`` (each ``name``, ``type``, ``messages``), ``files``
-    (each ``name``, ``size`` [bytes]; those of the bag also ``messages``, ``start``, ``end`` [ns], ``compression``,
-    ``torn``, ``damaged_chunks``, ``lost_messages``, ``problem``), ``protocol`` (as of an experiment), ``versions``
+    dict[str, Any]
+        ``bag``, ``recording`` (process that is writing it, or None), ``problem`` (why no run can be made of it; then
+        what is said of the run is None), ``run``, ``experiment``, ``seed``, ``agents``, ``replicas``, ``steps``,
+        ``simulated_time``, ``completeness``, ``prefix``, ``topics`` (each ``name``, ``type``, ``messages``), ``files``
+        (each ``name``, ``size`` [bytes]; those of the bag also ``messages``, ``start``, ``end`` [ns], ``compression``,
+        ``torn``, ``damaged_chunks``, ``lost_messages``, ``problem``), ``protocol`` (as of an experiment), ``versions``
 
     Raises
     ------
-    InputError : nothing of it can be read
+    InputError
+        nothing of it can be read
     """
     from msg_analysis.bags.inventory import Inventory  # here: an experiment does not need it
     from msg_analysis.bags.metadata import total_channels
@@ -167,12 +171,15 @@ def describe_salvage(out: Path, report: SalvageReport) -> dict[str, Any]:
 
     Parameters
     ----------
-    out : the new bag
-    report : of :func:`msg_analysis.bags.salvage.salvage`
+    out
+        the new bag
+    report
+        of :func:`msg_analysis.bags.salvage.salvage`
 
     Returns
     -------
-    ``bag``, the report's fields, and of the run what :func:`describe_bag` says
+    dict[str, Any]
+        ``bag``, the report's fields, and of the run what :func:`describe_bag` says
     """
     from msg_analysis.bags.inventory import Inventory
 

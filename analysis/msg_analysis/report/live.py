@@ -39,9 +39,12 @@ def live_line(report: LiveReport, record: RunRecord, rate: float) -> str:
 
     Parameters
     ----------
-    report : the numbers
-    record : of the run
-    rate : steps per second
+    report
+        the numbers
+    record
+        of the run
+    rate
+        steps per second
     """
     parts = [f"step {max(report.newest, 0)} of {record.experiment.steps}", f"system error {_beside(report.system)}"]
     return ", ".join(parts + _account(report, rate))

@@ -53,12 +53,18 @@ class Curve:
 
     Attributes
     ----------
-    network : name of the set of graphs
-    quantity : ``SYSTEM``, ``NODE`` or ``CENTRALITY`` (of this agent as the only leader)
-    agent : from 0; None for the system
-    epsilon : (points,) scale of all rates [1 / unit of time]
-    r12, r21 : (points,) rates before scaling, so that q_ij = epsilon r_ij
-    value : (points,)
+    network
+        name of the set of graphs
+    quantity
+        ``SYSTEM``, ``NODE`` or ``CENTRALITY`` (of this agent as the only leader)
+    agent
+        from 0; None for the system
+    epsilon
+        (points,) scale of all rates [1 / unit of time]
+    r12, r21
+        (points,) rates before scaling, so that q_ij = epsilon r_ij
+    value
+        (points,)
     """
 
     network: str
@@ -81,11 +87,16 @@ class Example:
 
     Attributes
     ----------
-    number : 1, 2 or 3
-    title : what it is about
-    networks : graphs by network's name
-    curves : all that is drawn
-    remarks : lines for the head of the table; what is a reconstruction says so
+    number
+        1, 2 or 3
+    title
+        what it is about
+    networks
+        graphs by network's name
+    curves
+        all that is drawn
+    remarks
+        lines for the head of the table; what is a reconstruction says so
     """
 
     number: int
@@ -172,7 +183,8 @@ def example_1(points: int = 60) -> Example:
 
     Parameters
     ----------
-    points : per curve
+    points
+        per curve
     """
     network = _Network.of("line_ring", LINE_RING, two_graphs)
     swept = np.unique(np.append(5.0 * np.linspace(0.04, 1.0, points) ** 2, [0.1, 1.0]))  # dense where it is steep
@@ -209,7 +221,8 @@ def example_2(points: int = 60) -> Example:
 
     Parameters
     ----------
-    points : per curve
+    points
+        per curve
     """
     network = _Network.of("three_lines", THREE_LINES, three_graphs)
     curves: list[Curve] = []
@@ -232,7 +245,8 @@ def example_3(points: int = 60) -> Example:
 
     Parameters
     ----------
-    points : per curve
+    points
+        per curve
     """
     curves: list[Curve] = []
     networks: dict[str, tuple[Graph, ...]] = {}

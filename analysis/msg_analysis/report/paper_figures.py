@@ -70,20 +70,22 @@ def write_figures(numbers: Sequence[int], directory: str | Path, formats: Sequen
 
     Parameters
     ----------
-    numbers : Sequence[int]
-        1, 2, 3
-    directory : str | Path
+    numbers
+        Sequence[int] 1, 2, 3
+    directory
         made where it does not exist
-    formats : Sequence[str]
-        "png", "svg", "pdf"
+    formats
+        Sequence[str] "png", "svg", "pdf"
 
     Returns
     -------
-    the files
+    list[Path]
+        the files
 
     Raises
     ------
-    InputError : a file cannot be written
+    InputError
+        a file cannot be written
     """
     directory = Path(directory)
     written = []
@@ -119,7 +121,7 @@ def draw(example: Example) -> Figure:
 
     Parameters
     ----------
-    example : Example
+    example
         of ``msg_analysis.report.paper``
     """
     figure = {1: _draw_1, 2: _draw_2, 3: _draw_3}[example.number](example)

@@ -30,16 +30,26 @@ class Result:
 
     Attributes
     ----------
-    file : where it came from
-    experiment, seeds : of the run, or of all runs: "1 2"
-    bags : number of runs it is about
-    leaders : numbers of the leaders, "3" or "1 4"; empty without
-    verdict : of the comparison
-    simulated_time : of all runs
-    measured, standard_error, low, high, predicted, z : of the system error; low to high is the 95 % interval
-    least_p : least adjusted p of the tests
-    blame : what is wrong, in words; empty where nothing is
-    identity : the same for runs of the same law
+    file
+        where it came from
+    experiment, seeds
+        of the run, or of all runs: "1 2"
+    bags
+        number of runs it is about
+    leaders
+        numbers of the leaders, "3" or "1 4"; empty without
+    verdict
+        of the comparison
+    simulated_time
+        of all runs
+    measured, standard_error, low, high, predicted, z
+        of the system error; low to high is the 95 % interval
+    least_p
+        least adjusted p of the tests
+    blame
+        what is wrong, in words; empty where nothing is
+    identity
+        the same for runs of the same law
     """
 
     file: str
@@ -65,11 +75,13 @@ def read_result(path: Path) -> Result:
 
     Parameters
     ----------
-    path : file, or directory of a run with such a file in it
+    path
+        file, or directory of a run with such a file in it
 
     Raises
     ------
-    InputError : not there, or not a result of a comparison
+    InputError
+        not there, or not a result of a comparison
     """
     file = path / RESULT_FILE if path.is_dir() else path
     wanted = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
@@ -130,10 +142,14 @@ class Merged:
 
     Attributes
     ----------
-    experiment : name of the first
-    files : where they came from
-    simulated_time : of all
-    measured, standard_error, predicted, z, p : of the system error; every unit of time counts the same
+    experiment
+        name of the first
+    files
+        where they came from
+    simulated_time
+        of all
+    measured, standard_error, predicted, z, p
+        of the system error; every unit of time counts the same
     """
 
     experiment: str
@@ -220,9 +236,12 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
 
     Parameters
     ----------
-    rows : results
-    level : chance of telling any two apart wrongly
-    console : where to print
+    rows
+        results
+    level
+        chance of telling any two apart wrongly
+    console
+        where to print
     """
     heads, body = _shown(rows)
     kept = [

@@ -59,8 +59,10 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
 
     Parameters
     ----------
-    document : of ``Prediction.to_json()``
-    console : where to print
+    document
+        of ``Prediction.to_json()``
+    console
+        where to print
     """
     laws = {
         "steps in turn" if document[key].get("law") == "sequential" else title: document[key]
@@ -89,8 +91,10 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
 
     Parameters
     ----------
-    document : of ``Comparison.to_json()``; with ``strangers`` of a run's result where there are some
-    console : where to print
+    document
+        of ``Comparison.to_json()``; with ``strangers`` of a run's result where there are some
+    console
+        where to print
     """
     verdict, style = _VERDICTS[document["verdict"]]
     console.print(verdict_line(verdict, document), style=style)
@@ -128,7 +132,8 @@ def gaps(count: dict[str, Any]) -> list[str]:
 
     Parameters
     ----------
-    count : ``completeness`` of ``Comparison.to_json()``
+    count
+        ``completeness`` of ``Comparison.to_json()``
     """
     lines = []
     if count["missing"]:
@@ -193,8 +198,10 @@ def verdict_line(verdict: str, document: dict[str, Any]) -> str:
 
     Parameters
     ----------
-    verdict : a sentence
-    document : of ``Comparison.to_json()``
+    verdict
+        a sentence
+    document
+        of ``Comparison.to_json()``
     """
     if document.get("bags"):
         verdict = verdict.replace("The run agrees", "The runs agree").replace("The run disagrees", "The runs disagree")
@@ -233,7 +240,8 @@ def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:
 
     Parameters
     ----------
-    timing : of ``Comparison.to_json()``
+    timing
+        of ``Comparison.to_json()``
     """
     deadlines, uses, graphs = timing["deadlines"], timing["ideal_uses"], timing["outdated_graph"]
     facts = [
@@ -266,8 +274,10 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
 
     Parameters
     ----------
-    document : of ``msg_analysis.report.info.describe_experiment``
-    console : where to print
+    document
+        of ``msg_analysis.report.info.describe_experiment``
+    console
+        where to print
     """
     run = document["run"]
     facts = fact_table(console, document["name"])
@@ -319,8 +329,10 @@ def add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
 
     Parameters
     ----------
-    facts : gets the rows
-    protocol : ``protocol`` of a document of ``msg_analysis.report.info``; None adds nothing
+    facts
+        gets the rows
+    protocol
+        ``protocol`` of a document of ``msg_analysis.report.info``; None adds nothing
     """
     if protocol is None:
         return
@@ -337,8 +349,10 @@ def print_leaders(document: dict[str, Any], console: Console) -> None:
 
     Parameters
     ----------
-    document : of ``Selection.to_json()``
-    console : where to print
+    document
+        of ``Selection.to_json()``
+    console
+        where to print
     """
     gain = "held at the reference" if document["gain"] == "inf" else f"gain {document['gain']:g}"
     law = _LAWS[document["law"]]

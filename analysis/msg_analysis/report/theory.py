@@ -32,7 +32,8 @@ def parse_times(text: str) -> FloatArray:
 
     Raises
     ------
-    InputError : neither of them
+    InputError
+        neither of them
     """
     wanted = "expected START:STOP:STEP or t1,t2,..., ascending numbers >= 0: for example 0:10:0.5"
     try:
@@ -63,16 +64,23 @@ def describe_transient(
 
     Parameters
     ----------
-    experiment : with its start in ``run.start`` and ``switching.initial``
-    times : (T,) ascending [units of time]
-    law : "emulated" (the steps of the run; "discrete" in discrete time) or "continuous"
-    unreduced : consensus only: the states themselves, whose second moments grow without bound
-    moments : whether nu(t) and c(t) of every mode are in the document too
-    fraction : of the steady system error, for the settling time
+    experiment
+        with its start in ``run.start`` and ``switching.initial``
+    times
+        (T,) ascending [units of time]
+    law
+        "emulated" (the steps of the run; "discrete" in discrete time) or "continuous"
+    unreduced
+        consensus only: the states themselves, whose second moments grow without bound
+    moments
+        whether nu(t) and c(t) of every mode are in the document too
+    fraction
+        of the steady system error, for the settling time
 
     Raises
     ------
-    InputError : times that are no whole steps, a law that does not exist here, or too large
+    InputError
+        times that are no whole steps, a law that does not exist here, or too large
     """
     system, unit = _system(experiment, law)
     steady = MomentSolver(system).steady()
@@ -169,9 +177,10 @@ def describe_facts(experiment: Experiment) -> dict[str, Any]:
 
     Returns
     -------
-    ``facts`` (list), ``bounds``, ``graphs`` (list; None for directed or disconnected graphs), ``two_topology``
-    (``continuous``, ``emulated`` or ``discrete``; None unless there are two graphs that can each be held for ever).
-    What the network is too large for is None, and ``notes`` say so.
+    dict[str, Any]
+        ``facts`` (list), ``bounds``, ``graphs`` (list; None for directed or disconnected graphs), ``two_topology``
+        (``continuous``, ``emulated`` or ``discrete``; None unless there are two graphs that can each be held for ever).
+        What the network is too large for is None, and ``notes`` say so.
     """
     prediction = predict(experiment)
     laws = {"discrete" if experiment.time == "discrete" else "emulated": prediction.system}
@@ -206,8 +215,10 @@ def write_transient_csv(document: dict[str, Any], path: Path) -> None:
 
     Parameters
     ----------
-    document : of ``describe_transient``
-    path : of the CSV file
+    document
+        of ``describe_transient``
+    path
+        of the CSV file
     """
     system, nodes = _mean_squares(document)
     agents = range(1, document["agents"] + 1)

@@ -18,8 +18,10 @@ def print_transient(document: dict[str, Any], console: Console) -> None:
 
     Parameters
     ----------
-    document : of ``msg_analysis.report.theory.describe_transient``
-    console : where to print
+    document
+        of ``msg_analysis.report.theory.describe_transient``
+    console
+        where to print
     """
     key = "system_second_moment" if document["unreduced"] else "system_error"
     title = f"Transient from the start of the run, {_LAWS[document['law']]}"
@@ -51,8 +53,10 @@ def print_facts(document: dict[str, Any], console: Console) -> None:
 
     Parameters
     ----------
-    document : of ``msg_analysis.report.theory.describe_facts``
-    console : where to print
+    document
+        of ``msg_analysis.report.theory.describe_facts``
+    console
+        where to print
     """
     if document["facts"]:
         _print_lemmas(document["facts"], console)

@@ -66,10 +66,14 @@ def order_statements(order: dict[str, Any], names: Sequence[str], relation: str,
 
     Parameters
     ----------
-    order : of ``Order.to_json()``
-    names : of what is in order
-    relation : what the better one does, "is more certain than"
-    most : largest number of pairs named one by one
+    order
+        of ``Order.to_json()``
+    names
+        of what is in order
+    relation
+        what the better one does, "is more certain than"
+    most
+        largest number of pairs named one by one
     """
 
     def named(pair: dict[str, Any]) -> str:

@@ -56,7 +56,8 @@ class AveragedEquations:
 
     Attributes
     ----------
-    definite : whether it is known to be symmetric and positive definite
+    definite
+        whether it is known to be symmetric and positive definite
     """
 
     def __init__(self, equations: CoupledEquations) -> None:

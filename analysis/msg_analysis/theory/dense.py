@@ -33,11 +33,13 @@ class DenseSolver:
 
     Parameters
     ----------
-    system : what to solve for
+    system
+        what to solve for
 
     Raises
     ------
-    InputError : too large for a dense solve, no steady second moments, or too ill-conditioned to be trusted
+    InputError
+        too large for a dense solve, no steady second moments, or too ill-conditioned to be trusted
     """
 
     def __init__(self, system: JumpSystem) -> None:

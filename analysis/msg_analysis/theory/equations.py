@@ -51,9 +51,12 @@ class Level(NamedTuple):
 
     Attributes
     ----------
-    average : (g, n) law of the graph in each group
-    members : (g, n) 1.0 where a graph belongs to the group
-    solves : of the averaged equations
+    average
+        (g, n) law of the graph in each group
+    members
+        (g, n) 1.0 where a graph belongs to the group
+    solves
+        of the averaged equations
     """
 
     average: FloatArray
@@ -68,16 +71,26 @@ class CoupledEquations:
 
     Attributes
     ----------
-    system : what they belong to
-    weights : (n,) pi, with respect to which A is self-adjoint if ``definite``
-    definite : whether A is known to be self-adjoint and positive definite
-    direct : whether the preconditioner is A^-1: one graph, no lost messages
-    drift : (n, d, d) D
-    symmetric : whether every D is, to the last bit
-    rates : (n, n) T off the diagonal
-    leaving : (n,) its sums
-    reversible : whether the chain is
-    whole : solves of the average of all graphs
+    system
+        what they belong to
+    weights
+        (n,) pi, with respect to which A is self-adjoint if ``definite``
+    definite
+        whether A is known to be self-adjoint and positive definite
+    direct
+        whether the preconditioner is A^-1: one graph, no lost messages
+    drift
+        (n, d, d) D
+    symmetric
+        whether every D is, to the last bit
+    rates
+        (n, n) T off the diagonal
+    leaving
+        (n,) its sums
+    reversible
+        whether the chain is
+    whole
+        solves of the average of all graphs
     """
 
     def __init__(self, system: JumpSystem, forward: CoupledEquations | None = None) -> None:

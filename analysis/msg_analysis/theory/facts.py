@@ -37,14 +37,21 @@ class Fact:
 
     Attributes
     ----------
-    name : the matrix
-    statement : what the lemma says, corrected where the paper errs
-    holds : whether it is so here
-    target : the special eigenvalue: 0 in continuous time, 1 in discrete time
-    expected, multiplicity, nullity : eigenvalues at the target: by the lemma, counted, and counted as null vectors
-    others : least real part of the other eigenvalues (continuous time, must be > 0), or largest modulus (discrete
-        time, must be < 1)
-    residual : largest entry of (matrix - target) @ v over the null vectors v that the lemma names, relative
+    name
+        the matrix
+    statement
+        what the lemma says, corrected where the paper errs
+    holds
+        whether it is so here
+    target
+        the special eigenvalue: 0 in continuous time, 1 in discrete time
+    expected, multiplicity, nullity
+        eigenvalues at the target: by the lemma, counted, and counted as null vectors
+    others
+        least real part of the other eigenvalues (continuous time, must be > 0), or largest modulus (discrete time, must
+        be < 1)
+    residual
+        largest entry of (matrix - target) @ v over the null vectors v that the lemma names, relative
     """
 
     name: str
@@ -82,7 +89,8 @@ def check_facts(experiment: Experiment) -> list[Fact]:
 
     Raises
     ------
-    InputError : n m^2 is too large, or rates and gains differ by so much that rounding hides which eigenvalues are 0
+    InputError
+        n m^2 is too large, or rates and gains differ by so much that rounding hides which eigenvalues are 0
     """
     gains = experiment.leader_gains
     follows = np.isfinite(gains)

@@ -29,9 +29,12 @@ class GraphIndices:
 
     Attributes
     ----------
-    name : name of the graph
-    kirchhoff_index : sum of r_uv over pairs = m tr(L^+); the system error of the graph with F = I times 2 m
-    information_centrality : (m,) 1 / sum_v r_uv, the convention of networkx (Stephenson and Zelen: times m)
+    name
+        name of the graph
+    kirchhoff_index
+        sum of r_uv over pairs = m tr(L^+); the system error of the graph with F = I times 2 m
+    information_centrality
+        (m,) 1 / sum_v r_uv, the convention of networkx (Stephenson and Zelen: times m)
     """
 
     name: str
@@ -67,9 +70,12 @@ class Bounds:
 
     Attributes
     ----------
-    lower : error of the averaged graph; None where it bounds nothing
-    upper : error of the graphs held for ever (static baseline); None where it bounds nothing, or is infinite
-    note : why there are these bounds and no others
+    lower
+        error of the averaged graph; None where it bounds nothing
+    upper
+        error of the graphs held for ever (static baseline); None where it bounds nothing, or is infinite
+    note
+        why there are these bounds and no others
     """
 
     lower: float | None

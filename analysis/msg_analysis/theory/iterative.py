@@ -47,12 +47,15 @@ class IterativeSolver:
 
     Parameters
     ----------
-    system : what to solve for
-    guess : (n, d, d) steady moments of a similar system, or None
+    system
+        what to solve for
+    guess
+        (n, d, d) steady moments of a similar system, or None
 
     Raises
     ------
-    InputError : no steady second moments
+    InputError
+        no steady second moments
     """
 
     def __init__(self, system: JumpSystem, guess: FloatArray | None = None) -> None:

@@ -43,11 +43,16 @@ def conjugate_gradients(
 
     Parameters
     ----------
-    equations : A and its preconditioner
-    right : (q, n, d, d) B
-    goal : (q,) norms of the preconditioned residual that are small enough
-    tolerance : the same, relative to X
-    most : iterations
+    equations
+        A and its preconditioner
+    right
+        (q, n, d, d) B
+    goal
+        (q,) norms of the preconditioned residual that are small enough
+    tolerance
+        the same, relative to X
+    most
+        iterations
     """
     weights = equations.weights
     x, moved = equations.average(right)  # the preconditioner is symmetric where the residual has mean zero
@@ -81,10 +86,14 @@ def plain_conjugate_gradients(
 
     Parameters
     ----------
-    apply : (X, relative accuracy that will do) -> A X, symmetric and positive definite
-    right : (q, n, d, d) B; overwritten
-    tolerance : (q,) residuals that are small enough, relative to B
-    most : iterations
+    apply
+        (X, relative accuracy that will do) -> A X, symmetric and positive definite
+    right
+        (q, n, d, d) B; overwritten
+    tolerance
+        (q,) residuals that are small enough, relative to B
+    most
+        iterations
     """
     x, residual, p = np.zeros_like(right), right, right.copy()
     axpy = scipy.linalg.blas.get_blas_funcs("axpy", (right,))  # in place, in one pass
@@ -111,10 +120,14 @@ def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, m
 
     Parameters
     ----------
-    equations : A and its preconditioner
-    right : (q, n, d, d) B
-    tolerance : (q,) residuals that are small enough, relative to B
-    most : iterations, bounded by ``MAX_BASIS`` too
+    equations
+        A and its preconditioner
+    right
+        (q, n, d, d) B
+    tolerance
+        (q,) residuals that are small enough, relative to B
+    most
+        iterations, bounded by ``MAX_BASIS`` too
     """
     q, shape = len(right), right.shape
     length = right[0].size

@@ -62,12 +62,15 @@ class LeaderSearch:
 
     Parameters
     ----------
-    function : what is minimised
-    watch : told of progress
+    function
+        what is minimised
+    watch
+        told of progress
 
     Attributes
     ----------
-    evaluations : number of solves so far
+    evaluations
+        number of solves so far
     """
 
     def __init__(self, function: SetFunction, watch: Watch = ignore) -> None:
@@ -83,12 +86,15 @@ class LeaderSearch:
 
         Parameters
         ----------
-        count : agents in a set
-        top : how many sets
+        count
+            agents in a set
+        top
+            how many sets
 
         Returns
         -------
-        (E, set), best first; infinite ones are left out
+        list[tuple[float, Leaders]]
+            (E, set), best first; infinite ones are left out
         """
         self._begin("all sets", math.comb(self._function.agents, count))
         least = math.inf
@@ -114,8 +120,10 @@ class LeaderSearch:
 
         Parameters
         ----------
-        count : how many
-        first : agent to begin with; by default the best one
+        count
+            how many
+        first
+            agent to begin with; by default the best one
         """
         self._begin("greedy" if first is None else f"greedy after agent {first + 1}", count * self._function.agents)
         chosen = [] if first is None else [first]
@@ -134,11 +142,13 @@ class LeaderSearch:
 
         Parameters
         ----------
-        count : how many
+        count
+            how many
 
         Returns
         -------
-        agents; if no set of this size reaches everybody, one that reaches as many as possible
+        list[int]
+            agents; if no set of this size reaches everybody, one that reaches as many as possible
         """
         best = self.greedy(count)
         if self._function.unreached(frozenset(best)):
@@ -155,11 +165,13 @@ class LeaderSearch:
 
         Parameters
         ----------
-        chosen : a set that reaches everybody
+        chosen
+            a set that reaches everybody
 
         Returns
         -------
-        as many agents, each the best beside the others
+        list[int]
+            as many agents, each the best beside the others
         """
         count = len(chosen)
         current = list(chosen)
@@ -193,7 +205,8 @@ class LeaderSearch:
 
         Parameters
         ----------
-        leaders : the result of the search
+        leaders
+            the result of the search
         """
         count = len(leaders)
         self._begin("bound", self._function.agents)
@@ -223,8 +236,10 @@ class LeaderSearch:
 
         Parameters
         ----------
-        count : agents in a set
-        top : how many sets
+        count
+            agents in a set
+        top
+            how many sets
         """
         sets = [(value, key) for key, value in self._known.items() if len(key) == count and math.isfinite(value)]
         return _ranked(sets)[:top]

@@ -39,9 +39,12 @@ class LeaderProblem:
 
     Attributes
     ----------
-    experiment : consensus or tracking
-    law : "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
-    gain : kappa of the leaders [1 / unit of time]; inf holds them at the reference
+    experiment
+        consensus or tracking
+    law
+        "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
+    gain
+        kappa of the leaders [1 / unit of time]; inf holds them at the reference
     """
 
     experiment: Experiment
@@ -101,11 +104,13 @@ class LeaderProblem:
 
         Parameters
         ----------
-        leaders : agents from 0
+        leaders
+            agents from 0
 
         Raises
         ------
-        InputError : no steady state, or too large
+        InputError
+            no steady state, or too large
         """
         if not leaders or self.unreached(leaders):
             return math.inf
@@ -130,12 +135,18 @@ class Selection:
 
     Attributes
     ----------
-    problem : what was asked
-    method : "exhaustive", "greedy" or "swap"
-    sets : (E, agents from 0), best first; of greedy and swap, the best of those that were evaluated
-    order : agents in the order of the greedy choice, each replaced in its place by exchanges; () for enumeration
-    evaluations : number of system errors that were solved for
-    bound : no set of this size has a smaller system error; None where that is not known
+    problem
+        what was asked
+    method
+        "exhaustive", "greedy" or "swap"
+    sets
+        (E, agents from 0), best first; of greedy and swap, the best of those that were evaluated
+    order
+        agents in the order of the greedy choice, each replaced in its place by exchanges; () for enumeration
+    evaluations
+        number of system errors that were solved for
+    bound
+        no set of this size has a smaller system error; None where that is not known
     """
 
     problem: LeaderProblem
@@ -176,11 +187,13 @@ def resolve_law(experiment: Experiment, law: Law | None = None) -> Law:
 
     Parameters
     ----------
-    law : None for the paper's where the experiment has it, else that of the run's steps
+    law
+        None for the paper's where the experiment has it, else that of the run's steps
 
     Raises
     ------
-    InputError : the experiment does not have this law
+    InputError
+        the experiment does not have this law
     """
     if experiment.time == "discrete":
         possible: list[Law] = ["discrete"]
@@ -203,14 +216,19 @@ def system_error(experiment: Experiment, agents: list[int], *, law: Law | None =
 
     Parameters
     ----------
-    experiment : consensus or tracking; its own leaders do not count
-    agents : the leaders S, from 0
-    law : see ``resolve_law``
-    gain : kappa [1 / unit of time]
+    experiment
+        consensus or tracking; its own leaders do not count
+    agents
+        the leaders S, from 0
+    law
+        see ``resolve_law``
+    gain
+        kappa [1 / unit of time]
 
     Returns
     -------
-    inf where S does not reach everybody
+    float
+        inf where S does not reach everybody
     """
     return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(frozenset(agents))
 
@@ -220,7 +238,8 @@ def joint_robustness_centrality(experiment: Experiment, agents: list[int], *, la
 
     Parameters
     ----------
-    experiment, agents, law : see ``system_error``
+    experiment, agents, law
+        see ``system_error``
     """
     error = system_error(experiment, agents, law=law)
     return 1.0 / error if error > 0.0 else math.inf
@@ -240,19 +259,27 @@ def select_leaders(
 
     Parameters
     ----------
-    experiment : consensus or tracking; its own leaders do not count
-    count : number of leaders
-    method : "exhaustive" evaluates every set; "greedy" takes the best agent beside those taken before; "swap"
-        exchanges single leaders, from three starts, until that helps no more; "auto" is exhaustive up to
-        ``AUTO_SETS`` sets, else swap
-    law : see ``resolve_law``
-    gain : kappa of the leaders [1 / unit of time]; inf holds them at the reference
-    top : most sets in the result
-    watch : told of progress
+    experiment
+        consensus or tracking; its own leaders do not count
+    count
+        number of leaders
+    method
+        "exhaustive" evaluates every set; "greedy" takes the best agent beside those taken before; "swap" exchanges
+        single leaders, from three starts, until that helps no more; "auto" is exhaustive up to ``AUTO_SETS`` sets, else
+        swap
+    law
+        see ``resolve_law``
+    gain
+        kappa of the leaders [1 / unit of time]; inf holds them at the reference
+    top
+        most sets in the result
+    watch
+        told of progress
 
     Raises
     ------
-    InputError : impossible count, gain or law; no set of this size reaches everybody; too many sets
+    InputError
+        impossible count, gain or law; no set of this size reaches everybody; too many sets
     """
     _check(method in get_args(Method), f"method {method}: expected one of {', '.join(get_args(Method))}")
     _check(gain > 0.0, f"--gain {gain}: expected a number > 0, or inf for leaders held at the reference")

@@ -46,10 +46,14 @@ class LocalSolves:
 
     Parameters
     ----------
-    time : "continuous" (Lyapunov) or "discrete" (Stein)
-    drift : (k, d, d) D; symmetric to the last bit if at all
-    leaving : (k,) a
-    eigenvectors : of ``drift``, if they are known
+    time
+        "continuous" (Lyapunov) or "discrete" (Stein)
+    drift
+        (k, d, d) D; symmetric to the last bit if at all
+    leaving
+        (k,) a
+    eigenvectors
+        of ``drift``, if they are known
     """
 
     def __init__(
@@ -102,7 +106,8 @@ class LocalSolves:
 
         Parameters
         ----------
-        right : (..., k, d, d) F, symmetric
+        right
+            (..., k, d, d) F, symmetric
         """
         if self.eigenvectors is None:
             return self._by_schur(right)

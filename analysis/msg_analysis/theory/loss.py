@@ -15,9 +15,12 @@ def lost(lift: FloatArray, variance: FloatArray, moments: FloatArray) -> FloatAr
 
     Parameters
     ----------
-    lift : (m, d)
-    variance : (n, m, m), or (m, m) for one graph; see ``StepModel.loss_variance``
-    moments : (..., n, d, d) symmetric C
+    lift
+        (m, d)
+    variance
+        (n, m, m), or (m, m) for one graph; see ``StepModel.loss_variance``
+    moments
+        (..., n, d, d) symmetric C
     """
     full = lift @ moments @ lift.T
     own = np.diagonal(full, axis1=-2, axis2=-1)
@@ -31,9 +34,12 @@ def lost_adjoint(lift: FloatArray, variance: FloatArray, forms: FloatArray) -> F
 
     Parameters
     ----------
-    lift : (m, d)
-    variance : (n, m, m), or (m, m) for one graph
-    forms : (..., n, d, d) symmetric Y
+    lift
+        (m, d)
+    variance
+        (n, m, m), or (m, m) for one graph
+    forms
+        (..., n, d, d) symmetric Y
     """
     seen = variance * ((lift @ forms) * lift).sum(axis=-1)[..., None]
     laplacian = -(seen + seen.swapaxes(-1, -2))

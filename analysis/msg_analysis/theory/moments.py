@@ -29,13 +29,17 @@ class MomentSolver:
 
     Parameters
     ----------
-    system : what to solve for
-    method : "auto"; "krylov" or "dense" for this one and no other
-    guess : (n, d, d) steady moments of a similar system (the last one of a sweep), to start from
+    system
+        what to solve for
+    method
+        "auto"; "krylov" or "dense" for this one and no other
+    guess
+        (n, d, d) steady moments of a similar system (the last one of a sweep), to start from
 
     Raises
     ------
-    InputError : no steady second moments, or too ill-conditioned to be trusted
+    InputError
+        no steady second moments, or too ill-conditioned to be trusted
     """
 
     def __init__(
@@ -74,7 +78,8 @@ class MomentSolver:
 
         Raises
         ------
-        InputError : no steady second moments, or too ill-conditioned to be trusted
+        InputError
+            no steady second moments, or too ill-conditioned to be trusted
         """
         try:
             moments = self._solver.steady()
@@ -101,15 +106,18 @@ class MomentSolver:
 
         Parameters
         ----------
-        forms : (q, d, d) symmetric H
+        forms
+            (q, d, d) symmetric H
 
         Returns
         -------
-        (q, n, d, d)
+        FloatArray
+            (q, n, d, d)
 
         Raises
         ------
-        InputError : as ``steady``
+        InputError
+            as ``steady``
         """
         try:
             return self._solver.dual(forms)
@@ -131,13 +139,15 @@ def mode_potential(system: JumpSystem, dual: FloatArray) -> tuple[FloatArray, Fl
 
     Parameters
     ----------
-    system : discrete time
-    dual : (q, n, d, d) from ``MomentSolver.dual``
+    system
+        discrete time
+    dual
+        (q, n, d, d) from ``MomentSolver.dual``
 
     Returns
     -------
-    means : (q,) steady means of y^T H y
-    kappa : (q, n), pi-mean zero
+    tuple[FloatArray, FloatArray]
+        means : (q,) steady means of y^T H y kappa : (q, n), pi-mean zero
     """
     ahead = np.einsum("ij,qjab->qiab", system.chain, dual)
     gained = np.einsum("qiab,iab->qi", ahead, system.noise)
@@ -155,15 +165,21 @@ def transient_mean(
 
     Parameters
     ----------
-    system : discrete time
-    steady : (n, d, d) steady moments
-    initial : (n, d, d) E[y(0) y(0)^T; mode i]
-    law : (n,) of g(0)
-    steps : > 0
+    system
+        discrete time
+    steady
+        (n, d, d) steady moments
+    initial
+        (n, d, d) E[y(0) y(0)^T; mode i]
+    law
+        (n,) of g(0)
+    steps
+        > 0
 
     Returns
     -------
-    (d, d)
+    FloatArray
+        (d, d)
     """
     away, law_away = initial - steady, law - system.stationary
     scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))

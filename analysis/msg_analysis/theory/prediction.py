@@ -40,10 +40,14 @@ class Moments:
 
     Attributes
     ----------
-    covariance : (m, m) of the disagreement (consensus) or of the deviation from the reference (tracking)
-    by_mode : (n, m, m) E[.; mode i], which sum to ``covariance``; None for the static baseline
-    solver : how they were computed; None for the static baseline
-    law : of the run's steps: "synchronous", or "sequential" in real time; None for other laws
+    covariance
+        (m, m) of the disagreement (consensus) or of the deviation from the reference (tracking)
+    by_mode
+        (n, m, m) E[.; mode i], which sum to ``covariance``; None for the static baseline
+    solver
+        how they were computed; None for the static baseline
+    law
+        of the run's steps: "synchronous", or "sequential" in real time; None for other laws
     """
 
     covariance: FloatArray
@@ -86,17 +90,23 @@ class Prediction:
 
     Attributes
     ----------
-    experiment : what is predicted
-    step : the experiment compiled to one step of an agent
-    solver : of the equations of the run's steps, in real time those of its sequential law; its ``system`` is the
-        reduced system
-    steady : (n, d, d) steady second moments of the reduced system of the run's steps
-    emulated : what the run's steps do, exactly ("discrete" in the document of a discrete-time experiment); in real
-        time if nobody is late
-    continuous : the paper's continuous-time system; None in discrete time, with a protocol, or with noise on the air,
-        loss or delay
-    static : the pi-weighted mean over the graphs held for ever; None where one of them cannot keep the
-        agents together
+    experiment
+        what is predicted
+    step
+        the experiment compiled to one step of an agent
+    solver
+        of the equations of the run's steps, in real time those of its sequential law; its ``system`` is the reduced
+        system
+    steady
+        (n, d, d) steady second moments of the reduced system of the run's steps
+    emulated
+        what the run's steps do, exactly ("discrete" in the document of a discrete-time experiment); in real time if
+        nobody is late
+    continuous
+        the paper's continuous-time system; None in discrete time, with a protocol, or with noise on the air, loss or
+        delay
+    static
+        the pi-weighted mean over the graphs held for ever; None where one of them cannot keep the agents together
     """
 
     experiment: Experiment
@@ -133,7 +143,8 @@ def predict(experiment: Experiment) -> Prediction:
 
     Raises
     ------
-    InputError : too large, or without finite steady errors
+    InputError
+        too large, or without finite steady errors
     """
     step = build_step_model(experiment)
     continuous = static = None
@@ -159,8 +170,10 @@ def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
 
     Parameters
     ----------
-    experiment : whose steps, in real time those of its sequential law, the start is stationary for
-    mode : g(0), from 0
+    experiment
+        whose steps, in real time those of its sequential law, the start is stationary for
+    mode
+        g(0), from 0
     """
     step = build_step_model(experiment)
     with threadpool_limits(1):

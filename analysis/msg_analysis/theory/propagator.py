@@ -32,8 +32,10 @@ class Power:
 
     Attributes
     ----------
-    matrix : E or P
-    change : whether the map is z + E z; otherwise P z, which is better once nearly everything has died out
+    matrix
+        E or P
+    change
+        whether the map is z + E z; otherwise P z, which is better once nearly everything has died out
     """
 
     matrix: FloatArray
@@ -58,8 +60,10 @@ class Flow:
 
     Parameters
     ----------
-    time : "continuous": y(t) = exp(A t) y(0), "discrete": y(k) = (1 + A)^k y(0)
-    matrix : (N, N) A
+    time
+        "continuous": y(t) = exp(A t) y(0), "discrete": y(k) = (1 + A)^k y(0)
+    matrix
+        (N, N) A
     """
 
     def __init__(self, time: Time, matrix: FloatArray) -> None:
@@ -146,10 +150,14 @@ class Propagator(Flow):
 
     Parameters
     ----------
-    time : "continuous" or "discrete"
-    chain : (n, n) Gamma or P
-    stationary : (n,) pi
-    local : (n, q, q) A_i, less the identity in discrete time
+    time
+        "continuous" or "discrete"
+    chain
+        (n, n) Gamma or P
+    stationary
+        (n,) pi
+    local
+        (n, q, q) A_i, less the identity in discrete time
     """
 
     def __init__(self, time: Time, chain: FloatArray, stationary: FloatArray, local: FloatArray) -> None:

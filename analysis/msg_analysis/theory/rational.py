@@ -35,14 +35,19 @@ class RationalFlow(Flow):
 
     Parameters
     ----------
-    system : continuous time
-    start : (n, p + 1) packed second moments and probability of every mode, or their distance from the steady state
-    slow : slowest rate, or 1 / longest time, of interest
-    decays : whether the start is a distance from the steady state, of which nothing stays
+    system
+        continuous time
+    start
+        (n, p + 1) packed second moments and probability of every mode, or their distance from the steady state
+    slow
+        slowest rate, or 1 / longest time, of interest
+    decays
+        whether the start is a distance from the steady state, of which nothing stays
 
     Raises
     ------
-    InputError : too large, or the space does not become accurate
+    InputError
+        too large, or the space does not become accurate
     """
 
     def __init__(self, system: JumpSystem, start: FloatArray, slow: float, *, decays: bool) -> None:

@@ -19,15 +19,20 @@ class SolverReport:
 
     Attributes
     ----------
-    method : "cg" (reversible chain, symmetric graphs, continuous time) or "gmres", "direct" for one graph alone,
-        "dense" (LU of the half-vectorised equations)
-    preconditioner : "two-level" (every graph alone, then their average), "averaged" (the average in place of every
-        graph), "none"
-    iterations : applications of the preconditioner; for "dense", steps of refinement
-    residual : largest norm of a graph's residual, over that of its right-hand side
-    backward_error : largest norm of a graph's residual, over the sum of the norms of the terms that it consists of
-    error : estimated relative error: size of the correction that one more step would make; for "dense", the backward
-        error times the condition number
+    method
+        "cg" (reversible chain, symmetric graphs, continuous time) or "gmres", "direct" for one graph alone, "dense" (LU
+        of the half-vectorised equations)
+    preconditioner
+        "two-level" (every graph alone, then their average), "averaged" (the average in place of every graph), "none"
+    iterations
+        applications of the preconditioner; for "dense", steps of refinement
+    residual
+        largest norm of a graph's residual, over that of its right-hand side
+    backward_error
+        largest norm of a graph's residual, over the sum of the norms of the terms that it consists of
+    error
+        estimated relative error: size of the correction that one more step would make; for "dense", the backward error
+        times the condition number
     """
 
     method: Method

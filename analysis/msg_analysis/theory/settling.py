@@ -50,18 +50,24 @@ def settling_time(system: JumpSystem, steady: FloatArray, start: Snapshot, fract
 
     Parameters
     ----------
-    system : with a steady state; continuous or discrete time
-    steady : (n, d, d) of ``MomentSolver(system).steady()``
-    start : at time 0
-    fraction : between 0 and 1
+    system
+        with a steady state; continuous or discrete time
+    steady
+        (n, d, d) of ``MomentSolver(system).steady()``
+    start
+        at time 0
+    fraction
+        between 0 and 1
 
     Returns
     -------
-    units of time, or steps; 0.0 if the error is within the fraction from the start
+    float
+        units of time, or steps; 0.0 if the error is within the fraction from the start
 
     Raises
     ------
-    InputError : no noise, so that the steady error is 0; too large in continuous time; or never settles
+    InputError
+        no noise, so that the steady error is 0; too large in continuous time; or never settles
     """
     if not 0.0 < fraction < 1.0:
         raise InputError(f"settling fraction: {fraction:g}, expected a number between 0 and 1: for example 0.05")
@@ -166,9 +172,12 @@ class Rates:
 
     Attributes
     ----------
-    mean : of the means: least real part of the eigenvalues of N, or -log of the spectral radius of H
-    second_moment : of the second moments: the same of M, or A; None where it was not found
-    graph : of the law of the graph; None for one graph
+    mean
+        of the means: least real part of the eigenvalues of N, or -log of the spectral radius of H
+    second_moment
+        of the second moments: the same of M, or A; None where it was not found
+    graph
+        of the law of the graph; None for one graph
     """
 
     mean: float
@@ -181,8 +190,10 @@ def asymptotic_rates(system: JumpSystem, steady: FloatArray) -> Rates:
 
     Parameters
     ----------
-    system : with a steady state; continuous or discrete time
-    steady : (n, d, d) of ``MomentSolver(system).steady()``
+    system
+        with a steady state; continuous or discrete time
+    steady
+        (n, d, d) of ``MomentSolver(system).steady()``
     """
     means = mean_propagator(system)
     second: float | None = None

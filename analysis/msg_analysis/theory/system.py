@@ -28,14 +28,22 @@ class JumpSystem:
 
     Attributes
     ----------
-    time : "continuous" or "discrete"
-    matrices : (n, d, d) Z_i [1 / unit of time] or W_i
-    noise : (n, d, d) covariance of the noise, per unit of time or per step
-    chain : (n, n) Gamma or P
-    stationary : (n,) pi
-    lift : (len(s), d), columns orthonormal, so that y = lift^T (s - what s should be)
-    loss_variance : (n, len(s), len(s)) or None; see ``StepModel.loss_variance``. Discrete time only
-    readout : (m, d) with a delay; None without, where ``lift`` is what it would be
+    time
+        "continuous" or "discrete"
+    matrices
+        (n, d, d) Z_i [1 / unit of time] or W_i
+    noise
+        (n, d, d) covariance of the noise, per unit of time or per step
+    chain
+        (n, n) Gamma or P
+    stationary
+        (n,) pi
+    lift
+        (len(s), d), columns orthonormal, so that y = lift^T (s - what s should be)
+    loss_variance
+        (n, len(s), len(s)) or None; see ``StepModel.loss_variance``. Discrete time only
+    readout
+        (m, d) with a delay; None without, where ``lift`` is what it would be
     """
 
     time: Time
@@ -92,8 +100,10 @@ class JumpSystem:
 
         Parameters
         ----------
-        moments : (n, d, d) C_i(k) = E[y y^T; mode i]
-        law : (n,) of g(k)
+        moments
+            (n, d, d) C_i(k) = E[y y^T; mode i]
+        law
+            (n,) of g(k)
         """
         after = self.propagate(moments) + law[:, None, None] * self.noise
         return np.tensordot(self.chain, after, axes=(0, 0)), law @ self.chain
@@ -112,8 +122,10 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
 
     Parameters
     ----------
-    step : the compiled experiment
-    problem : "consensus" or "tracking"
+    step
+        the compiled experiment
+    problem
+        "consensus" or "tracking"
     """
     m, delay = step.agents, step.delay
     size = m * (delay + 1)

@@ -41,9 +41,12 @@ class Snapshot:
 
     Attributes
     ----------
-    law : (n,) pi_i = P(g = i)
-    means : (n, d) E[y; mode i]
-    moments : (n, d, d) C_i = E[y y^T; mode i]
+    law
+        (n,) pi_i = P(g = i)
+    means
+        (n, d) E[y; mode i]
+    moments
+        (n, d, d) C_i = E[y y^T; mode i]
     """
 
     law: FloatArray
@@ -57,11 +60,16 @@ class Transient:
 
     Attributes
     ----------
-    system : whose they are
-    times : (T,) ascending; units of time, or numbers of steps
-    laws : (T, n) pi(t)
-    means : (T, n, d) nu(t), reduced
-    moments : (T, n, d, d) c(t), reduced
+    system
+        whose they are
+    times
+        (T,) ascending; units of time, or numbers of steps
+    laws
+        (T, n) pi(t)
+    means
+        (T, n, d) nu(t), reduced
+    moments
+        (T, n, d, d) c(t), reduced
     """
 
     system: JumpSystem
@@ -102,9 +110,12 @@ def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | Non
 
     Parameters
     ----------
-    system : reduced or not
-    deviation : (m,) x(0) - (what x should be); in consensus, x(0)
-    law : (n,) of g(0); by default the stationary law
+    system
+        reduced or not
+    deviation
+        (m,) x(0) - (what x should be); in consensus, x(0)
+    law
+        (n,) of g(0); by default the stationary law
     """
     law = system.stationary if law is None else law
     y = system.reduced(deviation)
@@ -116,9 +127,12 @@ def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray)
 
     Parameters
     ----------
-    experiment : whose start
-    system : one of its laws
-    stationary : (n, d, d) second moments for ``run.start: stationary``
+    experiment
+        whose start
+    system
+        one of its laws
+    stationary
+        (n, d, d) second moments for ``run.start: stationary``
     """
     law = system.stationary
     if experiment.switching.initial != "stationary":
@@ -153,14 +167,19 @@ def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Fl
 
     Parameters
     ----------
-    system : continuous or discrete time
-    start : at time 0
-    times : (T,) >= 0, ascending; whole numbers of steps in discrete time
-    steady : (n, d, d) of ``MomentSolver(system).steady()``; None where there is no steady state
+    system
+        continuous or discrete time
+    start
+        at time 0
+    times
+        (T,) >= 0, ascending; whole numbers of steps in discrete time
+    steady
+        (n, d, d) of ``MomentSolver(system).steady()``; None where there is no steady state
 
     Raises
     ------
-    InputError : times not usable, or too large
+    InputError
+        times not usable, or too large
     """
     times = np.asarray(times, dtype=float)
     _check_times(system, times)
@@ -179,10 +198,14 @@ def joint_flow(system: JumpSystem, stack: FloatArray, slow: Callable[[], float],
 
     Parameters
     ----------
-    system : small, or in continuous time
-    stack : (n, p + 1) of ``joint_stack``
-    slow : gives the slowest rate of interest
-    decays : whether the stack is a distance from the steady state
+    system
+        small, or in continuous time
+    stack
+        (n, p + 1) of ``joint_stack``
+    slow
+        gives the slowest rate of interest
+    decays
+        whether the stack is a distance from the steady state
     """
     if unknowns(system) <= MAX_UNKNOWNS:
         return second_moment_propagator(system)

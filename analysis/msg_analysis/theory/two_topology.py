@@ -37,11 +37,15 @@ class TwoTopology:
 
     Attributes
     ----------
-    rate : beta = q_12 + q_21 [1 / unit of time], or P_12 + P_21
-    static : (m,) pi-weighted mean of the node errors of the two graphs held for ever
-    switching : (m,) what switching adds to them; negative where it helps
-    fast : (m,) limit of ``switching`` for beta to infinity (continuous time), or its value at beta = 1, where
-        the graphs of successive steps are independent (discrete time)
+    rate
+        beta = q_12 + q_21 [1 / unit of time], or P_12 + P_21
+    static
+        (m,) pi-weighted mean of the node errors of the two graphs held for ever
+    switching
+        (m,) what switching adds to them; negative where it helps
+    fast
+        (m,) limit of ``switching`` for beta to infinity (continuous time), or its value at beta = 1, where the graphs
+        of successive steps are independent (discrete time)
     """
 
     rate: float
@@ -74,11 +78,13 @@ def two_topology(system: JumpSystem) -> TwoTopology:
 
     Parameters
     ----------
-    system : two modes; continuous or discrete time, consensus or tracking, any noise and loss
+    system
+        two modes; continuous or discrete time, consensus or tracking, any noise and loss
 
     Raises
     ------
-    InputError : not two graphs, too many agents, or a graph that cannot be held for ever
+    InputError
+        not two graphs, too many agents, or a graph that cannot be held for ever
     """
     if system.modes != 2:
         raise InputError(f"two-topology form: {system.modes} graphs, expected 2: use predict")
