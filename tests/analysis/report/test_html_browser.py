@@ -102,8 +102,9 @@ def test_small_and_large(browser: Any, tmp_path: Path, agents: int) -> None:
     page.mouse.move(x, y)
     page.locator(".bk-Tooltip", has_text=re.compile(r"agent:?\s*3.*z:?\s*[+\-−]\d", re.DOTALL)).first.wait_for()
     page.mouse.click(x, y)
-    page.wait_for_function("document.getElementById('agents').value == '3'")
+    page.locator("#chosen", has_text=f"1 of {agents} agents").wait_for()
     assert rows.count() == 1
+    assert page.input_value("#agents") == "3"
     page.click("#all-agents")
 
     page.locator("details").last.evaluate("one => one.open = false")
