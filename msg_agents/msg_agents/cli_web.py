@@ -41,8 +41,7 @@ def web_options(function: Function) -> Function:
 
 def with_port(args: list[str]) -> list[str]:
     """The same arguments, where ``--web`` takes the one after it only if that is a number."""
-    following = [*args[1:], ""]
-    pairs = zip(args, following, strict=True)
+    pairs = zip(args, [*args[1:], ""], strict=False)
     return [f"--web={PORT}" if one == "--web" and not after.isdigit() else one for one, after in pairs]
 
 
