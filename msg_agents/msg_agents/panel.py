@@ -76,7 +76,9 @@ def _progress(moment: Moment, experiment: Experiment, width: int) -> RenderableT
     text = f"step {moment.reached} of {experiment.steps}  {100 * share:.0f} %  {moment.rate:.0f} steps/s"
     if moment.left is not None:
         text += f"  {_duration(moment.left)} left"
-    bar = ProgressBar(total=1.0, completed=share, width=max(width - len(text) - 2, 4))
+    bar = ProgressBar(
+        total=1.0, completed=share, width=max(width - len(text) - 2, 4), complete_style="cyan", finished_style="green"
+    )
     line = Table.grid(padding=(0, 2, 0, 0))
     line.add_row(Text(text, no_wrap=True, overflow="ellipsis"), bar)
     return line if width > len(text) + 6 else Text(text, no_wrap=True, overflow="ellipsis")
