@@ -19,7 +19,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def web_options(function: Function) -> Function:
-    """The options ``--web`` and ``--web-host``."""
+    """The options ``--web`` and ``--web-host``.
+
+    Parameters
+    ----------
+    function
+        of the command, which gets ``web`` and ``web_host``
+    """
     host = click.option(
         "--web-host",
         default=HOST,
@@ -40,7 +46,13 @@ def web_options(function: Function) -> Function:
 
 
 def with_port(args: list[str]) -> list[str]:
-    """The same arguments, where ``--web`` takes the one after it only if that is a number."""
+    """The same arguments, where ``--web`` takes the one after it only if that is a number.
+
+    Parameters
+    ----------
+    args
+        of the command line
+    """
     pairs = zip(args, [*args[1:], ""], strict=False)
     return [f"--web={PORT}" if one == "--web" and not after.isdigit() else one for one, after in pairs]
 
@@ -87,7 +99,17 @@ def page(port: int | None, host: str) -> Iterator[Web | None]:
 
 
 def announce(web: Web, host: str, note: Callable[[str], None]) -> None:
-    """Say where the page is, and who can see it."""
+    """Say where the page is, and who can see it.
+
+    Parameters
+    ----------
+    web
+        that serves it
+    host
+        where it is served
+    note
+        told a line for people
+    """
     note(f"live page at {web.address}")
     if host not in LOOPBACK:
         note("whoever can reach this machine can see the page; it is not encrypted and asks for no password")

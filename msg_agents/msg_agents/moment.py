@@ -26,7 +26,13 @@ class Speeds:
         self._seen: deque[tuple[float, list[int]]] = deque()
 
     def add(self, steps: Sequence[int]) -> None:
-        """Take the newest step of every agent."""
+        """Take the newest step of every agent.
+
+        Parameters
+        ----------
+        steps
+            of agent 1, agent 2, ...
+        """
         now = time.monotonic()
         if self._seen and now - self._seen[-1][0] < GRAIN:
             return
@@ -43,14 +49,26 @@ class Speeds:
 
 
 class Path:
-    """The sojourns of a run, in order: which one a step is in."""
+    """The sojourns of a run, in order: which one a step is in.
+
+    Parameters
+    ----------
+    experiment
+        that is run
+    """
 
     def __init__(self, experiment: Experiment) -> None:
         self._rest: Iterator[Sojourn] = sojourns(experiment, first_graph(experiment))
         self._now = next(self._rest, None)
 
     def at(self, step: int) -> Sojourn | None:
-        """The sojourn of the step k -> k+1; steps must not go back."""
+        """The sojourn of the step k -> k+1; steps must not go back.
+
+        Parameters
+        ----------
+        step
+            k
+        """
         while self._now is not None and step > self._now.last_step:
             following = next(self._rest, None)
             if following is None:  # the end of the run
@@ -72,7 +90,7 @@ class Moment:
     sojourn
         of the graph that the slowest agent is in; None before the start
     seconds
-        since the first state
+        since the first state [s]
     left
         s until the end at this speed; None where not known
     report

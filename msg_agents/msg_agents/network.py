@@ -21,7 +21,13 @@ loopback.xml, of which switcher, recorder and what the user watches the run with
 
 
 def agent_name(agent: int) -> str:
-    """Name of the node, and namespace of the topics, of an agent (index from 0)."""
+    """Name of the node, and namespace of the topics, of an agent.
+
+    Parameters
+    ----------
+    agent
+        index from 0
+    """
     return f"agent_{agent + 1}"
 
 

@@ -52,7 +52,13 @@ class Observer:
         self._thread.start()
 
     def look(self, reached: int) -> None:
-        """Tell which state all agents have published."""
+        """Tell which state all agents have published.
+
+        Parameters
+        ----------
+        reached
+            its step; -1: none
+        """
         self._reached = reached
 
     def end(self) -> None:

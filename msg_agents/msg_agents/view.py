@@ -65,7 +65,13 @@ class RunView:
             self._live.stop()
 
     def note(self, line: str) -> None:
-        """Say what happens, above the panel."""
+        """Say what happens, above the panel.
+
+        Parameters
+        ----------
+        line
+            for people
+        """
         from rich.text import Text
 
         self._console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
@@ -128,6 +134,12 @@ class RunView:
             self._observer = None
 
     def say(self, words: dict[str, Any]) -> None:
-        """Tell the page how the run ended."""
+        """Tell the page how the run ended.
+
+        Parameters
+        ----------
+        words
+            what the page shows of it
+        """
         if self._web is not None:
             self._web.end(words)

@@ -145,7 +145,13 @@ class Web:
         self._changed.notify_all()
 
     def follow(self, handler: _Handler) -> None:
-        """Send one browser what is newest, again and again, until the end or until it has gone."""
+        """Send one browser what is newest, again and again, until the end or until it has gone.
+
+        Parameters
+        ----------
+        handler
+            of its request
+        """
         with self._changed:
             if self._browsers >= MOST_BROWSERS:
                 handler.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_BROWSERS} browsers are watching already")

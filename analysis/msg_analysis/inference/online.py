@@ -120,7 +120,19 @@ class LiveEstimate:
         self.steps.add(agent, step, mode, payload)
 
     def add_whole(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
-        """Take steps that have come whole by another way, each once ever; arrays as of ``StepCollector.take``."""
+        """Take steps that have come whole by another way, each once ever.
+
+        Parameters
+        ----------
+        steps
+            (b,) k
+        modes
+            (b,) graph of the step k -> k+1, from 0
+        states
+            (b, m, width) x(k)
+        after
+            (b, m, width) x(k+1)
+        """
         if not len(steps):
             return
         self._errors.add(steps, modes, states, after)

@@ -83,7 +83,7 @@ class Timing:
     histogram
         of lateness: edges [ms] (BINS + 1,) and counts (BINS,); beyond the last edge there is nothing
     ages
-        the same of the age of the values used
+        the same of the age of the values used: edges [ms] (BINS + 1,) and counts (BINS,)
     """
 
     period_ms: float

@@ -261,7 +261,13 @@ def _built_in(experiment: Experiment) -> FloatArray:
 
 
 def first_graph(experiment: Experiment) -> FloatArray:
-    """(n,): the law of g(0)."""
+    """(n,): the law of g(0).
+
+    Parameters
+    ----------
+    experiment
+        of which the file says how it begins
+    """
     first = experiment.switching.initial
     if first == "stationary":
         return experiment.chain.stationary

@@ -24,6 +24,11 @@ def explain(experiment: Experiment) -> list[str]:
 def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
     """What there is to know of every graph.
 
+    Parameters
+    ----------
+    experiment
+        whose graphs they are
+
     Returns
     -------
     list[dict[str, Any]]

@@ -224,7 +224,13 @@ def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
 
 
 def holding_times(experiment: Experiment) -> list[float | None]:
-    """Mean time [units of simulated time] in each graph at a stretch; None where it is never left."""
+    """Mean time [units of simulated time] in each graph at a stretch; None where it is never left.
+
+    Parameters
+    ----------
+    experiment
+        whose chain it is
+    """
     matrix = experiment.chain.matrix
     leaving = (matrix - np.diag(np.diag(matrix))).sum(axis=1)
     return [1.0 / rate if rate > 0 else None for rate in leaving.tolist()]

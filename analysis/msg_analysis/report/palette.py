@@ -11,10 +11,24 @@ GREY, PALE, INK = "#6b7280", "#e5e7eb", "#374151"
 
 
 def mode_colour(mode: int) -> str:
-    """Of a graph, index from 0."""
+    """Of a graph.
+
+    Parameters
+    ----------
+    mode
+        index from 0
+    """
     return MODE_COLOURS[mode % len(MODE_COLOURS)]
 
 
 def shorten(name: str, length: int = 18) -> str:
-    """Short enough for a label."""
+    """Short enough for a label.
+
+    Parameters
+    ----------
+    name
+        of a graph, or of anything
+    length
+        characters that there is room for
+    """
     return name if len(name) <= length else name[: length - 1] + "…"
