@@ -13,7 +13,13 @@ SMALLEST_SPLIT = 0.1  # MB; of the order of a chunk
 
 
 def storage_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the arguments ``compression`` and ``split_size`` [MB]; see :func:`storage`."""
+    """Give a command the arguments ``compression`` and ``split_size`` [MB]; see :func:`storage`.
+
+    Parameters
+    ----------
+    command
+        function of the command, below ``click.command``
+    """
     for option in (
         click.option(
             "--compression",
@@ -34,6 +40,13 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
 
 def storage(compression: Compression, split_size: float | None) -> Storage:
     """What these options say.
+
+    Parameters
+    ----------
+    compression
+        of the chunks
+    split_size
+        of a file of the bag [MB, 10^6 bytes]; None: one file
 
     Raises
     ------

@@ -103,10 +103,22 @@ class LinearProtocol(ABC):
 
     @abstractmethod
     def weights(self, mode: int) -> FloatArray:
-        """W_g of a graph, (m, m): rows sum to 1, and agent i uses only itself and whom it hears in this graph."""
+        """W_g of a graph, (m, m): rows sum to 1, and agent i uses only itself and whom it hears in this graph.
+
+        Parameters
+        ----------
+        mode
+            index of the graph, from 0
+        """
 
     def noise_gain(self, mode: int) -> FloatArray:
-        """B_g of a graph, (m, m). By default what the experiment says."""
+        """B_g of a graph, (m, m). By default what the experiment says.
+
+        Parameters
+        ----------
+        mode
+            index of the graph, from 0
+        """
         return np.asarray(self.network.noise_gain[mode])
 
 
@@ -178,13 +190,25 @@ class Protocol(ABC):
         self.agent = agent
 
     def start(self, value: FloatArray) -> FloatArray:
-        """State (S, R) at step 0 from the value (R,) that the experiment gives. By default all else is 0."""
+        """State (S, R) at step 0 from the value (R,) that the experiment gives. By default all else is 0.
+
+        Parameters
+        ----------
+        value
+            (R,) the experiment's start of this agent
+        """
         state = np.zeros((self.states, len(value)))
         state[0] = value
         return state
 
     def publish(self, state: FloatArray) -> FloatArray:
-        """What others hear (R,) of a state (S, R). By default its first row."""
+        """What others hear (R,) of a state (S, R). By default its first row.
+
+        Parameters
+        ----------
+        state
+            (S, R) of this agent
+        """
         return np.asarray(state[0])
 
     @abstractmethod

@@ -32,6 +32,10 @@ def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatA
 
     Parameters
     ----------
+    experiment
+        whose ``run.start`` and seed
+    model
+        its compiled step; the stationary start needs a ``StepModel``
     first_mode
         index of g(0); the stationary start depends on it
     """
@@ -53,6 +57,8 @@ def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecor
 
     Parameters
     ----------
+    experiment
+        that is going to be run
     run
         run id; a new random one if not given
     """
@@ -69,6 +75,8 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
 
     Parameters
     ----------
+    experiment
+        what to run; with a record, that of the record
     record
         of the run to repeat; a new run with a new id if not given
 

@@ -44,6 +44,11 @@ class IdealTimers:
             (m, R) x(0)
         drives
             for every step, (m, R) noise plus offset
+
+        Yields
+        ------
+        FloatArray
+            (m, R) each, one for each step
         """
         m = len(start)
         both = np.concatenate([start, start])  # x(k) above x(k+1)
@@ -54,7 +59,13 @@ class IdealTimers:
             yield both[m:].copy()
 
     def log(self, modes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-        """``Trajectory.agent_modes``, ``Trajectory.used`` and ``Trajectory.made`` of a run with these graphs (N,)."""
+        """``Trajectory.agent_modes``, ``Trajectory.used`` and ``Trajectory.made`` of a run with these graphs (N,).
+
+        Parameters
+        ----------
+        modes
+            (N,) graph of every step, from 0
+        """
         model, phase, steps = self._model, self._phase, len(modes)
         agent_modes = np.repeat(np.concatenate([[-1], modes])[:, None], model.agents, axis=1)
         ahead = ideal_uses(model, phase)[modes]

@@ -37,7 +37,17 @@ class Account:
 
 
 def write_account(path: Path, refused: Sequence[Refused], waiting: Mapping[str, str]) -> None:
-    """Replace the account of one process. That it cannot be written (full disk) is no reason to fail."""
+    """Replace the account of one process. That it cannot be written (full disk) is no reason to fail.
+
+    Parameters
+    ----------
+    path
+        of the file
+    refused
+        messages that were refused
+    waiting
+        name of a node, and what it waits for
+    """
     with contextlib.suppress(OSError):
         temporary = path.with_suffix(".part")
         temporary.write_text(json.dumps({"refused": refused, "waiting": waiting}), encoding="utf-8")
@@ -45,7 +55,13 @@ def write_account(path: Path, refused: Sequence[Refused], waiting: Mapping[str, 
 
 
 def read_accounts(paths: Iterable[Path]) -> Account:
-    """Sum of the accounts of processes, in the order of their start, those that were killed included."""
+    """Sum of the accounts of processes, in the order of their start, those that were killed included.
+
+    Parameters
+    ----------
+    paths
+        of the files; those that are not there are left out
+    """
     account = Account()
     waiting: dict[str, str] = {}
     for path in paths:

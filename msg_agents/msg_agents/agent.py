@@ -92,13 +92,25 @@ class Agent(NetworkNode):
             self._awaits_truth = [name for name in readers if name == RECORDER]  # others may do with what all hear
 
     def meet(self, colleagues: Mapping[int, Agent]) -> None:
-        """Hand the state directly to the agents of the same process, by index; hear those of others on topics."""
+        """Hand the state directly to the agents of the same process, by index; hear those of others on topics.
+
+        Parameters
+        ----------
+        colleagues
+            agents of this process by index from 0, itself included
+        """
         self._listeners = [colleagues[j].hear for j in self._near]
         for j in self._far:
             self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), STREAM, raw=True)
 
     def host(self, agents: Sequence[Agent]) -> None:
-        """Have what the agents of a process need once: asked of the first of them."""
+        """Have what the agents of a process need once: asked of the first of them.
+
+        Parameters
+        ----------
+        agents
+            of this process
+        """
 
     def found(self) -> bool:
         """See NetworkNode."""
@@ -159,7 +171,13 @@ class Agent(NetworkNode):
             hear(self._law.agent, step, state)
 
     def send_again(self, since: int) -> None:
-        """Somebody may have missed what was sent from a step on."""
+        """Somebody may have missed what was sent from a step on.
+
+        Parameters
+        ----------
+        since
+            first step that is wanted
+        """
         self._repeat(since)
 
     def _repeat(self, since: int) -> None:
@@ -178,11 +196,27 @@ class Agent(NetworkNode):
         raise NotImplementedError
 
     def hear(self, peer: int, step: int, value: Any) -> None:
-        """Take x_peer(step) from an agent of the same process."""
+        """Take x_peer(step) from an agent of the same process.
+
+        Parameters
+        ----------
+        peer
+            index from 0
+        step
+            k
+        value
+            x_peer(k), as the law takes it
+        """
         raise NotImplementedError
 
     def learn(self, graph: ActiveGraph) -> str | None:
-        """Take note of a sojourn; None, or why not."""
+        """Take note of a sojourn; None, or why not.
+
+        Parameters
+        ----------
+        graph
+            of this run
+        """
         raise NotImplementedError
 
     def _report(self) -> None:

@@ -16,6 +16,11 @@ from msg_analysis.errors import InputError
 def message_class(type_name: str) -> Any:
     """Class of a message type, ``package/msg/Name``.
 
+    Parameters
+    ----------
+    type_name
+        such as std_msgs/msg/String
+
     Raises
     ------
     ImportError, AttributeError, ValueError

@@ -24,13 +24,25 @@ _MARK = struct.Struct("<QQ")
 
 
 def longest_heard(record: RunRecord) -> int:
-    """Most steps that ``heard`` of a state message can list in a run."""
+    """Most steps that ``heard`` of a state message can list in a run.
+
+    Parameters
+    ----------
+    record
+        of the run
+    """
     experiment = record.experiment
     return experiment.agents - 1 if experiment.noise.loss or experiment.run.pace == "realtime" else 0
 
 
 def room_for(size: int) -> int:
-    """Bytes of the file of an agent whose longest message has so many."""
+    """Bytes of the file of an agent whose longest message has so many.
+
+    Parameters
+    ----------
+    size
+        of the message, in bytes
+    """
     slot = size + _MARK.size
     return slot * max(LEAST, min(MOST, ROOM // slot))
 
@@ -85,7 +97,15 @@ class Checkpoint:
             os.close(descriptor)
 
     def write(self, step: int, message: bytes) -> None:
-        """Keep the message of a step; steps must come one after the other."""
+        """Keep the message of a step; steps must come one after the other.
+
+        Parameters
+        ----------
+        step
+            k
+        message
+            CDR bytes of the state
+        """
         start = step % self._capacity * self._slot
         self._map[start : start + len(message)] = message
         _MARK.pack_into(self._map, start + self._size, len(message), step + 1)
@@ -94,6 +114,11 @@ class Checkpoint:
         """(step, message) of the newest unbroken row of steps, from a first one on, ascending.
 
         The slot after the newest is left out: it may be torn.
+
+        Parameters
+        ----------
+        first
+            least step that is wanted
         """
         marks = [_MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self._capacity)]
         newest = max(mark for _, mark in marks) - 1

@@ -250,6 +250,11 @@ def _make(directory: Path | None) -> Path | None:
 def load_record(path: Path) -> RunRecord:
     """The run record in a file.
 
+    Parameters
+    ----------
+    path
+        of the file that ``msg-agents prepare`` wrote
+
     Raises
     ------
     InputError

@@ -52,7 +52,15 @@ def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) ->
 
 
 def keep_to(process: int, core: int) -> None:
-    """Keep a process that has just been started, and what it starts, to a core; not if the system will not have it."""
+    """Keep a process that has just been started, and what it starts, to a core; not if the system will not have it.
+
+    Parameters
+    ----------
+    process
+        its id
+    core
+        number of the core, as the system has it
+    """
     try:
         os.sched_setaffinity(process, {core})
     except OSError:  # it has ended already, or the core has been taken from us

@@ -98,16 +98,38 @@ class AgentGroup:
         self._host.executor.create_task(callback)
 
     def fail(self, error: Exception) -> None:
-        """End the process because an agent cannot go on."""
+        """End the process because an agent cannot go on.
+
+        Parameters
+        ----------
+        error
+            that the agent ended with
+        """
         for agent in self.nodes:
             agent.fail(error)
 
     def report(self, agent: int, step: int) -> None:
-        """Tell the switcher how far an agent is."""
+        """Tell the switcher how far an agent is.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        step
+            that it has reached
+        """
         self._host.publish(self._progress, self._host.progress(agent + 1, step))
 
     def ask_again(self, agent: int, step: int) -> None:
-        """Ask an agent of another process for its states from a step on."""
+        """Ask an agent of another process for its states from a step on.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        step
+            first step that is wanted
+        """
         if self._resend is None:  # hardly ever needed; latched, so that it does not matter when it is matched
             self._resend = self._host.create_publisher(ProgressMsg, RESEND_TOPIC, LATCHED)
         self._host.publish(self._resend, self._host.progress(agent + 1, step))

@@ -35,7 +35,17 @@ class Health:
     values: dict[str, str] = field(default_factory=dict)
 
     def to_status(self, node: Node, refused: Mapping[tuple[str, str], int], repeated: int) -> DiagnosticStatus:
-        """The message. Refused messages are a warning: somebody else is on our topics."""
+        """The message. Refused messages are a warning: somebody else is on our topics.
+
+        Parameters
+        ----------
+        node
+            that it is about
+        refused
+            number of messages by topic and reason
+        repeated
+            messages that came again
+        """
         warn = self.waiting or bool(refused)
         counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in refused.items()}
         values = self.values | counts

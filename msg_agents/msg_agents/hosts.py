@@ -101,6 +101,13 @@ class Hosts:
     def load(cls, path: Path, experiment: Experiment) -> Hosts:
         """Read a hosts file (YAML).
 
+        Parameters
+        ----------
+        path
+            of the file
+        experiment
+            whose agents are spread
+
         Raises
         ------
         InputError
@@ -110,7 +117,22 @@ class Hosts:
 
     @classmethod
     def parse(cls, document: Any, experiment: Experiment, source: str = "hosts") -> Hosts:
-        """Check a document and make it hosts. See ``load``."""
+        """Check a document and make it hosts. See ``load``.
+
+        Parameters
+        ----------
+        document
+            as a YAML reader gives it
+        experiment
+            whose agents are spread
+        source
+            where it came from, for messages
+
+        Raises
+        ------
+        ExperimentError
+            names every mistake in the document
+        """
         if not isinstance(document, dict):
             raise ExperimentError(
                 source, ["expected the keys domain, recorder and hosts: see `msg-agents host --help`"]
@@ -170,12 +192,24 @@ class Hosts:
         return Share(self.agents[name], name == self.recorder, discovery_timeout, patience)
 
     def participants(self, experiment: Experiment) -> int:
-        """Places per host where participants are looked for: more than are on any."""
+        """Places per host where participants are looked for: more than are on any.
+
+        Parameters
+        ----------
+        experiment
+            that is run
+        """
         most = max(most_processes(experiment, len(agents)) for agents in self.agents.values())
         return min(most + 2 + VISITORS, MOST_PARTICIPANTS)
 
     def profile(self, experiment: Experiment) -> str:
-        """The profile of Fast DDS with which the processes of all hosts find each other."""
+        """The profile of Fast DDS with which the processes of all hosts find each other.
+
+        Parameters
+        ----------
+        experiment
+            that is run
+        """
         ET.register_namespace("", _NAMESPACE)
         tree = ET.parse(LOOPBACK_PROFILE)  # drops its comments, which are about another profile
         addresses = list(dict.fromkeys(("127.0.0.1", *self.addresses.values())))

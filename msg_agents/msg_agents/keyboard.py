@@ -77,7 +77,7 @@ class Keyboard:
         Parameters
         ----------
         seconds
-            to wait if nothing was
+            to wait if nothing was typed [s]
         """
         if not self._saved:
             self.listen()  # it may have been started in the background

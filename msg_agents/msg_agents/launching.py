@@ -56,6 +56,13 @@ class LaunchFailedError(Exception):
 def flag(arguments: Mapping[str, str], name: str) -> bool:
     """An argument that is true or false.
 
+    Parameters
+    ----------
+    arguments
+        of the launch
+    name
+        of one of them
+
     Raises
     ------
     InputError
@@ -76,6 +83,11 @@ def find_experiment(name: str, share: Path) -> Path:
         path, or name of an example
     share
         directory of msg_agents_bringup's data
+
+    Raises
+    ------
+    InputError
+        neither of them is there
     """
     path = Path(name).expanduser()
     examples = share / "experiments"
@@ -88,7 +100,20 @@ def find_experiment(name: str, share: Path) -> Path:
 
 
 def load_experiment(arguments: Mapping[str, str], share: Path) -> Experiment:
-    """The experiment with what the arguments of the launch say instead of the file."""
+    """The experiment with what the arguments of the launch say instead of the file.
+
+    Parameters
+    ----------
+    arguments
+        of the launch, by the names of NETWORK_ARGUMENTS
+    share
+        directory of msg_agents_bringup's data
+
+    Raises
+    ------
+    InputError
+        an argument or the experiment is wrong, or asks for what is not available
+    """
     changes: dict[str, Any] = {}
     for name, kind in (("seed", int), ("duration", float), ("speed", float)):
         if text := arguments[name].strip():
@@ -197,6 +222,11 @@ class LaunchedNetwork:
 
     def analysed(self, code: int) -> None:
         """Take note of the end of the analysis.
+
+        Parameters
+        ----------
+        code
+            exit code of ``msg-analysis compare``
 
         Raises
         ------

@@ -38,14 +38,26 @@ LOW, MIDDLE, HIGH = (0.13, 0.40, 0.67), (0.97, 0.97, 0.97), (0.70, 0.09, 0.17)
 
 
 def circle(agents: int) -> list[tuple[float, float]]:
-    """Places of the agents [m], on a circle, the first at the top, clockwise; neighbours ``SPACING`` apart."""
+    """Places of the agents [m], on a circle, the first at the top, clockwise; neighbours ``SPACING`` apart.
+
+    Parameters
+    ----------
+    agents
+        m
+    """
     radius = SPACING / (2 * math.sin(math.pi / agents)) if agents > 1 else 0.0
     angles = [math.pi / 2 - 2 * math.pi * i / agents for i in range(agents)]
     return [(radius * math.cos(angle), radius * math.sin(angle)) for angle in angles]
 
 
 def colour(value: float) -> Colour:
-    """From blue (-1 and less) over white (0) to red (1 and more)."""
+    """From blue (-1 and less) over white (0) to red (1 and more).
+
+    Parameters
+    ----------
+    value
+        how far, in units of what is usual
+    """
     end, part = (HIGH, value) if value > 0 else (LOW, -value)
     part = min(part, 1.0)
     red, green, blue = (middle + part * (full - middle) for middle, full in zip(MIDDLE, end, strict=True))

@@ -93,7 +93,15 @@ def count_processes(experiment: Experiment, agents: int | None = None) -> int:
 
 
 def most_processes(experiment: Experiment, agents: int) -> int:
-    """Agent processes that an experiment may have for so many agents, on a machine of any number of cores."""
+    """Agent processes that an experiment may have for so many agents, on a machine of any number of cores.
+
+    Parameters
+    ----------
+    experiment
+        that is run
+    agents
+        that are to be spread over them
+    """
     wanted = experiment.run.processes
     return min(agents, MOST_PROCESSES, int(wanted) if isinstance(wanted, int) else agents)
 
@@ -103,6 +111,13 @@ def discovery_timeout(agents: int, processes: int) -> float:
 
     Who is started first waits for who is started last; processes start at two or more a second, and in large ones it
     takes a while until every endpoint is known everywhere.
+
+    Parameters
+    ----------
+    agents
+        m
+    processes
+        of the whole network
     """
     return max(DISCOVERY_TIMEOUT, 2.0 * processes + 0.1 * agents)
 

@@ -34,6 +34,11 @@ class Newest(Generic[Value]):
         gives the newest step that anybody can have reached by now; what claims to be newer is refused
     start
         step that the agent is at already, where it takes over from a process that has gone
+
+    Raises
+    ------
+    ValueError
+        numbers that do not go together: a mistake of the caller
     """
 
     def __init__(
@@ -65,6 +70,17 @@ class Newest(Generic[Value]):
     def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
         """Take note of a sojourn of the graph: from now on it is the newest.
 
+        Parameters
+        ----------
+        sequence
+            of the sojourn, from 0
+        mode
+            graph, from 0
+        first_step
+            that uses it
+        last_step
+            that uses it
+
         Returns
         -------
         str | None
@@ -90,6 +106,15 @@ class Newest(Generic[Value]):
 
     def offer(self, agent: int, step: int, value: Value) -> str | None:
         """Take x_agent(step), if there is nothing newer.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        step
+            k
+        value
+            x_agent(k), as the law takes it
 
         Returns
         -------

@@ -40,17 +40,35 @@ REPEATS = {Refusal.OLD, Refusal.KNOWN, RECORDED}
 
 
 def agent_name(agent: int) -> str:
-    """Name of the node, and namespace of the topics, of an agent (index from 0)."""
+    """Name of the node, and namespace of the topics, of an agent (index from 0).
+
+    Parameters
+    ----------
+    agent
+        index from 0
+    """
     return f"agent_{agent + 1}"
 
 
 def state_topic(agent: int) -> str:
-    """Topic of an agent's states (index from 0)."""
+    """Topic of an agent's states (index from 0).
+
+    Parameters
+    ----------
+    agent
+        index from 0
+    """
     return f"{agent_name(agent)}/state"
 
 
 def truth_topic(agent: int) -> str:
-    """Topic of an agent's states as they are, where it publishes them with noise (index from 0)."""
+    """Topic of an agent's states as they are, where it publishes them with noise (index from 0).
+
+    Parameters
+    ----------
+    agent
+        index from 0
+    """
     return f"{agent_name(agent)}/truth"
 
 
@@ -59,6 +77,10 @@ def why_not(data: bytes, record: RunRecord, agent: int, length: int) -> str:
 
     Parameters
     ----------
+    data
+        CDR bytes
+    record
+        of the run that the readers belong to
     agent
         whose topic it is (index from 0)
     length
@@ -86,6 +108,11 @@ class NetworkNode(QuietNode):
         of the node
     record
         of the run; the run id is the mark of every message that belongs to it
+
+    Raises
+    ------
+    InputError
+        its name was changed by arguments of ROS 2: by their names the nodes of a run find each other
     """
 
     def __init__(self, name: str, *, record: RunRecord) -> None:
@@ -107,6 +134,13 @@ class NetworkNode(QuietNode):
         """Count a message that is no part of this run; say so the first time on this topic for this reason.
 
         What is here already is only counted: agents send again what one of them may have missed.
+
+        Parameters
+        ----------
+        reason
+            a few words
+        topic
+            that it came on
         """
         if reason in REPEATS:
             self.repeated += 1
@@ -145,7 +179,15 @@ class NetworkNode(QuietNode):
         return [name for name in names if count[name] > 1]
 
     def clash(self, names: Iterable[str], seconds: float) -> InputError:
-        """The error of a node that has not been alone with these names for some time."""
+        """The error of a node that has not been alone with these names for some time.
+
+        Parameters
+        ----------
+        names
+            of nodes that somebody else has too
+        seconds
+            for which that has been so [s]
+        """
         return InputError(
             f"after {seconds:.0f} s there was still more than one {', '.join(names)} in the same ROS_DOMAIN_ID "
             f"({os.environ.get('ROS_DOMAIN_ID', '0')}): is this run, or another one, under way there? End it, or "
@@ -156,10 +198,22 @@ class NetworkNode(QuietNode):
         """Everyone has been found: start."""
 
     def finish(self, *, complete: bool) -> None:
-        """The process is about to end: the node has done its part, or (not complete) was interrupted."""
+        """The process is about to end: the node has done its part, or (not complete) was interrupted.
+
+        Parameters
+        ----------
+        complete
+            whether it has done its part
+        """
 
     def fail(self, error: Exception) -> None:
-        """End the process with an error."""
+        """End the process with an error.
+
+        Parameters
+        ----------
+        error
+            that the process is to end with
+        """
         if not self.done.done():
             self.done.set_exception(error)
 
@@ -168,6 +222,11 @@ class NetworkNode(QuietNode):
 
         Whoever leaves earlier may take with it what others still need: unread messages, or the acknowledgements that
         they wait for.
+
+        Parameters
+        ----------
+        nodes
+            of this process; None: this one alone
         """
         self._leaving = [self] if nodes is None else list(nodes)
         self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LATCHED, raw=True)
@@ -179,7 +238,15 @@ class NetworkNode(QuietNode):
                     node.done.set_result(None)
 
     def decode_progress(self, data: bytes, topic: str) -> Progress | None:
-        """A Progress message of this run; None (and counted) if it is no such thing."""
+        """A Progress message of this run; None (and counted) if it is no such thing.
+
+        Parameters
+        ----------
+        data
+            CDR bytes
+        topic
+            that it came on
+        """
         try:
             progress = Progress.decode(data)
         except CdrError:
@@ -194,16 +261,40 @@ class NetworkNode(QuietNode):
         return progress
 
     def progress(self, agent: int, step: int) -> bytes:
-        """A Progress message: number of the agent from 1 (or NOT_AN_AGENT), and step."""
+        """A Progress message: number of the agent from 1 (or NOT_AN_AGENT), and step.
+
+        Parameters
+        ----------
+        agent
+            number from 1, or NOT_AN_AGENT
+        step
+            k
+        """
         return Progress(self._step_clock.nanoseconds(step), self.run, agent, step).encode()
 
     def has_readers(self, publisher: Publisher, expected: Sequence[str]) -> bool:
-        """Whether all the expected nodes read a topic of ours."""
+        """Whether all the expected nodes read a topic of ours.
+
+        Parameters
+        ----------
+        publisher
+            of this node
+        expected
+            names of nodes
+        """
         # Names come out of a look at every endpoint of the network: not before they can all be there.
         return publisher.get_subscription_count() >= len(expected) and not self.missing_readers(publisher, expected)
 
     def missing_readers(self, publisher: Publisher, expected: Sequence[str]) -> list[str]:
-        """Names of the expected nodes that do not read a topic of ours yet."""
+        """Names of the expected nodes that do not read a topic of ours yet.
+
+        Parameters
+        ----------
+        publisher
+            of this node
+        expected
+            names of nodes
+        """
         readers = self.get_subscriptions_info_by_topic(publisher.topic_name)
         found = {reader.node_name for reader in readers}
         missing = [name for name in expected if name not in found]

@@ -24,7 +24,13 @@ class Pace:
         self.rate = self.stalled = 0.0
 
     def look(self, step: int) -> bool:
-        """Whether it is time to complain: after ``PATIENCE`` s without a step, and then ever more rarely."""
+        """Whether it is time to complain: after ``PATIENCE`` s without a step, and then ever more rarely.
+
+        Parameters
+        ----------
+        step
+            that everybody has reached
+        """
         now = time.monotonic()
         elapsed, made = now - self._time, step - self._step
         self._step, self._time = step, now

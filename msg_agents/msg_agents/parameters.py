@@ -58,7 +58,13 @@ class ProcessParameters:
     _declarations: list[tuple[str, Any, ParameterDescriptor]] = field(default_factory=list, init=False)
 
     def declare(self, node: Node) -> None:
-        """Declare all of them on a node, with the values that hold, for ``ros2 param`` and the like."""
+        """Declare all of them on a node, with the values that hold, for ``ros2 param`` and the like.
+
+        Parameters
+        ----------
+        node
+            of this process
+        """
         if not self._declarations:  # the same for every node of the process
             self._declarations = [
                 (name_of(option), _ros_value(option, self.values.get(option.name or "")), describe(option))
@@ -72,7 +78,13 @@ PROCESS = ProcessParameters()
 
 
 def options_of(command: click.Command) -> list[click.Parameter]:
-    """The options and arguments of a command that are parameters of its nodes."""
+    """The options and arguments of a command that are parameters of its nodes.
+
+    Parameters
+    ----------
+    command
+        that is a node
+    """
     return [
         each
         for each in command.params
@@ -81,13 +93,25 @@ def options_of(command: click.Command) -> list[click.Parameter]:
 
 
 def name_of(option: click.Parameter) -> str:
-    """Name of its parameter."""
+    """Name of its parameter.
+
+    Parameters
+    ----------
+    option
+        of such a command
+    """
     name = option.name or ""
     return NAMES.get(name, name)
 
 
 def describe(option: click.Parameter) -> ParameterDescriptor:
-    """Type, range, description. All are read-only: a node does not change what it is in the middle of a run."""
+    """Type, range, description. All are read-only: a node does not change what it is in the middle of a run.
+
+    Parameters
+    ----------
+    option
+        of such a command
+    """
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
     kind, constraints = option.type, ""
@@ -129,7 +153,13 @@ def _ros_value(option: click.Parameter, value: Any) -> Any:
 
 @contextlib.contextmanager
 def ros_arguments() -> Iterator[None]:
-    """Say what is wrong with arguments for ROS 2 that rcl does not take."""
+    """Say what is wrong with arguments for ROS 2 that rcl does not take.
+
+    Raises
+    ------
+    InputError
+        rcl does not take them; its reason is in the text
+    """
     from msg_agents.errors import RCLError
 
     try:
@@ -147,7 +177,13 @@ def ros_arguments() -> Iterator[None]:
 
 
 def mention_qos(arguments: Sequence[str]) -> bool:
-    """Whether somebody may have asked for another quality of service, for any node."""
+    """Whether somebody may have asked for another quality of service, for any node.
+
+    Parameters
+    ----------
+    arguments
+        of ROS 2, from ``--ros-args`` on
+    """
     if any(QOS_OVERRIDES in word for word in arguments):
         return True
     for option, file in itertools.pairwise(arguments):

@@ -46,6 +46,11 @@ class PlayClock:
         """Time of the bag [ns], but not after ``limit``, the time of what is to be played next.
 
         So whoever takes the time from here never sees a message of the past.
+
+        Parameters
+        ----------
+        limit
+            time of the bag [ns] of what is to be played next
         """
         if self._paused:
             return self._then
@@ -54,7 +59,13 @@ class PlayClock:
         return min(limit, self._then + round((self._wall() - self._since) * self._rate * SECOND))
 
     def until(self, when: int) -> float:
-        """Seconds of the wall until a time of the bag [ns]: inf while it stands, 0 or less if it has come."""
+        """Seconds of the wall until a time of the bag [ns]: inf while it stands, 0 or less if it has come.
+
+        Parameters
+        ----------
+        when
+            time of the bag [ns]
+        """
         if self._paused:
             return math.inf
         if math.isinf(self._rate):
@@ -62,21 +73,49 @@ class PlayClock:
         return (when - self._then) / (self._rate * SECOND) - (self._wall() - self._since)
 
     def jump(self, when: int) -> None:
-        """Go to a time of the bag [ns]."""
+        """Go to a time of the bag [ns].
+
+        Parameters
+        ----------
+        when
+            time of the bag [ns]
+        """
         self._set(when)
 
     def hold(self, seconds: float) -> None:
-        """What has just passed on the wall did not count: nobody took what was played."""
+        """What has just passed on the wall did not count: nobody took what was played.
+
+        Parameters
+        ----------
+        seconds
+            of the wall [s]
+        """
         self._since += seconds
 
     def pause(self, paused: bool, limit: int) -> None:
-        """Stand, or go on from there; ``limit`` as in ``now``."""
+        """Stand, or go on from there; ``limit`` as in ``now``.
+
+        Parameters
+        ----------
+        paused
+            whether to stand
+        limit
+            as in ``now`` [ns]
+        """
         if paused != self._paused:
             self._set(self.now(limit))
             self._paused = paused
 
     def change_rate(self, factor: float, limit: int) -> None:
-        """Go faster or slower from now on; ``limit`` as in ``now``."""
+        """Go faster or slower from now on; ``limit`` as in ``now``.
+
+        Parameters
+        ----------
+        factor
+            on the rate that it has
+        limit
+            as in ``now`` [ns]
+        """
         if not math.isinf(self._rate):
             self._set(self.now(limit))
             self._rate *= factor

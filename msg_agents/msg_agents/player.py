@@ -93,7 +93,7 @@ class Played:
     messages
         published
     seconds
-        of the wall, since the first
+        of the wall since the first message [s]
     held_back
         s of them in which readers did not take what was published
     now
@@ -101,7 +101,7 @@ class Played:
     length
         s of the bag, all of it
     rate
-        at which it is played
+        at which it is played [s of the bag per second]
     paused
         whether it stands
     begun
@@ -139,6 +139,12 @@ class Player(QuietNode):
         told a few times a second how far it is
     on_note
         told what somebody should know
+
+    Raises
+    ------
+    InputError
+        it begins behind the end of the bag, nothing is left to play, or a topic is to have a name that ROS 2 does not
+        take
     """
 
     def __init__(

@@ -65,7 +65,13 @@ def prefer_throughput() -> None:
 
 
 def hold_lifeline(descriptor: int) -> None:
-    """End this process when the other end of a pipe closes, that is when the parent is gone, however it went."""
+    """End this process when the other end of a pipe closes, that is when the parent is gone, however it went.
+
+    Parameters
+    ----------
+    descriptor
+        of the end of the pipe that this process has
+    """
 
     def watch() -> None:
         while os.read(descriptor, 1):
@@ -168,6 +174,13 @@ def leave(nodes: Sequence[Node], *, complete: bool) -> None:
     When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
     interpreter's lock or after the interpreter has gone. Only what runs in C helps then: an alarm, whose default action
     ends the process. All that the process owed to others it has given by now, so nothing is lost.
+
+    Parameters
+    ----------
+    nodes
+        of this process
+    complete
+        whether they have done their part
     """
     if complete:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)

@@ -104,6 +104,13 @@ class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that myp
 
         A reader that does not keep up blocks a reliable keep-all writer; after 100 ms the middleware gives up and
         raises, and the message has not been written.
+
+        Parameters
+        ----------
+        publisher
+            reliable, keep-all
+        data
+            CDR bytes
         """
         while True:
             try:

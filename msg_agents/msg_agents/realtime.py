@@ -74,7 +74,13 @@ class RealtimeAgent(Agent):
         self.create_subscription(ProgressMsg, EPOCH_TOPIC, receive, LATCHED, raw=True)
 
     def start(self, epoch: int) -> None:
-        """Simulated time is 0 when the clock says ``epoch`` [ns]."""
+        """Simulated time is 0 when the clock says ``epoch`` [ns].
+
+        Parameters
+        ----------
+        epoch
+            time of the clock [ns]
+        """
         if self._schedule:
             if self._schedule.epoch != epoch:
                 self.refuse(OTHER_EPOCH, EPOCH_TOPIC)

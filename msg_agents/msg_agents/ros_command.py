@@ -16,8 +16,12 @@ class RosCommand(click.Command):
 
     Parameters
     ----------
+    *args
+        see click.Command
     node_name
         by which parameters are found, where they are given to a certain node; the command's name by default
+    **options
+        see click.Command
     """
 
     def __init__(self, *args: Any, node_name: str | None = None, **options: Any) -> None:
@@ -62,7 +66,13 @@ class RosCommand(click.Command):
 
 
 def split_arguments(args: list[str]) -> tuple[list[str], list[str]]:
-    """Arguments of the command, and those for ROS 2 with their ``--ros-args``."""
+    """Arguments of the command, and those for ROS 2 with their ``--ros-args``.
+
+    Parameters
+    ----------
+    args
+        as the user has typed them
+    """
     ours, ros = list(args), list[str]()
     while "--ros-args" in ours:
         start = ours.index("--ros-args")

@@ -74,7 +74,15 @@ class RunResult:
 
 
 def make_bag_directory(experiment: Experiment, out: Path) -> Path:
-    """Make an empty directory for a new bag, <out>/<name>_<time>, which no other run can take any more."""
+    """Make an empty directory for a new bag, <out>/<name>_<time>, which no other run can take any more.
+
+    Parameters
+    ----------
+    experiment
+        whose name
+    out
+        directory that is there
+    """
     stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
     candidate, number = out / stem, 2
     while True:
@@ -305,7 +313,13 @@ def _interruptible() -> Iterator[list[int]]:
 
 
 def conclude(result: RunResult) -> None:
-    """Compare the bag of a run with its prediction; write report.html and result.json beside it."""
+    """Compare the bag of a run with its prediction; write report.html and result.json beside it.
+
+    Parameters
+    ----------
+    result
+        of ``run_network``; ``comparison`` is set in it
+    """
     if result.trajectory is None or result.bag is None:
         return
     from msg_analysis.inference.compare import compare

@@ -34,19 +34,45 @@ class Schedule:
         self._dt, self._phase = self._steps.step_ns, phase
 
     def simulated(self, now: int) -> int:
-        """Simulated time [ns] when the clock says ``now`` [ns]; negative before the epoch."""
+        """Simulated time [ns] when the clock says ``now`` [ns]; negative before the epoch.
+
+        Parameters
+        ----------
+        now
+            time of the clock [ns]
+        """
         return math.floor((now - self.epoch) * self._speed)
 
     def due(self, step: int) -> int:
-        """Simulated time [ns] at which a step is due."""
+        """Simulated time [ns] at which a step is due.
+
+        Parameters
+        ----------
+        step
+            k
+        """
         return self._steps.nanoseconds(step)
 
     def clock_time(self, step: int) -> int:
-        """Time of the clock [ns] at which a step is due; not earlier."""
+        """Time of the clock [ns] at which a step is due; not earlier.
+
+        Parameters
+        ----------
+        step
+            k
+        """
         return self.epoch + math.ceil(self.due(step) / self._speed)
 
     def next_step(self, now: int, *, after: int = 0) -> int:
-        """The first step that is not yet due when the clock says ``now`` [ns], and not before a given one."""
+        """The first step that is not yet due when the clock says ``now`` [ns], and not before a given one.
+
+        Parameters
+        ----------
+        now
+            time of the clock [ns]
+        after
+            the least step to return
+        """
         simulated = self.simulated(now)
         step = max(after, math.floor(simulated / self._dt - self._phase))
         while step > after and self.due(step - 1) > simulated:  # rounding
@@ -56,5 +82,11 @@ class Schedule:
         return step
 
     def reach(self, now: int) -> int:
-        """The newest state that anybody can have when the clock says ``now`` [ns], if clocks agree to the margin."""
+        """The newest state that anybody can have when the clock says ``now`` [ns], if clocks agree to the margin.
+
+        Parameters
+        ----------
+        now
+            time of the clock [ns]
+        """
         return max(0, math.floor(self.simulated(now + round(MARGIN * SECOND)) / self._dt) + 1)

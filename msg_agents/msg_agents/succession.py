@@ -65,7 +65,13 @@ class Succession:
         self.predecessor = os.read(self._descriptor, PREFIX_SIZE)
 
     def enter(self, prefix: bytes) -> None:
-        """Note whom the next process will follow."""
+        """Note whom the next process will follow.
+
+        Parameters
+        ----------
+        prefix
+            of the identifiers of this process's endpoints
+        """
         os.pwrite(self._descriptor, prefix, 0)
 
 
@@ -94,7 +100,15 @@ def succeed(directory: Path | None, names: Iterable[str]) -> list[Succession]:
 
 
 def enter(successions: Sequence[Succession], node: Node) -> None:
-    """Note the name of this process, which the endpoints of its nodes bear, for the one that will follow."""
+    """Note the name of this process, which the endpoints of its nodes bear, for the one that will follow.
+
+    Parameters
+    ----------
+    successions
+        of the nodes of this process
+    node
+        one of them
+    """
     if not successions:
         return
     own = (node.get_name(), node.get_namespace())

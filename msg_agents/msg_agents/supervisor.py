@@ -133,14 +133,26 @@ class Supervisor:
     _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts
 
     def start(self, plans: Sequence[ProcessPlan]) -> None:
-        """Start all processes."""
+        """Start all processes.
+
+        Parameters
+        ----------
+        plans
+            of ``plan_network``
+        """
         self._lifeline = os.pipe()
         self._status = os.pipe()
         os.set_blocking(self._status[0], False)
         self.children += [self._start(plan) for plan in plans]
 
     def restart(self, child: Child) -> None:
-        """Start again what has been killed."""
+        """Start again what has been killed.
+
+        Parameters
+        ----------
+        child
+            that is gone
+        """
         self.children[self.children.index(child)] = self._start(child.plan, child.number + 1)
 
     def _start(self, plan: ProcessPlan, number: int = 1) -> Child:

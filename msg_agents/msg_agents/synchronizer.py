@@ -64,6 +64,11 @@ class Synchronizer(Generic[Value]):
         steps that the agent may be ahead of a peer, >= 0
     start
         step that the agent is at already, where it takes over from a process that has gone
+
+    Raises
+    ------
+    ValueError
+        numbers that do not go together: a mistake of the caller
     """
 
     def __init__(
@@ -98,6 +103,17 @@ class Synchronizer(Generic[Value]):
     def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
         """Take note of a sojourn of the graph.
 
+        Parameters
+        ----------
+        sequence
+            of the sojourn, from 0
+        mode
+            graph, from 0
+        first_step
+            that uses it
+        last_step
+            that uses it
+
         Returns
         -------
         str | None
@@ -122,6 +138,15 @@ class Synchronizer(Generic[Value]):
 
     def offer(self, agent: int, step: int, value: Value) -> str | None:
         """Take x_agent(step).
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        step
+            k
+        value
+            x_agent(k), as the law takes it
 
         Returns
         -------

@@ -36,7 +36,15 @@ class DueTimer:
         return int(self._clock.now().nanoseconds)
 
     def set(self, when: int, now: int | None = None) -> None:
-        """Call back at a time of the clock [ns]; at once if that has passed."""
+        """Call back at a time of the clock [ns]; at once if that has passed.
+
+        Parameters
+        ----------
+        when
+            time of the clock [ns]
+        now
+            what the clock says, if it is known already [ns]
+        """
         # The clock may have moved since the caller looked: one that is late already is only called a little later.
         self._timer.timer_period_ns = max(1, when - (self.now() if now is None else now))
         self._timer.reset()
@@ -47,5 +55,15 @@ class DueTimer:
 
 
 def every(node: Node, period: float, callback: Callable[[], None]) -> None:
-    """Call back every ``period`` s of the wall, even while the node's clock stands or runs at another rate."""
+    """Call back every ``period`` s of the wall, even while the node's clock stands or runs at another rate.
+
+    Parameters
+    ----------
+    node
+        whose executor calls
+    period
+        of the wall [s]
+    callback
+        what to call
+    """
     node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))

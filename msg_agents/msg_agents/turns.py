@@ -40,14 +40,26 @@ class Turns:
         self._given = True  # or about to be: whoever asks for a turn need not see to it
 
     def join(self, member: Member) -> None:
-        """Be there, and have a turn when everybody is."""
+        """Be there, and have a turn when everybody is.
+
+        Parameters
+        ----------
+        member
+            of this process
+        """
         self._absent -= 1
         self._queue.append(member)
         if not self._absent:
             self._give()
 
     def ask(self, member: Member) -> None:
-        """Have a turn: now, or when those who asked before have had theirs."""
+        """Have a turn: now, or when those who asked before have had theirs.
+
+        Parameters
+        ----------
+        member
+            that has joined
+        """
         self._queue.append(member)
         if not self._given:
             self._give()

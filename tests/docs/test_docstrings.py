@@ -1,8 +1,8 @@
 """Everything public says what it takes, gives and refuses: arguments, shapes, units, errors, and theory its source.
 
-Public is what has no underscore at the front of its name nor of its module's or class's, in msg_analysis and msg_agents; of a
-module with ``__all__``, what that lists. Commands are documented by their --help (tests/commands). What overrides a method
-of another package, or of a documented class of ours, may leave the words to that.
+Public is what has no underscore at the front of its name nor of its module's or class's, in msg_analysis and
+msg_agents; of a module with ``__all__``, what that lists. Commands are documented by their --help (tests/commands).
+What overrides a method of another package, or of a documented class of ours, may leave the words to that.
 """
 
 from __future__ import annotations
@@ -18,21 +18,29 @@ import griffe
 import pytest
 
 ROOT = Path(__file__).parents[2]
-SHAPE = re.compile(
-    r"\([\w+*/^ .'-]+,[\w+*/^ .,'-]*\)|\bshape\b|\bscalar\b|\bone (?:for|per|a)\b|[Ss]ee "
-)
+SHAPE = re.compile(r"\([\w+*/^ .'-]+,[\w+*/^ .,'-]*\)|\bshape\b|\bscalar\b|\bone (?:for|per|a)\b|[Ss]ee ")
 ARRAY = re.compile(r"\b(?:Float|Int|Bool|Any|Complex)Array\b|\bndarray\b|\bNDArray\b|\bArrayLike\b")
 PHYSICAL = re.compile(  # names of arguments that are times or rates, whatever they are of
     r"(?:.*_)?(?:dt|duration|time|times|timeout|patience|period|seconds|rate|rates|stamp|delay|lateness)"
 )
 UNIT = re.compile(
-    r"\[[^\]]+\]|\bs\b|\bms\b|\bns\b|\bHz\b|[Ss]econds?|nanoseconds?|simulated time|unit|steps?\b|[Ss]ee |whether", re.IGNORECASE
+    r"\[[^\]]+\]|\bs\b|\bms\b|\bns\b|\bHz\b|[Ss]econds?|nanoseconds?|simulated time|unit|steps?\b|[Ss]ee |whether",
+    re.IGNORECASE,
 )
 SOURCE = re.compile(
-    r"\bpaper\b|Proposition|Lemma|Theorem|Definition|\bequations?\b|docs/\w+\.md|\b[A-Z]\w+(?:,| and| et al\.?)? [^.]{0,60}\(?(?:19|20)\d\d"
+    r"\bpaper\b|Proposition|Lemma|Theorem|Definition|docs/\w+\.md|\b[A-Z]\w+[^.]{0,70} \(?(?:19|20)\d\d\b"
 )
-NOT_TOLD = {"NotImplementedError", "AssertionError", "SystemExit", "AttributeError", "StopIteration", "KeyboardInterrupt"}
-ELSEWHERE = re.compile(r"^See |(?:[Pp]arameters|[Aa]rguments)[^.]{0,40}(?:see|as in|those of)|[Ss]ee \S+ for the parameters")
+NOT_TOLD = {
+    "NotImplementedError",
+    "AssertionError",
+    "SystemExit",
+    "AttributeError",
+    "StopIteration",
+    "KeyboardInterrupt",
+}
+ELSEWHERE = re.compile(
+    r"^See |(?:[Pp]arameters|[Aa]rguments)[^.]{0,40}(?:see|as in|those of)|[Ss]ee \S+ for the parameters"
+)
 FOREIGN = re.compile(r"[Ss]ee [`:\w.]*(?:click|rclpy|numpy|ast|threading|logging|collections|contextlib|Protocol|http)")
 
 
@@ -76,7 +84,11 @@ def with_methods(member: griffe.Function | griffe.Class) -> Iterator[griffe.Func
     yield member
     if isinstance(member, griffe.Class):
         for inner in member.members.values():
-            if isinstance(inner, griffe.Function | griffe.Class) and not inner.is_alias and not inner.name.startswith("_"):
+            if (
+                isinstance(inner, griffe.Function | griffe.Class)
+                and not inner.is_alias
+                and not inner.name.startswith("_")
+            ):
                 yield from with_methods(inner)
 
 
@@ -173,7 +185,11 @@ def findings(member: griffe.Function | griffe.Class) -> Iterator[str]:
             continue
         if ARRAY.search(annotation) and not SHAPE.search(told[argument]):
             yield f"{name}: {argument}: no shape in {told[argument]!r}"
-        if PHYSICAL.fullmatch(argument) and re.search(r"float|int|Array", annotation) and not UNIT.search(told[argument]):
+        if (
+            PHYSICAL.fullmatch(argument)
+            and re.search(r"float|int|Array", annotation)
+            and not UNIT.search(told[argument])
+        ):
             yield f"{name}: {argument}: no unit in {told[argument]!r}"
     for argument in words.described("parameters", "other parameters"):
         if given and argument not in given:
@@ -211,22 +227,36 @@ def test_there_is_something_to_look_at() -> None:
     assert sum(1 for module in MODULES.values() for _ in public(module)) > 600
 
 
+def made(signature: str, *sections: str, body: str = "") -> str:
+    """Source of a function, or class, with a docstring of the given sections: "Parameters x: what it is"."""
+    text = "Do."
+    for section in sections:
+        title, entry, words = re.fullmatch(r"(\w+) (\w+): (.*)", section).groups()  # type: ignore[union-attr]
+        text += f"\n\n    {title}\n    {'-' * len(title)}\n    {entry}\n        {words}"
+    return f'{signature}\n    """{text}\n    """\n    {body}\n'
+
+
 @pytest.mark.parametrize(
     ("code", "found"),
     [
         ("def f(x): ...", ["f: no docstring"]),
-        ('def f(x):\n    """Do."""', ["f: x: not documented"]),
-        ('def f(x):\n    """Do.\n\n    Parameters\n    ----------\n    y\n        it\n    """', ["f: x: not documented", "f: y: documented, but no argument"]),
-        ('def f(x: FloatArray):\n    """Do.\n\n    Parameters\n    ----------\n    x\n        it\n    """', ["f: x: no shape in 'it'"]),
-        ('def f(x: FloatArray):\n    """Do.\n\n    Parameters\n    ----------\n    x\n        (m, n) it\n    """', []),
-        ('def f(dt: float):\n    """Do.\n\n    Parameters\n    ----------\n    dt\n        it\n    """', ["f: dt: no unit in 'it'"]),
-        ('def f() -> FloatArray:\n    """Do."""', ["f: no shape of what it returns"]),
-        ('def f() -> FloatArray:\n    """(m,) errors."""', []),
-        ('def f():\n    """Do."""\n    raise InputError("x")', ["f: raises InputError: not documented"]),
-        ('def f():\n    """Do.\n\n    Raises\n    ------\n    InputError\n        never\n    """\n    raise InputError("x")', []),
-        ('@dataclass\nclass C:\n    """A thing."""\n\n    x: int', ["C: x: not documented"]),
-        ('class C:\n    """A thing."""\n\n    def f(self, x):\n        """Do."""', ["C.f: x: not documented"]),
-        ('class C:\n    """A thing."""\n\n    def _f(self, x): ...', []),
+        (made("def f(x):"), ["f: x: not documented"]),
+        (made("def f(x):", "Parameters y: it"), ["f: x: not documented", "f: y: documented, but no argument"]),
+        (made("def f(x):", "Parameters x: it"), []),
+        (made("def f(x: FloatArray):", "Parameters x: it"), ["f: x: no shape in 'it'"]),
+        (made("def f(x: FloatArray):", "Parameters x: (m, n) it"), []),
+        (made("def f(dt: float):", "Parameters dt: it"), ["f: dt: no unit in 'it'"]),
+        (made("def f(dt: float):", "Parameters dt: it [s]"), []),
+        (made("def f() -> FloatArray:"), ["f: no shape of what it returns"]),
+        (made("def f() -> FloatArray:", "Returns FloatArray: (m,) errors"), []),
+        (made("def f():", body="raise InputError('x')"), ["f: raises InputError: not documented"]),
+        (made("def f():", "Raises InputError: never", body="raise InputError('x')"), []),
+        (
+            made("@dataclass\nclass C:", body="x: int").replace("@d", "from dataclasses import dataclass\n\n@d"),
+            ["C: x: not documented"],
+        ),
+        (made("class C:", body="def f(self, x):\n        'Do.'"), ["C.f: x: not documented"]),
+        (made("class C:", body="def _f(self, x): ..."), []),
         ("def _f(x): ...", []),
     ],
 )

@@ -34,6 +34,11 @@ _LENGTH = struct.Struct("<I4x")  # of the state, before it
 def stamp_ns(data: bytes) -> int:
     """Time stamp [ns] of any message that begins with a std_msgs/Header.
 
+    Parameters
+    ----------
+    data
+        CDR bytes of the message
+
     Raises
     ------
     CdrError
@@ -59,6 +64,11 @@ class StateCodec:
         length of every state
     dt
         length of a step [units of simulated time]
+
+    Raises
+    ------
+    ValueError
+        a run id that is not 16 bytes
     """
 
     def __init__(self, run: bytes, agent: int, replicas: int, dt: float) -> None:
@@ -86,7 +96,21 @@ class StateCodec:
         return self.wrap(step, mode, to_payload(state))
 
     def wrap(self, step: int, mode: int, payload: bytes, heard: Sequence[int] = (), stamp: int | None = None) -> bytes:
-        """One AgentState of a state that is bytes already, of the right length; by default stamped k dt [ns]."""
+        """One AgentState of a state that is bytes already, of the right length; by default stamped k dt [ns].
+
+        Parameters
+        ----------
+        step
+            k
+        mode
+            graph used in the step that led here, from 1; 0 at step 0
+        payload
+            the state, 8 bytes for each replica
+        heard
+            steps of the neighbours' values; empty: all of k - 1
+        stamp
+            of the header [ns]; None: that of step k
+        """
         seconds, nanoseconds = divmod(self._nanoseconds(step) if stamp is None else stamp, SECOND)
         fixed = (1, 0, self._run, self._agent, step, mode, len(heard), self._replicas)
         data = _STATE.pack(LITTLE_ENDIAN, seconds, nanoseconds, *fixed)
@@ -126,6 +150,11 @@ class StateFrame:
         """(agent, step, mode, state as a payload), or None where the bytes are not of this run and layout.
 
         None means: ask :meth:`AgentState.decode`, which tells what it is.
+
+        Parameters
+        ----------
+        data
+            CDR bytes of an AgentState
         """
         if len(data) != self._least:
             return self._unwrap_heard(data)
@@ -206,7 +235,18 @@ class AgentState:
 
     @classmethod
     def decode(cls, data: bytes) -> AgentState:
-        """From CDR; raises CdrError."""
+        """From CDR.
+
+        Parameters
+        ----------
+        data
+            CDR bytes
+
+        Raises
+        ------
+        CdrError
+            they are no such message
+        """
         reader = CdrReader(data, "AgentState")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run, agent = reader.raw(RUN_SIZE, "run"), reader.number("I", "agent")
@@ -266,7 +306,18 @@ class ActiveGraph:
 
     @classmethod
     def decode(cls, data: bytes) -> ActiveGraph:
-        """From CDR; raises CdrError, also where the three lists of the arcs are not equally long."""
+        """From CDR.
+
+        Parameters
+        ----------
+        data
+            CDR bytes
+
+        Raises
+        ------
+        CdrError
+            they are no such message, or its three lists of arcs are not equally long
+        """
         reader = CdrReader(data, "ActiveGraph")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run, sequence = reader.raw(RUN_SIZE, "run"), reader.number("I", "sequence")
@@ -335,7 +386,18 @@ class Progress:
 
     @classmethod
     def decode(cls, data: bytes) -> Progress:
-        """From CDR; raises CdrError."""
+        """From CDR.
+
+        Parameters
+        ----------
+        data
+            CDR bytes
+
+        Raises
+        ------
+        CdrError
+            they are no such message
+        """
         reader = CdrReader(data, "Progress")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run = reader.raw(RUN_SIZE, "run")
@@ -345,14 +407,31 @@ class Progress:
 
 
 def encode_string(text: str) -> bytes:
-    """A std_msgs/String as CDR."""
+    """A std_msgs/String as CDR.
+
+    Parameters
+    ----------
+    text
+        to be sent
+    """
     out = CdrWriter()
     out.string(text)
     return out.bytes()
 
 
 def decode_string(data: bytes) -> str:
-    """Text of a std_msgs/String; raises CdrError."""
+    """Text of a std_msgs/String.
+
+    Parameters
+    ----------
+    data
+        CDR bytes
+
+    Raises
+    ------
+    CdrError
+        they are no such message
+    """
     reader = CdrReader(data, "String")
     text = reader.string("data")
     reader.end()

@@ -65,19 +65,46 @@ class CdrReader:
         return start
 
     def number(self, code: str, what: str) -> int:
-        """An integer, of a type code of ``struct``; ``what`` names the field in errors."""
+        """An integer, of a type code of ``struct``; ``what`` names the field in errors.
+
+        Parameters
+        ----------
+        code
+            type code of ``struct``, such as "I"
+        what
+            name of the field, for errors
+        """
         form = self._numbers[code]
         size = form.size
         value: int = form.unpack_from(self._data, self._take(size, size, what))[0]
         return value
 
     def raw(self, size: int, what: str) -> bytes:
-        """So many octets."""
+        """So many octets.
+
+        Parameters
+        ----------
+        size
+            number of octets
+        what
+            name of the field, for errors
+        """
         start = self._take(size, 1, what)
         return bytes(self._data[start : self._at])
 
     def string(self, what: str) -> str:
-        """A string."""
+        """A string.
+
+        Parameters
+        ----------
+        what
+            name of the field, for errors
+
+        Raises
+        ------
+        CdrError
+            it does not end, or is not UTF-8
+        """
         size = self.number("I", what)
         text = self.raw(size, what)
         if size and text[-1]:
@@ -88,7 +115,20 @@ class CdrReader:
             raise CdrError(f"{self._kind}.{what}: not UTF-8") from error
 
     def array(self, code: str, what: str) -> AnyArray:
-        """A sequence of numbers, of a type code of numpy, copied."""
+        """A sequence of numbers, of a type code of numpy, copied.
+
+        Parameters
+        ----------
+        code
+            type code of numpy, such as "f8"
+        what
+            name of the field, for errors
+
+        Returns
+        -------
+        AnyArray
+            (length,) of that type
+        """
         count = self.number("I", what)
         if not count:  # nothing follows, not even padding
             return np.empty(0, dtype=code)
@@ -105,7 +145,13 @@ class CdrReader:
         return self._data[self._at :]
 
     def end(self) -> None:
-        """Nothing but padding may follow."""
+        """Nothing but padding may follow.
+
+        Raises
+        ------
+        CdrError
+            something else follows
+        """
         left = len(self._data) - self._at
         if left > _MAX_PADDING:
             raise CdrError(f"{self._kind}: {left} bytes too many")
@@ -121,22 +167,50 @@ class CdrWriter:
         self._data += bytes((HEADER_SIZE - len(self._data)) % size)
 
     def number(self, code: str, value: int) -> None:
-        """An integer, of a type code of ``struct``."""
+        """An integer, of a type code of ``struct``.
+
+        Parameters
+        ----------
+        code
+            type code of ``struct``, such as "I"
+        value
+            that fits into it
+        """
         self._align(struct.calcsize(code))
         self._data += struct.pack("<" + code, value)
 
     def raw(self, value: bytes) -> None:
-        """Octets, without their number."""
+        """Octets, without their number.
+
+        Parameters
+        ----------
+        value
+            octets
+        """
         self._data += value
 
     def string(self, text: str) -> None:
-        """A string."""
+        """A string.
+
+        Parameters
+        ----------
+        text
+            of any length
+        """
         encoded = text.encode() + b"\x00"
         self.number("I", len(encoded))
         self._data += encoded
 
     def array(self, code: str, values: AnyArray | Sequence[Any]) -> None:
-        """A sequence of numbers, of a type code of numpy."""
+        """A sequence of numbers, of a type code of numpy.
+
+        Parameters
+        ----------
+        code
+            type code of numpy, such as "f8"
+        values
+            (length,) numbers that fit into it
+        """
         array = np.asarray(values, dtype="<" + code)
         self.number("I", len(array))
         if len(array):
@@ -144,7 +218,22 @@ class CdrWriter:
             self._data += array.tobytes()
 
     def header(self, stamp: int, frame_id: str, run: bytes) -> None:
-        """What every message of the network begins with; ``stamp`` in ns."""
+        """What every message of the network begins with; ``stamp`` in ns.
+
+        Parameters
+        ----------
+        stamp
+            time [ns]
+        frame_id
+            of the header
+        run
+            16 bytes of the run id
+
+        Raises
+        ------
+        ValueError
+            another number of bytes
+        """
         if len(run) != RUN_SIZE:
             raise ValueError(f"run: {len(run)} bytes, expected the {RUN_SIZE} bytes of a UUID")
         self.number("i", stamp // SECOND)

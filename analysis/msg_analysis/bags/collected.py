@@ -46,7 +46,7 @@ class Collector:
         batch
             messages
         chosen
-            indices of those that are states
+            (k,) indices of those that are states
         """
         states, undecodable = decode_states(batch, chosen, self._position)
         self._undecodable += undecodable
@@ -101,7 +101,15 @@ class Collector:
         return self._counts[run_number(run)]
 
     def finish(self, record: RunRecord, width: int) -> Collected:
-        """All that came of a run, after the last batch; parameters and errors are those of ``expect``."""
+        """All that came of a run, after the last batch; parameters and errors are those of ``expect``.
+
+        Parameters
+        ----------
+        record
+            of the run that is wanted
+        width
+            numbers of a state on this topic
+        """
         self.expect(record, width)
         collected = self._of(run_number(record.run.bytes))
         collected.refused["undecodable"] += self._undecodable

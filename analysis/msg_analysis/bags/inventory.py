@@ -108,13 +108,25 @@ class Inventory:
     files: list[FileInventory] = field(default_factory=list)
 
     def add(self, file: McapFile) -> FileInventory:
-        """A file that is going to be read."""
+        """A file that is going to be read.
+
+        Parameters
+        ----------
+        file
+            not read yet
+        """
         self.files.append(FileInventory(file, FileCount(file.path.name)))
         return self.files[-1]
 
 
 def summary_of(file: Path) -> Summary | None:
-    """The summary at the end of an MCAP file; None where it has none or it is damaged."""
+    """The summary at the end of an MCAP file; None where it has none or it is damaged.
+
+    Parameters
+    ----------
+    file
+        to look into
+    """
     try:
         with file.open("rb") as stream:
             stream.seek(-_FOOTER.size, io.SEEK_END)
@@ -142,7 +154,15 @@ def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
 
 
 def channel_count(channel: Channel, type_name: str) -> ChannelCount:
-    """A topic without messages yet, as an MCAP channel describes it."""
+    """A topic without messages yet, as an MCAP channel describes it.
+
+    Parameters
+    ----------
+    channel
+        of the file
+    type_name
+        of its messages, ``package/msg/Name``
+    """
     try:
         qos: Any = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "[]"))
     except (ValueError, RecursionError, yaml.YAMLError):

@@ -59,6 +59,17 @@ class Batch:
     def of_contents(cls, data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
         """From the places of the contents of their records.
 
+        Parameters
+        ----------
+        data
+            a chunk, unpacked
+        start
+            (messages,) where the content of each record begins
+        size
+            (messages,) bytes of each
+        end
+            bytes of ``data`` that are records
+
         Raises
         ------
         DamageError
@@ -83,7 +94,13 @@ class Batch:
         return np.column_stack((*columns, self.start, self.size))
 
     def message(self, index: int) -> bytes:
-        """CDR bytes of one message."""
+        """CDR bytes of one message.
+
+        Parameters
+        ----------
+        index
+            of the message in the batch
+        """
         start = int(self.start[index])
         return self.data[start : start + int(self.size[index])]
 

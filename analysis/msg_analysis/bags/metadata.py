@@ -121,7 +121,13 @@ def bag_information(files: Sequence[FileCount], custom: Mapping[str, str]) -> di
 
 
 def total_channels(files: Sequence[FileCount]) -> dict[str, ChannelCount]:
-    """The topics of several files by name, each with all its messages."""
+    """The topics of several files by name, each with all its messages.
+
+    Parameters
+    ----------
+    files
+        of one bag
+    """
     topics: dict[str, ChannelCount] = {}
     for file in files:
         for name, channel in file.channels.items():
@@ -131,7 +137,13 @@ def total_channels(files: Sequence[FileCount]) -> dict[str, ChannelCount]:
 
 
 def dump(document: Any) -> str:
-    """As YAML, keys in the order given."""
+    """As YAML, keys in the order given.
+
+    Parameters
+    ----------
+    document
+        of plain values, lists and dicts
+    """
     return str(yaml.dump(document, Dumper=_DUMPER, sort_keys=False))
 
 
@@ -165,6 +177,11 @@ def _load(text: str) -> Any:
 
 def read_metadata(directory: Path) -> dict[str, Any] | None:
     """Bag information of a directory, or None where there is no metadata.yaml.
+
+    Parameters
+    ----------
+    directory
+        of the bag
 
     Raises
     ------

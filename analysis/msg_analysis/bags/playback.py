@@ -85,7 +85,17 @@ class _Outline:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message of a bag: when it is its turn [ns of log time], its topic, its bytes."""
+    """A message of a bag: when it is its turn [ns of log time], its topic, its bytes.
+
+    Attributes
+    ----------
+    time
+        when it is its turn [ns of log time]
+    topic
+        name in the bag
+    data
+        as recorded
+    """
 
     time: int
     topic: str

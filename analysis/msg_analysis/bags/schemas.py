@@ -128,10 +128,26 @@ def network_topics(agents: int, namespace: str = "", *, truth: bool = False) -> 
 
 
 def state_topic(root: str, agent: int) -> str:
-    """Topic of the states of an agent (from 1) below a root that ends with a slash."""
+    """Topic of the states of an agent (from 1) below a root that ends with a slash.
+
+    Parameters
+    ----------
+    root
+        such as "/" or "/lab/"
+    agent
+        number from 1
+    """
     return f"{root}agent_{agent}/state"
 
 
 def truth_topic(root: str, agent: int) -> str:
-    """Topic of the states as they are, where others are published, of an agent (from 1) below a root."""
+    """Topic of the states as they are, where others are published, of an agent (from 1) below a root.
+
+    Parameters
+    ----------
+    root
+        such as "/" or "/lab/"
+    agent
+        number from 1
+    """
     return f"{root}agent_{agent}/truth"

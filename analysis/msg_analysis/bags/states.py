@@ -92,7 +92,13 @@ class States:
         return np.asarray(self.head["heard_count"].astype(np.int64))
 
     def heard(self, most: int) -> AnyArray:
-        """(messages, most) the first entries of ``heard``, uint64; 0 beyond its end."""
+        """(messages, most) the first entries of ``heard``, uint64; 0 beyond its end.
+
+        Parameters
+        ----------
+        most
+            entries of a message to take
+        """
         out = np.zeros((len(self), most), np.uint64)
         length = np.minimum(self.heard_count, most)
         for size in np.unique(length[length > 0]).tolist():
@@ -102,7 +108,13 @@ class States:
         return out
 
     def state(self, width: int) -> FloatArray:
-        """(messages, width) of states that all have this length."""
+        """(messages, width) of states that all have this length.
+
+        Parameters
+        ----------
+        width
+            numbers of a state
+        """
         if not width:
             return np.empty((len(self), 0))
         values = gather(self.data, self.start + _FIXED_SIZE + 8 * self.heard_count, 8 * width).view("<f8")
@@ -117,7 +129,13 @@ class States:
 
 
 def run_number(run: bytes) -> tuple[int, int]:
-    """The 16 bytes of a run id as the two numbers by which :class:`States` tells runs apart."""
+    """The 16 bytes of a run id as the two numbers by which :class:`States` tells runs apart.
+
+    Parameters
+    ----------
+    run
+        16 bytes of a UUID
+    """
     first, second = struct.unpack("<QQ", run)
     return first, second
 
@@ -130,7 +148,7 @@ def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States
     batch
         messages
     chosen
-        indices of those that are states
+        (k,) indices of those that are states
     position
         place in the bag of the first of them
 

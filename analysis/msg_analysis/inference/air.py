@@ -43,6 +43,11 @@ def loss_test(observation: Observation | Measurement) -> LossTest | None:
     the products of (lost - p) of successive messages of one link, and of pairs of messages in one step. What is too
     rare for a chi-square law is left out, links too rare for it are taken together; where these are too rare as
     well, their number is held against the binomial law itself.
+
+    Parameters
+    ----------
+    observation
+        of a run with ``noise.loss``, or without
     """
     tally = LossTally.of(observation)
     return tally.test() if tally else None
@@ -50,6 +55,11 @@ def loss_test(observation: Observation | Measurement) -> LossTest | None:
 
 class LossTally:
     """Sums over the messages of a run; xi = lost - p.
+
+    Parameters
+    ----------
+    observation
+        of a run with ``noise.loss``
 
     Attributes
     ----------
@@ -84,11 +94,23 @@ class LossTally:
 
     @classmethod
     def of(cls, observation: Observation | Measurement) -> LossTally | None:
-        """Of a run; None where no message can be lost, or none was logged."""
+        """Of a run; None where no message can be lost, or none was logged.
+
+        Parameters
+        ----------
+        observation
+            of any run
+        """
         return cls(observation) if observation.step.loss and observation.lost is not None else None
 
     def merge(self, other: LossTally) -> None:
-        """Take what another run of the same experiment adds up to."""
+        """Take what another run of the same experiment adds up to.
+
+        Parameters
+        ----------
+        other
+            of another run, with another seed
+        """
         self.messages += other.messages
         self.lost += other.lost
         self.successive, self.same_step = self.successive + other.successive, self.same_step + other.same_step
@@ -151,6 +173,11 @@ def _block(
 class BroadcastSums:
     """What the noise in what was published adds up to, in units of what it should be.
 
+    Parameters
+    ----------
+    observation
+        of a run with ``noise.broadcast``
+
     Attributes
     ----------
     scatter
@@ -173,12 +200,24 @@ class BroadcastSums:
 
     @classmethod
     def of(cls, observation: Observation) -> BroadcastSums | None:
-        """Of a run; None without broadcast noise."""
+        """Of a run; None without broadcast noise.
+
+        Parameters
+        ----------
+        observation
+            of any run
+        """
         noisy = observation.prediction.experiment.noise.broadcast
         return cls(observation) if noisy and observation.published is not None else None
 
     def merge(self, other: BroadcastSums) -> None:
-        """Take what another run of the same experiment adds up to."""
+        """Take what another run of the same experiment adds up to.
+
+        Parameters
+        ----------
+        other
+            of another run, with another seed
+        """
         self.scatter += other.scatter
         self.samples += other.samples
 
@@ -189,6 +228,12 @@ class BroadcastSums:
 
 
 def broadcast_p(observation: Observation) -> float | None:
-    """p-value of what was published, less the states: N(0, s^2 I) of agents; None without broadcast noise."""
+    """p-value of what was published, less the states: N(0, s^2 I) of agents; None without broadcast noise.
+
+    Parameters
+    ----------
+    observation
+        of any run
+    """
     sums = BroadcastSums.of(observation)
     return sums.p_value() if sums else None

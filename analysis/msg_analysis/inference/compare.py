@@ -44,7 +44,19 @@ RUNNING_POINTS = 400
 
 @dataclass(frozen=True, slots=True)
 class Test:
-    """One member of the family that the verdict is about; ``p_adjusted`` is Holm's, over the family."""
+    """One member of the family that the verdict is about; ``p_adjusted`` is Holm's, over the family.
+
+    Attributes
+    ----------
+    name
+        what is tested
+    p
+        of this test alone
+    p_adjusted
+        Holm's, over the family
+    rejected
+        whether ``p_adjusted`` is at most the level
+    """
 
     name: str
     p: float
@@ -73,7 +85,8 @@ class Comparison:
     tests
         the family, in the order of the report
     running
-        "time" [simulated time], "system_error" and "standard_error" of the mean up to then (400 points)
+        "time" [units of simulated time], "system_error" and "standard_error" of the mean up to then, (400,) each, fewer
+        for short runs
     loss
         of the messages that were lost; None where none can be
     p_broadcast
@@ -224,15 +237,15 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     probability at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In
     real time, the family is what is exact whatever the timing was.
 
+    Where the law has no prediction (a protocol that is not linear, or not here), the run is measured, and only its
+    graphs and losses are tested.
+
     Parameters
     ----------
     trajectory
         from a bag or from the twin. If something is missing, the numbers are those of the complete beginning
     level
         chance of calling a run that follows its law one that disagrees
-
-    Where the law has no prediction (a protocol that is not linear, or not here), the run is measured, and only its
-    graphs and losses are tested.
 
     Raises
     ------
@@ -373,7 +386,19 @@ def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Compari
 
 
 def without_numbers(trajectory: Trajectory, level: float, prediction: Prediction, steps: int) -> Comparison:
-    """Too little came: only what was expected."""
+    """Too little came: only what was expected.
+
+    Parameters
+    ----------
+    trajectory
+        with the account of what is missing
+    level
+        chance of a false "disagrees"
+    prediction
+        of its experiment
+    steps
+        that came whole
+    """
     predicted = prediction.emulated
     return Comparison(
         trajectory=trajectory,

@@ -55,7 +55,23 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CovarianceTest:
-    """All second moments at once; arrays are (m, m), None where they were not estimated."""
+    """All second moments at once; arrays are (m, m), None where they were not estimated.
+
+    Attributes
+    ----------
+    measured
+        (m, m) time mean; None where not estimated
+    predicted
+        (m, m) its expectation
+    chi2
+        of the half-vectorised difference; None where there is no joint test
+    dof
+        degrees of freedom of ``chi2``
+    p
+        of the test
+    note
+        why there is none, if so
+    """
 
     measured: FloatArray | None = None
     predicted: FloatArray | None = None
@@ -123,7 +139,15 @@ def estimate(measured: float, predicted: float, error: float, scale: float) -> E
 
 
 def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
-    """All second moments at once; see ``estimates``."""
+    """All second moments at once; see ``estimates``.
+
+    Parameters
+    ----------
+    means
+        of the run, or of several
+    system
+        that they are held against
+    """
     measured = system.lifted(means.second_moments)
     predicted = system.lifted(means.expected_moments)
     if not means.joint:

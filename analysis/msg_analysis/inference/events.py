@@ -32,6 +32,11 @@ def order_events(observation: Observation) -> Order:
     """Order the events of a run by when they were made; at equal times, what was used first.
 
     Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
+
+    Parameters
+    ----------
+    observation
+        of a run in real time
     """
     timers = _timers(observation)
     made = timers.made
@@ -87,7 +92,13 @@ def _turns(source: IntArray, target: IntArray, count: int) -> tuple[IntArray, bo
 
 
 def newest_steps(observation: Observation) -> IntArray:
-    """(N + 1, m): step of the newest state of every agent that was made at simulated time <= k dt."""
+    """(N + 1, m): step of the newest state of every agent that was made at simulated time <= k dt.
+
+    Parameters
+    ----------
+    observation
+        of a run in real time
+    """
     made = np.maximum.accumulate(_timers(observation).made, axis=0)
     times = sampling_times(observation)
     newest = [np.searchsorted(made[:, i], times, side="right") - 1 for i in range(made.shape[1])]
@@ -95,12 +106,24 @@ def newest_steps(observation: Observation) -> IntArray:
 
 
 def sampled(observation: Observation) -> FloatArray:
-    """(N + 1, m, R): the states X(k) that the network shows at simulated time k dt; what is compared in real time."""
+    """(N + 1, m, R): the states X(k) that the network shows at simulated time k dt; what is compared in real time.
+
+    Parameters
+    ----------
+    observation
+        of a run in real time
+    """
     return np.asarray(observation.states[newest_steps(observation), np.arange(observation.step.agents)])
 
 
 def sampling_times(observation: Observation) -> IntArray:
-    """(N + 1,) k dt [ns]."""
+    """(N + 1,) k dt [ns].
+
+    Parameters
+    ----------
+    observation
+        of a run in real time
+    """
     return StepClock(observation.step.dt).times(np.arange(observation.steps + 1))
 
 

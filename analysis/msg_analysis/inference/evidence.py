@@ -87,6 +87,11 @@ class Evidence:
 
         Time means are weighted with the numbers of steps: that is the mean over all steps, and every increment of the
         martingale counts the same.
+
+        Parameters
+        ----------
+        other
+            of another run of the experiment
         """
         self.innovations.merge(other.innovations)
         if self.loss and other.loss:

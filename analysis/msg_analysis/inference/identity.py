@@ -14,7 +14,13 @@ MAY_DIFFER = {"name", "run.seed", "run.duration", "run.processes", "run.speed"}
 
 
 def law_keys(experiment: Experiment) -> dict[str, Any]:
-    """Every key, with dots, that makes the law of a run, and its value."""
+    """Every key, with dots, that makes the law of a run, and its value.
+
+    Parameters
+    ----------
+    experiment
+        checked
+    """
     found = _flat(experiment.to_document())
     # The order of the graphs is that of the modes.
     found["graphs"] = [graph.name for graph in experiment.graph_list]
@@ -24,13 +30,27 @@ def law_keys(experiment: Experiment) -> dict[str, Any]:
 
 
 def law_identity(experiment: Experiment) -> str:
-    """A short text that is the same for runs of the same law."""
+    """A short text that is the same for runs of the same law.
+
+    Parameters
+    ----------
+    experiment
+        checked
+    """
     text = json.dumps(law_keys(experiment), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def first_difference(one: Experiment, other: Experiment) -> tuple[str, Any, Any] | None:
-    """Key and both values of what is different; None where the law is the same."""
+    """Key and both values of what is different; None where the law is the same.
+
+    Parameters
+    ----------
+    one
+        experiment
+    other
+        experiment
+    """
     a, b = law_keys(one), law_keys(other)
     for key in sorted(a.keys() | b.keys()):
         if a.get(key) != b.get(key):

@@ -71,6 +71,13 @@ class _Directions:
 class InnovationSums:
     """What the innovations of runs of one experiment add up to: enough for the tests, and for what is wrong.
 
+    Parameters
+    ----------
+    observation
+        of the first run
+    position
+        (N, m) in real time, when the states were made (``events.Order.position``)
+
     Attributes
     ----------
     noises
@@ -127,7 +134,13 @@ class InnovationSums:
         return self.samples // self.replicas
 
     def merge(self, other: InnovationSums) -> None:
-        """Take what another run of the same experiment adds up to."""
+        """Take what another run of the same experiment adds up to.
+
+        Parameters
+        ----------
+        other
+            of another run, with another seed
+        """
         self.samples += other.samples
         self.scatter += other.scatter
         self.still += other.still
@@ -216,6 +229,8 @@ def innovation_tests(observation: Observation, position: IntArray | None = None)
 
     Parameters
     ----------
+    observation
+        of a run
     position
         (N, m) in real time, when the states were made (``events.Order.position``)
     """
@@ -223,7 +238,19 @@ def innovation_tests(observation: Observation, position: IntArray | None = None)
 
 
 def innovations(observation: Observation, first: int, last: int, reception: Reception | None = None) -> FloatArray:
-    """(last - first, m, R): e of the steps first..last-1, given what was heard, if that was not the states."""
+    """(last - first, m, R): e of the steps first..last-1, given what was heard, if that was not the states.
+
+    Parameters
+    ----------
+    observation
+        of the run
+    first
+        step
+    last
+        step behind the last one
+    reception
+        of these steps; None: everybody heard the states of the step before
+    """
     step, now = observation.step, observation.states[first:last]
     after = observation.states[first + 1 : last + 1].copy()
     if reception is not None:
@@ -249,7 +276,13 @@ def _directions(noise: FloatArray) -> _Directions:
 
 
 class Whiteness:
-    """Portmanteau test of iid N(0, I) vectors: lags 1..LAGS, and lag 0 between replicas."""
+    """Portmanteau test of iid N(0, I) vectors: lags 1..LAGS, and lag 0 between replicas.
+
+    Parameters
+    ----------
+    rank
+        length of the vectors
+    """
 
     def __init__(self, rank: int) -> None:
         self.rank = rank
@@ -261,7 +294,13 @@ class Whiteness:
         self._steps, self._replicas = 0, 1
 
     def add(self, white: FloatArray) -> None:
-        """Take the next (b, rank, R) block."""
+        """Take the next (b, rank, R) block.
+
+        Parameters
+        ----------
+        white
+            (b, rank, R) standard normal, if the law holds
+        """
         self._steps += len(white)
         self._replicas = white.shape[2]
         squares = (white**2).sum(axis=2)
@@ -279,7 +318,13 @@ class Whiteness:
         self._tail = joined[-LAGS:]
 
     def merge(self, other: Whiteness) -> None:
-        """Take what another run adds up to; nothing is said of pairs of steps of different runs."""
+        """Take what another run adds up to; nothing is said of pairs of steps of different runs.
+
+        Parameters
+        ----------
+        other
+            of another run, with another seed
+        """
         self._products += other._products
         self._counts += other._counts
         self._squares += other._squares

@@ -141,16 +141,40 @@ class Value:
         return result
 
     def variances(self, combination: FloatArray, a: FloatArray, replicas: int) -> FloatArray:
-        """(b,): Var(D_k | now) of one combination (q,) of the forms in every step, a being (b, p + 1)."""
+        """(b,): Var(D_k | now) of one combination (q,) of the forms in every step, a being (b, p + 1).
+
+        Parameters
+        ----------
+        combination
+            (q,) of the forms
+        a
+            (b, p + 1) packed moments and 1, of each step
+        replicas
+            R, over which ``a`` is averaged
+        """
         return np.asarray(self.jump_variances(combination, a) + a @ self.spread_variance(combination) / replicas)
 
     def jump_variances(self, combination: FloatArray, a: FloatArray) -> FloatArray:
-        """(b,): the part of ``variances`` that the next graph is to blame for."""
+        """(b,): the part of ``variances`` that the next graph is to blame for.
+
+        Parameters
+        ----------
+        combination
+            (q,) of the forms
+        a
+            (b, p + 1) packed moments and 1, of each step
+        """
         parts = [(a @ (combination @ surprise)) ** 2 for surprise in self.surprises]
         return np.asarray(self.probability @ np.array(parts))
 
     def spread_variance(self, combination: FloatArray) -> FloatArray:
-        """(p + 1,): as a function of a, the part that the noise is to blame for, with one replica."""
+        """(p + 1,): as a function of a, the part that the noise is to blame for, with one replica.
+
+        Parameters
+        ----------
+        combination
+            (q,) of the forms
+        """
         linear = np.zeros(self.surprises.shape[2])
         for probability, form in zip(self.probability, self.forms, strict=True):
             matrix = np.tensordot(combination, form, axes=1)
@@ -182,11 +206,25 @@ class SharedValue:
     expected: FloatArray
 
     def increments(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """(steps, q): F_k - E[f(next)] of steps with these a and b, both (steps, p + 1)."""
+        """(steps, q): F_k - E[f(next)] of steps with these a and b, both (steps, p + 1).
+
+        Parameters
+        ----------
+        a
+            (steps, p + 1) packed moments and 1 before each step
+        b
+            (steps, p + 1) the same after it
+        """
         return np.asarray(b @ self.reached.T - a @ self.expected.T)
 
     def jumps(self, b: FloatArray) -> FloatArray:
-        """(q, q): sum over steps of Cov(f(next) - F_k), with b (steps, p + 1)."""
+        """(q, q): sum over steps of Cov(f(next) - F_k), with b (steps, p + 1).
+
+        Parameters
+        ----------
+        b
+            (steps, p + 1) packed moments and 1 after each step
+        """
         total = np.zeros((self.surprises.shape[1],) * 2)
         for probability, surprise in zip(self.probability, self.surprises, strict=True):
             surprised = b @ surprise.T
@@ -194,7 +232,15 @@ class SharedValue:
         return total
 
     def jump_variances(self, combination: FloatArray, b: FloatArray) -> FloatArray:
-        """(steps,): Var(f(next) - F_k) of one combination (q,) of the forms."""
+        """(steps,): Var(f(next) - F_k) of one combination (q,) of the forms.
+
+        Parameters
+        ----------
+        combination
+            (q,) of the forms
+        b
+            (steps, p + 1) packed moments and 1 after each step
+        """
         parts = [(b @ (combination @ surprise)) ** 2 for surprise in self.surprises]
         return np.asarray(self.probability @ np.array(parts))
 
@@ -204,6 +250,11 @@ def expected_mean(observation: Observation) -> FloatArray:
 
     A run that was not started from the stationary law is taken as it started, at the x(0) of its record and
     the graph that it logged first: what one draw of g(0) does to a transient is no error.
+
+    Parameters
+    ----------
+    observation
+        of a run in lockstep
     """
     prediction = observation.prediction
     step, system, steady = prediction.step, prediction.system, prediction.steady
@@ -221,6 +272,11 @@ def time_means(observation: Observation) -> TimeMeans:
     """Measure a run's second moments and their standard errors.
 
     Time and memory per step are those of p = d (d + 1) / 2 second moments.
+
+    Parameters
+    ----------
+    observation
+        of a run in lockstep
     """
     system, steps = observation.prediction.system, observation.steps
     p = symmetric.size(system.dimension)
@@ -267,7 +323,15 @@ def time_means(observation: Observation) -> TimeMeans:
 
 
 def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedValue]:
-    """One for each graph."""
+    """One for each graph.
+
+    Parameters
+    ----------
+    prediction
+        of the experiment
+    forms
+        (q, p) on packed y y^T
+    """
     system = prediction.system
     dual = prediction.solver.dual(symmetric.unpack(forms, system.dimension))
     _, kappa = mode_potential(system, dual)
@@ -295,6 +359,13 @@ def forms_of(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What is estimated: all second moments, the node errors, or the system error.
 
+    Parameters
+    ----------
+    system
+        reduced
+    kind
+        what to estimate
+
     Returns
     -------
     tuple[FloatArray, FloatArray, FloatArray]
@@ -310,11 +381,31 @@ def forms_of(
 
 
 def moments(observation: Observation, first: int, last: int, states: FloatArray) -> FloatArray:
-    """(last - first, p): packed y y^T of the states first..last-1 of (N + 1, m, R), averaged over the replicas."""
+    """(last - first, p): packed y y^T of the states first..last-1 of (N + 1, m, R), averaged over the replicas.
+
+    Parameters
+    ----------
+    observation
+        of the run
+    first
+        step
+    last
+        step behind the last one
+    states
+        (N + 1, m, R) of the run
+    """
     return packed_moments(states[first:last] - observation.step.reference, observation.prediction.system)
 
 
 def packed_moments(deviations: FloatArray, system: JumpSystem) -> FloatArray:
-    """(b, p): packed y y^T of what the agents are off in some steps, (b, m, R), averaged over the replicas."""
+    """(b, p): packed y y^T of what the agents are off in some steps, (b, m, R), averaged over the replicas.
+
+    Parameters
+    ----------
+    deviations
+        (b, m, R) from what the states should be
+    system
+        whose reduced coordinates
+    """
     y = np.einsum("kmr,md->krd", deviations, system.lift, optimize=True)
     return symmetric.pack(y.transpose(0, 2, 1) @ y / deviations.shape[2])

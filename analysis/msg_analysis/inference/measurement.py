@@ -42,7 +42,13 @@ class Measurement:
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> Measurement:
-        """Everything before the first gap."""
+        """Everything before the first gap.
+
+        Parameters
+        ----------
+        trajectory
+            of a bag or of the twin
+        """
         experiment, steps = trajectory.record.experiment, max(trajectory.prefix, 0)
         values = trajectory.values[:steps]
         consensus = experiment.problem == "consensus"
@@ -74,7 +80,13 @@ class Measurement:
         return _system_errors(self.deviations)
 
     def blocks(self, numbers_per_step: int) -> Iterator[tuple[int, int]]:
-        """See ``Observation.blocks``."""
+        """See ``Observation.blocks``.
+
+        Parameters
+        ----------
+        numbers_per_step
+            that are kept at once for a step
+        """
         length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
         for first in range(0, self.steps, length):
             yield first, min(first + length, self.steps)
@@ -85,6 +97,11 @@ def transient_length(series: FloatArray) -> int:
 
     Of means over 5 steps, those are left out without which the variance of the mean of the others, as if they were
     independent, is least.
+
+    Parameters
+    ----------
+    series
+        (N,) in the order of time
     """
     count = len(series) // BATCH
     if count < 4:

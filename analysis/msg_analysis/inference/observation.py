@@ -72,6 +72,13 @@ class Observation:
     def of(cls, trajectory: Trajectory, prediction: Prediction) -> Observation:
         """Everything before the first gap.
 
+        Parameters
+        ----------
+        trajectory
+            of a bag or of the twin
+        prediction
+            of its experiment
+
         Raises
         ------
         InputError
@@ -127,7 +134,18 @@ class Observation:
 
 
 def bounded(states: FloatArray) -> FloatArray:
-    """The same, and what is beyond ``LARGEST`` as large as that: wrong all the same, and it can be computed with."""
+    """The same, and what is beyond ``LARGEST`` as large as that: wrong all the same, and it can be computed with.
+
+    Parameters
+    ----------
+    states
+        of any shape
+
+    Returns
+    -------
+    FloatArray
+        of the same shape
+    """
     if not states.size or (states.max() <= LARGEST and states.min() >= -LARGEST):
         return states
     return np.clip(states, -LARGEST, LARGEST)

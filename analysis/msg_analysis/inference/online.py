@@ -97,7 +97,19 @@ class LiveEstimate:
             self._note = "too many agents for standard errors of each"
 
     def add(self, agent: int, step: int, mode: int, payload: bytes) -> None:
-        """See ``StepCollector.add``."""
+        """See ``StepCollector.add``.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        step
+            k
+        mode
+            graph that led to it, from 0; -1 at step 0
+        payload
+            x(k), 8 bytes for each number
+        """
         self.steps.add(agent, step, mode, payload)
 
     def report(self) -> LiveReport:

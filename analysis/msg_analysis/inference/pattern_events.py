@@ -32,9 +32,9 @@ class Period:
     Attributes
     ----------
     matrix
-        (S', S)
+        (S', S), of a shape that may change from period to period
     noise
-        (S', S') covariance
+        (S', S') covariance, of the shape that the stack has after the period
     """
 
     matrix: FloatArray
@@ -103,7 +103,13 @@ class Periods:
         """Most entries of a stack."""
 
     def entries(self, number: int) -> int:
-        """Entries of the stack at a sampling time."""
+        """Entries of the stack at a sampling time.
+
+        Parameters
+        ----------
+        number
+            K of the sampling time, from 0
+        """
         return self._step.agents + int(self._extra_ends[number + 1] - self._extra_ends[number])
 
     def __getitem__(self, number: int) -> Period:

@@ -42,7 +42,13 @@ class Neighbours:
 
 @lru_cache(maxsize=4)
 def neighbour_tables(wiring: Wiring) -> Neighbours:
-    """The neighbours that the log of a run with this wiring speaks of."""
+    """The neighbours that the log of a run with this wiring speaks of.
+
+    Parameters
+    ----------
+    wiring
+        of the experiment
+    """
     n, m = wiring.modes, wiring.agents
     senders = np.tile(np.arange(m)[:, None], (n, 1, wiring.most_neighbours))
     count = np.zeros((n, m), dtype=np.int64)
@@ -56,7 +62,13 @@ def neighbour_tables(wiring: Wiring) -> Neighbours:
 
 @lru_cache(maxsize=4)
 def neighbour_weights(step: StepModel) -> FloatArray:
-    """(n, m, D): nominal weights of the neighbours' values; 0 beyond their number."""
+    """(n, m, D): nominal weights of the neighbours' values; 0 beyond their number.
+
+    Parameters
+    ----------
+    step
+        compiled experiment
+    """
     tables = neighbour_tables(step)
     there = np.arange(step.most_neighbours) < tables.count[:, :, None]
     return np.where(there, np.take_along_axis(step.nominal, tables.senders, axis=2), 0.0)
@@ -100,7 +112,17 @@ class Reception:
 
     @classmethod
     def of(cls, observation: Observation, first: int, last: int) -> Reception:
-        """Of the steps first..last-1."""
+        """Of the steps first..last-1.
+
+        Parameters
+        ----------
+        observation
+            of a run whose log says what was heard
+        first
+            step
+        last
+            step behind the last one
+        """
         step, modes, timers = observation.step, observation.modes[first:last], observation.timers
         tables, agents = neighbour_tables(step), np.arange(step.agents)
         if timers is None:
@@ -126,7 +148,17 @@ class Reception:
         )
 
     def heard(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
-        """(len(at), a, R): in some steps of the block, what these agents (a,) used for these neighbours (a,)."""
+        """(len(at), a, R): in some steps of the block, what these agents (a,) used for these neighbours (a,).
+
+        Parameters
+        ----------
+        at
+            (k,) steps, counted from the first of the block
+        agents
+            (a,) receivers, from 0
+        which
+            (a,) places of the senders among their neighbours
+        """
         index = at[:, None], agents, which
         return np.asarray(self.published[self.used[index], self.senders[index]])
 
@@ -163,14 +195,33 @@ class Reception:
 
 
 def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Receiver, sender, and place of the sender among the receiver's neighbours, of every link of a graph."""
+    """Receiver, sender, and place of the sender among the receiver's neighbours, of every link of a graph.
+
+    Parameters
+    ----------
+    step
+        wiring
+    mode
+        graph, from 0
+
+    Returns
+    -------
+    tuple[IntArray, IntArray, IntArray]
+        (links,) each, by receiver and then by sender
+    """
     tables = neighbour_tables(step)
     receiver, which = np.nonzero(np.arange(step.most_neighbours) < tables.count[mode][:, None])
     return receiver, tables.senders[mode, receiver, which], which
 
 
 def full_reception_noise(observation: Observation) -> FloatArray:
-    """(n, m, m): covariance of the innovations of a step in which nothing is lost."""
+    """(n, m, m): covariance of the innovations of a step in which nothing is lost.
+
+    Parameters
+    ----------
+    observation
+        of a run
+    """
     step = observation.step
     link = observation.prediction.experiment.noise.link**2 * (neighbour_weights(step) ** 2).sum(axis=2)
     process = step.noise_gain @ step.noise_gain.transpose(0, 2, 1)
@@ -178,7 +229,15 @@ def full_reception_noise(observation: Observation) -> FloatArray:
 
 
 def process_noise(step: StepModel, graphs: IntArray) -> FloatArray:
-    """(m, m): covariance of the process noise of a step in which the agents use these graphs (m,)."""
+    """(m, m): covariance of the process noise of a step in which the agents use these graphs (m,).
+
+    Parameters
+    ----------
+    step
+        compiled experiment
+    graphs
+        (m,) that the agents use, from 0
+    """
     gain = step.noise_gain[graphs, np.arange(step.agents)]
     return np.asarray(gain @ gain.T)
 
@@ -190,6 +249,13 @@ class Equalizer:
     knew the graph, M^1/2 N^-1/2 e has the covariance M. Where a step has not as many directions with noise as M (an
     agent without process noise has heard nobody), it cannot be brought there: then only the total size of all
     innovations is left to test.
+
+    Parameters
+    ----------
+    step
+        compiled experiment
+    full
+        (n, m, m) of ``full_reception_noise``
 
     Attributes
     ----------
@@ -209,7 +275,15 @@ class Equalizer:
         self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
 
     def equalize(self, innovations: FloatArray, reception: Reception) -> FloatArray:
-        """(b, m, R) of (b, m, R)."""
+        """(b, m, R) of (b, m, R).
+
+        Parameters
+        ----------
+        innovations
+            (b, m, R) of the steps of a block
+        reception
+            of the same block
+        """
         m = innovations.shape[1]
         keys = np.column_stack([reception.modes, reception.graphs, reception.link_variance])
         patterns, owner = np.unique(keys, axis=0, return_inverse=True)
@@ -232,7 +306,13 @@ class Equalizer:
         return equal
 
     def merge(self, other: Equalizer) -> None:
-        """Take what another one has of another run of the same experiment."""
+        """Take what another one has of another run of the same experiment.
+
+        Parameters
+        ----------
+        other
+            of another run, with another seed
+        """
         self.possible &= other.possible
         self.chi2, self.dof, self.quiet = self.chi2 + other.chi2, self.dof + other.dof, max(self.quiet, other.quiet)
 
@@ -333,7 +413,17 @@ class HeardRegression:
         return found
 
     def add(self, reception: Reception, innovations: FloatArray, first: int = 0) -> None:
-        """Take a block of steps, from ``first`` on, with their innovations (b, m, R)."""
+        """Take a block of steps, from ``first`` on, with their innovations (b, m, R).
+
+        Parameters
+        ----------
+        reception
+            of a block
+        innovations
+            (b, m, R) of its steps
+        first
+            step of the block
+        """
         order = None
         if self._position is not None:
             order = np.argsort(self._position[first : first + len(innovations)], axis=1)

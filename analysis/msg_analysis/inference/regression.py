@@ -47,6 +47,13 @@ class StateRegression:
     The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a
     phi_b given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated
     noise too. All regressors are linear in z, the deviations of the agents and a constant 1.
+
+    Parameters
+    ----------
+    observation
+        whose graphs and sizes it is for
+    most
+        largest number of terms; when there would be more, fewer kinds of them are tested
     """
 
     def __init__(self, observation: Observation, most: int = MAX_REGRESSORS) -> None:
@@ -63,7 +70,17 @@ class StateRegression:
         return 0
 
     def add(self, modes: IntArray, states: FloatArray, innovations: FloatArray) -> None:
-        """Take a block of steps: graphs (b,), states and innovations (b, m, R)."""
+        """Take a block of steps: graphs (b,), states and innovations (b, m, R).
+
+        Parameters
+        ----------
+        modes
+            (b,) graph of each step, from 0
+        states
+            (b, m, R) x(k)
+        innovations
+            (b, m, R) of the steps
+        """
         m = self._step.agents
         z = np.ones((len(modes), m + 1, states.shape[2]))
         z[:, :m] = states - (states.mean(axis=1, keepdims=True) if self._centred else self._step.reference)

@@ -42,7 +42,13 @@ class Suspects:
 
 
 def frozen(sums: InnovationSums) -> list[tuple[int, int, int]]:
-    """(agent, steps in which it did not move, steps) of agents whose noise cannot have let them stand still."""
+    """(agent, steps in which it did not move, steps) of agents whose noise cannot have let them stand still.
+
+    Parameters
+    ----------
+    sums
+        of the runs
+    """
     noisy = np.sqrt(np.diagonal(sums.noises, axis1=1, axis2=2)) > 1e-12 * sums.largest
     still, steps = (sums.still * noisy).sum(axis=0), (sums.steps[:, None] * noisy).sum(axis=0)
     # Two equal numbers in a row are a coincidence of rounding, of which there may be one.
@@ -160,7 +166,15 @@ def noise(sums: InnovationSums, pardoned: Iterable[int], change: FloatArray) -> 
 
 
 def variances(squares: FloatArray, samples: int) -> Suspects:
-    """Of the logarithms of variances (m,) of independent standard normal numbers, agent by agent."""
+    """Of the logarithms of variances (m,) of independent standard normal numbers, agent by agent.
+
+    Parameters
+    ----------
+    squares
+        (m,) mean squares
+    samples
+        numbers that each is the mean of
+    """
     information = np.eye(len(squares)) * samples / 2.0
     classes = [
         [Candidate("agent", i, row) for i, row in enumerate(np.eye(len(squares)))],
@@ -170,7 +184,19 @@ def variances(squares: FloatArray, samples: int) -> Suspects:
 
 
 def losses(pairs: IntArray, messages: IntArray, lost: IntArray, probability: float) -> Suspects:
-    """Of the log-odds of losing a message, link by link; pairs (links, 2) are receiver and sender."""
+    """Of the log-odds of losing a message, link by link; pairs (links, 2) are receiver and sender.
+
+    Parameters
+    ----------
+    pairs
+        (links, 2) receiver and sender, from 0
+    messages
+        (links,) that were due
+    lost
+        (links,) of them
+    probability
+        that the experiment says
+    """
     identity = np.eye(len(pairs))
     classes = [
         [Candidate("link", (int(j), int(i)), identity[a]) for a, (i, j) in enumerate(pairs)],

@@ -54,17 +54,37 @@ class Transitions:
 
     @classmethod
     def of(cls, modes: IntArray, graphs: int) -> Transitions:
-        """Of one run with the graphs (N,), from 0."""
+        """Of one run with the graphs (N,), from 0.
+
+        Parameters
+        ----------
+        modes
+            (N,) from 0
+        graphs
+            n
+        """
         counts = np.zeros((graphs, graphs), dtype=np.int64)
         np.add.at(counts, (modes[:-1], modes[1:]), 1)
         return cls(counts, ((int(modes[0]), len(modes) - 1),) if len(modes) else ())
 
     def merged(self, other: Transitions) -> Transitions:
-        """With those of other runs."""
+        """With those of other runs.
+
+        Parameters
+        ----------
+        other
+            of runs with the same graphs
+        """
         return Transitions(self.counts + other.counts, self.paths + other.paths)
 
     def test(self, transition: FloatArray) -> SwitchingTest:
-        """See ``switching_test``."""
+        """See ``switching_test``.
+
+        Parameters
+        ----------
+        transition
+            (n, n) predicted P
+        """
         counts = self.counts
         visits = counts.sum(axis=1)
         expected = visits[:, None] * transition
@@ -118,7 +138,20 @@ def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
 
 
 def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
-    """(...): G = 2 sum c log(c / e) of (..., n, n) counts."""
+    """(...): G = 2 sum c log(c / e) of (..., n, n) counts.
+
+    Parameters
+    ----------
+    counts
+        (..., n, n) of transitions
+    transition
+        (n, n) predicted P
+
+    Returns
+    -------
+    FloatArray
+        of the shape of ``counts`` without its last two axes
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = counts * np.log(counts / (counts.sum(axis=-1, keepdims=True) * transition))
     return np.asarray(2.0 * np.where(counts > 0, terms, 0.0).sum(axis=(-2, -1)))
@@ -137,6 +170,10 @@ def simulate_counts(
         first graph
     transitions
         of every path
+    paths
+        how many
+    random
+        generator, whose numbers are used up
     """
     n = len(transition)
     leaving = 1.0 - np.diag(transition)

@@ -19,7 +19,19 @@ BINS = 60
 
 @dataclass(frozen=True, slots=True)
 class Quantiles:
-    """How a measure is spread; None where there was nothing to measure."""
+    """How a measure is spread; None where there was nothing to measure.
+
+    Attributes
+    ----------
+    p50
+        median
+    p95
+        95th percentile
+    p99
+        99th percentile
+    max
+        the largest
+    """
 
     p50: float | None
     p95: float | None
@@ -28,7 +40,13 @@ class Quantiles:
 
     @classmethod
     def of(cls, values: AnyArray) -> Quantiles:
-        """Of all entries."""
+        """Of all entries.
+
+        Parameters
+        ----------
+        values
+            of any shape
+        """
         if not values.size:
             return cls(None, None, None, None)
         return cls(*(float(value) for value in (*np.quantile(values, (0.5, 0.95, 0.99)), values.max())))
@@ -112,7 +130,13 @@ class Timing:
 
 
 def measure_timing(observation: Observation) -> Timing:
-    """Measure the timing of a run in real time."""
+    """Measure the timing of a run in real time.
+
+    Parameters
+    ----------
+    observation
+        of a run in real time
+    """
     timers, step = observation.timers, observation.step
     assert timers is not None
     experiment = observation.prediction.experiment

@@ -53,16 +53,38 @@ class AgentLaw:
         self._drives = self._draw(0)
 
     def resume(self, step: int, state: bytes) -> None:
-        """Go on from x(step). The noise is a function of the seed and the step: nothing else is needed."""
+        """Go on from x(step). The noise is a function of the seed and the step: nothing else is needed.
+
+        Parameters
+        ----------
+        step
+            k, from which the agent goes on
+        state
+            payload of x(k)
+        """
         self.step, self.state = step, state
         self._drives = self._draw(step // STEPS_PER_BLOCK)
 
     def neighbours(self, mode: int) -> list[int]:
-        """The other agents, ascending, whose states this agent uses under a mode (index from 0)."""
+        """The other agents, ascending, whose states this agent uses under a mode (index from 0).
+
+        Parameters
+        ----------
+        mode
+            graph, from 0
+        """
         return [j for j in self._inputs[mode] if j != self.agent]
 
     def published(self, step: int, state: bytes) -> bytes:  # noqa: ARG002  what is published is the truth
-        """What is published of x(step)."""
+        """What is published of x(step).
+
+        Parameters
+        ----------
+        step
+            k
+        state
+            payload of x(k)
+        """
         return state
 
     def advance(self, mode: int, heard: list[bytes]) -> bytes:
@@ -95,7 +117,17 @@ class AgentLaw:
 
 
 class AgentLawOnAir(AgentLaw):
-    """The same where something becomes of the values between the agents: see ``model.air``."""
+    """The same where something becomes of the values between the agents: see ``model.air``.
+
+    Parameters
+    ----------
+    record
+        of the run
+    model
+        of its experiment
+    agent
+        index from 0
+    """
 
     def __init__(self, record: RunRecord, model: StepModel, agent: int) -> None:
         super().__init__(record, model, agent)
@@ -229,7 +261,17 @@ def _links(air: Air, model: Wiring, agent: int) -> Callable[[int, int], tuple[Fl
 
 
 def agent_law(record: RunRecord, model: Wiring, agent: int) -> AgentLaw | ProtocolLaw:
-    """The law of one agent of a run: see AgentLaw for the parameters."""
+    """The law of one agent of a run: see AgentLaw for the parameters.
+
+    Parameters
+    ----------
+    record
+        of the run
+    model
+        of its experiment
+    agent
+        index from 0
+    """
     if not isinstance(model, StepModel):
         return ProtocolLaw(record, model, agent)
     kind = AgentLawOnAir if record.experiment.noise.on_air else AgentLaw

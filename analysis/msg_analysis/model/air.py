@@ -41,19 +41,57 @@ class Air:
         self._broadcast_block = lru_cache(maxsize=2)(self.broadcast_noise)
 
     def broadcast_noise(self, agent: int, block: int) -> FloatArray:
-        """(STEPS_PER_BLOCK, replicas): b of an agent (index from 0)."""
+        """(STEPS_PER_BLOCK, replicas): b of an agent (index from 0).
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        block
+            number of the block of steps, from 0
+        """
         return self.broadcast * normals(self._seed, Stream.BROADCAST, agent, block, self._shape)
 
     def link_noise(self, receiver: int, sender: int, block: int) -> FloatArray:
-        """(STEPS_PER_BLOCK, replicas): l of the messages from sender to receiver (indices from 0)."""
+        """(STEPS_PER_BLOCK, replicas): l of the messages from sender to receiver (indices from 0).
+
+        Parameters
+        ----------
+        receiver
+            index from 0
+        sender
+            index from 0
+        block
+            number of the block of steps, from 0
+        """
         return self.link * normals(self._seed, Stream.LINK, link_number(receiver, sender), block, self._shape)
 
     def losses(self, receiver: int, sender: int, block: int) -> BoolArray:
-        """(STEPS_PER_BLOCK,): which messages from sender to receiver (indices from 0) are lost."""
+        """(STEPS_PER_BLOCK,): which messages from sender to receiver (indices from 0) are lost.
+
+        Parameters
+        ----------
+        receiver
+            index from 0
+        sender
+            index from 0
+        block
+            number of the block of steps, from 0
+        """
         random = generator(self._seed, Stream.LOSS, link_number(receiver, sender), block)
         return random.random(STEPS_PER_BLOCK) < self.loss
 
     def published(self, agent: int, step: int, state: FloatArray) -> FloatArray:
-        """(replicas,): what one agent publishes of its state of a step; for many steps in a row."""
+        """(replicas,): what one agent publishes of its state of a step; for many steps in a row.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        step
+            k; the noise of a block is kept, so steps one after the other are fast
+        state
+            (replicas,) x(k) of the agent
+        """
         block, within = divmod(step, STEPS_PER_BLOCK)
         return np.asarray(state + self._broadcast_block(agent, block)[within])

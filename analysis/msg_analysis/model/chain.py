@@ -87,7 +87,13 @@ class MarkovChain:
         return stationary_law(self.matrix)
 
     def transition(self, dt: float) -> FloatArray:
-        """(n, n) law of the graph one step later: expm(Gamma dt), or P itself in discrete time."""
+        """(n, n) law of the graph one step later: expm(Gamma dt), or P itself in discrete time.
+
+        Parameters
+        ----------
+        dt
+            length of a step [units of simulated time]; without meaning in discrete time
+        """
         if self.time == "discrete":
             return self.matrix.copy()
         import scipy.linalg  # here, since every agent's process would wait for it

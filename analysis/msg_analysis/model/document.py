@@ -54,6 +54,11 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
 def read_yaml(path: Path) -> Any:
     """The content of a YAML (or JSON) file.
 
+    Parameters
+    ----------
+    path
+        of the file, in UTF-8
+
     Raises
     ------
     InputError

@@ -91,6 +91,11 @@ class Experiment:
     def load(cls, path: str | Path) -> Self:
         """Read an experiment file (YAML; JSON is YAML too).
 
+        Parameters
+        ----------
+        path
+            of the file; paths in it are relative to its directory
+
         Raises
         ------
         InputError
@@ -210,6 +215,11 @@ class Experiment:
 
     def require_available(self, purpose: Purpose = "run") -> None:
         """Refuse what this version does not do yet.
+
+        Parameters
+        ----------
+        purpose
+            "run" (simulate or run it) or "predict"
 
         Raises
         ------

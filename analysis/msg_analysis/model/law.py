@@ -18,9 +18,14 @@ def weighted_sum(weights: Sequence[float | FloatArray], values: Sequence[FloatAr
     Parameters
     ----------
     weights
-        numbers, or arrays that broadcast against the values
+        numbers, or arrays of a shape that broadcasts against the values
     values
         arrays of one shape, at least one
+
+    Returns
+    -------
+    FloatArray
+        of the shape of a value
     """
     terms = zip(values, weights, strict=True)
     value, weight = next(terms)
@@ -36,11 +41,16 @@ def step(weights: Sequence[float | FloatArray], values: Sequence[FloatArray], dr
     Parameters
     ----------
     weights
-        the non-zero W_ij of row i, j ascending (for many rows at once: columns, padded with zeros)
+        the non-zero W_ij of row i, j ascending; or, of many rows at once, columns of shape (m, 1), padded with zeros
     values
-        the matching x_j(k), each one entry per replica
+        the matching x_j(k), each (R,), one entry for each replica; of many rows, (m, R)
     drive
-        noise_i(k) + offset_i, the offset being what a reference adds to the row; like one of the values
+        noise_i(k) + offset_i, of the shape of a value, the offset being what a reference adds to the row
+
+    Returns
+    -------
+    FloatArray
+        x_i(k+1), of the shape of a value
     """
     total = weighted_sum(weights, values)
     total += drive

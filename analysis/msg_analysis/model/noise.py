@@ -43,6 +43,13 @@ class ProcessNoise:
         """For each mode, the noise of one agent in the steps of one block, (STEPS_PER_BLOCK, replicas).
 
         Modes with the same noise share one array.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        block
+            number of the block of steps, from 0
         """
         rows = self._gain[:, agent]
         drawn = {key: self._combined(row, block) for key, row in {row.tobytes(): row for row in rows}.items()}

@@ -44,6 +44,8 @@ def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
 
     Parameters
     ----------
+    experiment
+        whose chain, seed and duration
     initial
         (n,) law of g(0)
     """
@@ -63,7 +65,15 @@ def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
 
 
 def mode_path(experiment: Experiment, initial: FloatArray) -> IntArray:
-    """(N,) index of the graph of each step k -> k+1."""
+    """(N,) index of the graph of each step k -> k+1.
+
+    Parameters
+    ----------
+    experiment
+        whose chain, seed and duration
+    initial
+        (n,) law of g(0)
+    """
     modes = np.empty(experiment.steps, dtype=np.int64)
     for sojourn in sojourns(experiment, initial):
         modes[sojourn.first_step : sojourn.last_step + 1] = sojourn.mode

@@ -16,12 +16,24 @@ _DOUBLE = np.dtype("<f8")
 
 
 def to_payload(state: FloatArray) -> bytes:
-    """Bytes of (replicas,) numbers."""
+    """Bytes of (replicas,) numbers.
+
+    Parameters
+    ----------
+    state
+        (replicas,) float64
+    """
     return state.astype(_DOUBLE, copy=False).tobytes()
 
 
 def from_payload(payload: bytes) -> FloatArray:
-    """(replicas,) numbers, read-only."""
+    """(replicas,) numbers, read-only.
+
+    Parameters
+    ----------
+    payload
+        8 bytes for each number, little-endian
+    """
     return np.frombuffer(payload, _DOUBLE)
 
 
@@ -34,12 +46,20 @@ def combine_with_numpy(weights: Sequence[float], payloads: Sequence[bytes], driv
         a tuple of numbers, at least one
     payloads
         a list, one for each weight, all of the size of the drive
+    drive
+        payload of noise and offset
     """
     return to_payload(step(weights, [from_payload(payload) for payload in payloads], from_payload(drive)))
 
 
 def all_finite_with_numpy(payload: bytes) -> bool:
-    """Whether no entry is infinite or undefined."""
+    """Whether no entry is infinite or undefined.
+
+    Parameters
+    ----------
+    payload
+        8 bytes for each number, little-endian
+    """
     return bool(np.isfinite(from_payload(payload)).all())
 
 

@@ -61,7 +61,13 @@ def problem(key: str, value: object, wanted: str, remedy: str) -> str:
 
 
 def show(value: object) -> str:
-    """A value as the file would have it, on one line, shortened."""
+    """A value as the file would have it, on one line, shortened.
+
+    Parameters
+    ----------
+    value
+        of a key of the file, or what a key was given
+    """
     try:
         text = json.dumps(value, ensure_ascii=False)
     except (TypeError, ValueError):
@@ -71,7 +77,13 @@ def show(value: object) -> str:
 
 
 def dotted(location: Sequence[int | str]) -> str:
-    """The key of a place in the document: names joined by dots, list entries in brackets, counted from 1."""
+    """The key of a place in the document: names joined by dots, list entries in brackets, counted from 1.
+
+    Parameters
+    ----------
+    location
+        keys and list indices from 0, as pydantic has them
+    """
     key = ""
     for part in location:
         if isinstance(part, int):

@@ -61,7 +61,18 @@ class ProtocolInfo:
 
     @classmethod
     def from_json(cls, document: Any) -> ProtocolInfo:
-        """Read it back; ValueError, KeyError or TypeError where it is something else."""
+        """Read it back.
+
+        Parameters
+        ----------
+        document
+            what ``to_json`` gave
+
+        Raises
+        ------
+        ValueError
+            it is something else (KeyError and TypeError, too)
+        """
         if int(document["states"]) < 1:
             raise ValueError(f"protocol: states {document['states']}, expected a number >= 1")
         return cls(
@@ -108,7 +119,13 @@ class ChosenProtocol:
         return None if self.info.linear else f"{self.info} is not linear, and runs without a prediction"
 
     def unavailable(self, purpose: Purpose) -> list[str]:
-        """What stands in the way of a purpose, one line each: see ``Experiment.unavailable``."""
+        """What stands in the way of a purpose, one line each: see ``Experiment.unavailable``.
+
+        Parameters
+        ----------
+        purpose
+            "run" or "predict"
+        """
         name, reason = show(self.info.name), self.unpredictable()
         if self.absent:
             remedy = f"install {self.info.package} {self.info.version}"
@@ -164,6 +181,13 @@ class ChosenProtocol:
 
     def guard(self, where: str, call: Callable[[], Result]) -> Result:
         """What a call of the protocol's own code gives; whatever it raises becomes an error that says where.
+
+        Parameters
+        ----------
+        where
+            the method, for the message
+        call
+            of the protocol's code
 
         Raises
         ------
@@ -239,7 +263,13 @@ def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def network_of(experiment: Experiment) -> Network:
-    """What a protocol is told of an experiment's network."""
+    """What a protocol is told of an experiment's network.
+
+    Parameters
+    ----------
+    experiment
+        checked
+    """
     return Network(
         graphs=experiment.graph_list,
         dt=experiment.step_length,
@@ -387,5 +417,11 @@ def _problems(check: Callable[[], object]) -> list[str]:
 
 
 def info_of(document: Mapping[str, Any]) -> ProtocolInfo | None:
-    """Of a run record; None where the built-in law was run."""
+    """Of a run record; None where the built-in law was run.
+
+    Parameters
+    ----------
+    document
+        of the run record
+    """
     return ProtocolInfo.from_json(document["protocol"]) if document.get("protocol") is not None else None

@@ -22,6 +22,11 @@ def phases(experiment: Experiment) -> FloatArray:
     """(m,) phi_i in (0, 1): the part of a step after which agent i makes it.
 
     They are (rank + 1/2) / m, the ranks a random permutation drawn from the seed of the experiment.
+
+    Parameters
+    ----------
+    experiment
+        in real time; its seed draws them
     """
     ranks = generator(experiment.run.seed, Stream.PHASE).permutation(experiment.agents)
     return np.asarray((ranks + 0.5) / experiment.agents)

@@ -12,7 +12,15 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
 def padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
-    """(d, m): the d-th input of every agent, ascending, and which of these entries there are; others are 0."""
+    """(d, m): the d-th input of every agent, ascending, and which of these entries there are; others are 0.
+
+    Parameters
+    ----------
+    model
+        of the experiment
+    mode
+        graph, from 0
+    """
     inputs = [model.inputs(mode, i) for i in range(model.agents)]
     columns = np.zeros((max(len(row) for row in inputs), model.agents), dtype=np.int64)
     there = np.zeros(columns.shape, dtype=np.bool_)

@@ -68,7 +68,13 @@ class Sections:
         self.protocol: ChosenProtocol | None = None
 
     def resolve(self, directory: Path) -> None:
-        """Find everything that several keys say together, and every mistake in it."""
+        """Find everything that several keys say together, and every mistake in it.
+
+        Parameters
+        ----------
+        directory
+            what the paths in the file are relative to
+        """
         time, run, leaders = self.values["time"], self.values["run"], self.values["leaders"]
         self._find_protocol()
         self._count_agents(directory)

@@ -18,13 +18,24 @@ StepLaw = Literal["synchronous", "sequential"]
 
 
 def step_law(experiment: Experiment) -> StepLaw:
-    """Whether the agents of a run step all at once (lockstep) or one after the other (real time)."""
+    """Whether the agents of a run step all at once (lockstep) or one after the other (real time).
+
+    Parameters
+    ----------
+    experiment
+        by its ``run.pace``
+    """
     return "sequential" if experiment.run.pace == "realtime" else "synchronous"
 
 
 def build_run_model(experiment: Experiment) -> StepModel:
     """What a step of all agents does to x(k), as one jump linear system: ``build_step_model``, or in real time its
     sequential law, in which the noise that everybody makes reaches those who are due later in the same period.
+
+    Parameters
+    ----------
+    experiment
+        whose law is linear
     """
     step = build_step_model(experiment)
     return sequential(step, phases(experiment)) if step_law(experiment) == "sequential" else step
@@ -70,6 +81,13 @@ def ideal_uses(model: StepModel, phase: FloatArray) -> IntArray:
     """(n, m, D): how many steps after x_i(k) the value of the d-th neighbour of agent i is, with ideal timers.
 
     1 for those that are due earlier in the period, 0 for others; -1 where there is no such neighbour.
+
+    Parameters
+    ----------
+    model
+        of the experiment
+    phase
+        (m,) of ``phases``
     """
     ahead = np.full((model.modes, model.agents, model.most_neighbours), -1, dtype=np.int64)
     for mode in range(model.modes):

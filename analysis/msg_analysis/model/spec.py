@@ -26,12 +26,24 @@ Purpose = Literal["predict", "run"]
 
 
 def expected(text: str) -> PydanticCustomError:
-    """The error of a value that is not what ``text`` says."""
+    """The error of a value that is not what ``text`` says.
+
+    Parameters
+    ----------
+    text
+        what the value should be, such as "a number > 0"
+    """
     return PydanticCustomError("expected", "{text}", {"text": text})
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a real number (no boolean) of a reasonable size."""
+    """Whether a value is a real number (no boolean) of a reasonable size.
+
+    Parameters
+    ----------
+    value
+        anything that YAML knows
+    """
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
 
 

@@ -63,13 +63,39 @@ class Wiring:
         return self.chain.stationary
 
     def inputs(self, mode: int, agent: int) -> IntArray:
-        """Agents, ascending, whose values an agent uses under a mode; the agent itself always among them."""
+        """Agents, ascending, whose values an agent uses under a mode; the agent itself always among them.
+
+        Parameters
+        ----------
+        mode
+            graph, from 0
+        agent
+            index from 0
+
+        Returns
+        -------
+        IntArray
+            (d,) indices from 0
+        """
         used = self.links[mode, agent].copy()
         used[agent] = True
         return np.flatnonzero(used)
 
     def neighbours(self, mode: int, agent: int) -> IntArray:
-        """The other agents, ascending, whose values an agent uses under a mode."""
+        """The other agents, ascending, whose values an agent uses under a mode.
+
+        Parameters
+        ----------
+        mode
+            graph, from 0
+        agent
+            index from 0
+
+        Returns
+        -------
+        IntArray
+            (d,) indices from 0
+        """
         used = self.inputs(mode, agent)
         return np.asarray(used[used != agent])
 
@@ -136,7 +162,13 @@ def _transition(chain: MarkovChain, dt: float) -> FloatArray:
 
 
 def build_model(experiment: Experiment) -> Wiring:
-    """What a run needs to know of its network: a ``StepModel`` where the law is linear, else its wiring alone."""
+    """What a run needs to know of its network: a ``StepModel`` where the law is linear, else its wiring alone.
+
+    Parameters
+    ----------
+    experiment
+        with a protocol or without
+    """
     if experiment.protocol is None or experiment.protocol.linear:
         return build_step_model(experiment)
     return Wiring(
@@ -153,6 +185,11 @@ def build_step_model(experiment: Experiment) -> StepModel:
 
     One thread of linear algebra: the matrix exponential of a discrete-time experiment must come out the same, to the
     last bit, in every process of a run, whatever number of threads it was given.
+
+    Parameters
+    ----------
+    experiment
+        whose law is linear
 
     Raises
     ------

@@ -41,13 +41,25 @@ class StepClock:
         self._shift = round(float(phase) * self.step_ns)
 
     def nanoseconds(self, step: int) -> int:
-        """Time of step k [ns]."""
+        """Time of step k [ns].
+
+        Parameters
+        ----------
+        step
+            k
+        """
         if self._denominator == 1:
             return step * self._numerator + self._shift
         return (2 * step * self._numerator + self._denominator) // (2 * self._denominator) + self._shift
 
     def times(self, steps: IntArray) -> IntArray:
-        """Times of many steps [ns], in the same shape; the same as one by one."""
+        """Times of many steps [ns], in the same shape; the same as one by one.
+
+        Parameters
+        ----------
+        steps
+            of any shape: k
+        """
         whole, rest = divmod(self._numerator, self._denominator)
         if 2 * int(np.max(steps, initial=0)) * rest + self._denominator > _LARGEST:  # a dt of very many digits
             flat = [self.nanoseconds(step) for step in np.ravel(steps).tolist()]

@@ -48,10 +48,32 @@ def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.r
 
 
 def link_number(receiver: int, sender: int) -> int:
-    """What stands for the agent in the streams of a directed link, from sender to receiver (indices from 0)."""
+    """What stands for the agent in the streams of a directed link, from sender to receiver (indices from 0).
+
+    Parameters
+    ----------
+    receiver
+        index from 0
+    sender
+        index from 0
+    """
     return receiver << 32 | sender
 
 
 def normals(seed: int, stream: Stream, agent: int, block: int, shape: tuple[int, ...]) -> FloatArray:
-    """Standard normal numbers of one block, of the given shape."""
+    """Standard normal numbers of one block, of the given shape.
+
+    Parameters
+    ----------
+    seed
+        of the experiment
+    stream
+        what the numbers are for
+    agent
+        index from 0, or ``link_number`` of a link
+    block
+        number of the block of ``STEPS_PER_BLOCK`` steps, from 0
+    shape
+        of the result
+    """
     return generator(seed, stream, agent, block).standard_normal(shape)

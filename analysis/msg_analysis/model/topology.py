@@ -14,7 +14,13 @@ from msg_analysis.model.spec import GraphSpec, Link, is_number
 
 
 def largest_label(spec: GraphSpec) -> int:
-    """Largest number of an agent that the graph mentions; 0 where it mentions none."""
+    """Largest number of an agent that the graph mentions; 0 where it mentions none.
+
+    Parameters
+    ----------
+    spec
+        graph as the file has it
+    """
     if spec.path or spec.cycle:
         return max(spec.path or spec.cycle or [0])
     if spec.star:
@@ -54,7 +60,17 @@ def links(spec: GraphSpec, agents: int) -> list[Link]:
 
 
 def link_problems(name: str, spec: GraphSpec, agents: int) -> list[str]:
-    """Self-loops, links that stand twice and agents that do not exist."""
+    """Self-loops, links that stand twice and agents that do not exist.
+
+    Parameters
+    ----------
+    name
+        of the graph
+    spec
+        as the file has it
+    agents
+        m
+    """
     kind = spec.kinds[0]
     key = f"graphs.{name}.{kind}"
     largest = largest_label(spec)
@@ -76,7 +92,17 @@ def link_problems(name: str, spec: GraphSpec, agents: int) -> list[str]:
 
 
 def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
-    """The graph with its (m, m) adjacency."""
+    """The graph with its (m, m) adjacency.
+
+    Parameters
+    ----------
+    name
+        of the graph
+    spec
+        without mistakes
+    agents
+        m
+    """
     adjacency = np.zeros((agents, agents))
     for i, j, weight in links(spec, agents):
         adjacency[j - 1, i - 1] = weight
@@ -87,6 +113,13 @@ def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
 
 def read_graphml(name: str, file: Path) -> tuple[GraphSpec, int, list[str]]:
     """A GraphML file as edges (or arcs, where it is directed).
+
+    Parameters
+    ----------
+    name
+        of the graph, for messages
+    file
+        to read
 
     Returns
     -------

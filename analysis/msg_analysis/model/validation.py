@@ -28,6 +28,15 @@ def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tupl
     """The chain that the file describes, and what is wrong with it (then the chain is None).
 
     Rows are scaled to sum to 0 (or 1) to the last bit, within the tolerance that the check allows.
+
+    Parameters
+    ----------
+    switching
+        section of the file
+    names
+        of the graphs, in their order
+    time
+        "continuous" or "discrete"
     """
     found = _initial_problems(switching, names)
     given = [key for key in ("generator", "rates", "transition") if getattr(switching, key) is not None]
@@ -130,7 +139,17 @@ def _from_matrix(
 
 
 def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> list[str]:
-    """Graphs that cannot be reached from others, or the period of the chain (assumption 1 of the paper)."""
+    """Graphs that cannot be reached from others, or the period of the chain (assumption 1 of the paper).
+
+    Parameters
+    ----------
+    chain
+        to look at
+    names
+        of the graphs
+    key
+        of the file that the chain came from, for messages
+    """
     if chain.ergodic:
         return []
     for source in range(chain.modes):
@@ -147,6 +166,13 @@ def connection_problems(graphs: Sequence[Graph], leaders: LeadersSpec | None) ->
 
     Disagreement (deviation from the reference) is mean-square stable only if the union has an agent (leaders)
     from which every other one is reached.
+
+    Parameters
+    ----------
+    graphs
+        all of the experiment
+    leaders
+        section of the file; None in consensus
     """
     union = np.any([graph.adjacency.T > 0 for graph in graphs], axis=0)
     sources = _widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
@@ -188,6 +214,15 @@ def noise_gain_of(noise: NoiseSpec, names: Sequence[str], agents: int) -> tuple[
     """(n, m, m) F of every graph as ``noise.process`` has it, and what is wrong with it.
 
     One and the same F for all graphs is stored once.
+
+    Parameters
+    ----------
+    noise
+        section of the file
+    names
+        of the graphs
+    agents
+        m
     """
     if not isinstance(noise.process, dict):
         gain, found = _gain_of("noise.process", noise.process, agents)
@@ -235,7 +270,17 @@ def _ragged(value: object) -> bool:
 
 
 def leader_problems(problem_kind: str, leaders: LeadersSpec | None, agents: int | None) -> list[str]:
-    """Leaders where there must be none, missing, twice, unknown, or with nobody to lead."""
+    """Leaders where there must be none, missing, twice, unknown, or with nobody to lead.
+
+    Parameters
+    ----------
+    problem_kind
+        "consensus" or "tracking"
+    leaders
+        section of the file, if there
+    agents
+        m; None where the graphs do not tell
+    """
     if problem_kind == "consensus":
         if leaders is None:
             return []
@@ -282,7 +327,17 @@ def stability_limit(graph: Graph, gains: FloatArray) -> float:
 
 
 def stability_problems(graphs: Iterable[Graph], gains: FloatArray, dt: float) -> list[str]:
-    """Graphs for which an Euler step of dt is unstable."""
+    """Graphs for which an Euler step of dt is unstable.
+
+    Parameters
+    ----------
+    graphs
+        all of the experiment
+    gains
+        (m,) kappa, inf for grounded leaders
+    dt
+        length of a step [units of simulated time]
+    """
     found = []
     for graph in graphs:
         limit = stability_limit(graph, gains)
@@ -293,7 +348,17 @@ def stability_problems(graphs: Iterable[Graph], gains: FloatArray, dt: float) ->
 
 
 def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
-    """Steps, durations and starting values that do not fit."""
+    """Steps, durations and starting values that do not fit.
+
+    Parameters
+    ----------
+    run
+        section of the file
+    time
+        "continuous" or "discrete"
+    agents
+        m; None where the graphs do not tell
+    """
     found = []
     if time == "discrete" and run.dt != 1.0:
         found.append(problem("run.dt", run.dt, "expected 1 in discrete time", "remove run.dt"))
@@ -321,6 +386,21 @@ def memory_needed(
     """Bytes for the states of a run, and for the matrices of all graphs, which a delay makes larger.
 
     Where others hear something else than the states, these are there twice: as they are, and as they were published.
+
+    Parameters
+    ----------
+    agents
+        m
+    modes
+        n
+    steps
+        N
+    replicas
+        numbers of an agent's state
+    delay
+        of values [steps]
+    truth
+        whether states and what is published of them are kept
     """
     states = (steps + 1) * agents * replicas * 8 * (2 if truth else 1)
     return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
@@ -338,7 +418,23 @@ def available_memory() -> int:
 
 
 def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int, truth: bool = False) -> list[str]:
-    """States and matrices that cannot fit in memory."""
+    """States and matrices that cannot fit in memory.
+
+    Parameters
+    ----------
+    agents
+        m
+    modes
+        n
+    steps
+        N
+    replicas
+        numbers of an agent's state
+    delay
+        of values [steps]
+    truth
+        whether states and what is published of them are kept
+    """
     available = available_memory()
     states, matrices = memory_needed(agents, modes, steps, replicas, delay, truth)
     if states + matrices <= available:
@@ -355,7 +451,13 @@ def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: i
 
 
 def amount(size: float) -> str:
-    """A number of bytes for people."""
+    """A number of bytes for people.
+
+    Parameters
+    ----------
+    size
+        in bytes
+    """
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":
             return f"{size:.3g} {unit}"
@@ -364,7 +466,15 @@ def amount(size: float) -> str:
 
 
 def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
-    """(m,) kappa; 0 for followers, inf for grounded leaders."""
+    """(m,) kappa; 0 for followers, inf for grounded leaders.
+
+    Parameters
+    ----------
+    leaders
+        section of the file; None in consensus
+    agents
+        m
+    """
     gains = np.zeros(agents)
     if leaders:
         gains[np.array(leaders.agents) - 1] = leaders.gain

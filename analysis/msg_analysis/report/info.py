@@ -23,6 +23,11 @@ if TYPE_CHECKING:
 def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     """What an experiment says, with what follows from it.
 
+    Parameters
+    ----------
+    experiment
+        checked; it need not be one that can be run
+
     Returns
     -------
     dict[str, Any]
@@ -199,7 +204,13 @@ def _protocol(experiment: Experiment) -> dict[str, Any] | None:
 
 
 def algebraic_connectivity(graph: Graph) -> float:
-    """Second smallest real part of the Laplacian's eigenvalues: how fast agreement comes with this graph."""
+    """Second smallest real part of the Laplacian's eigenvalues: how fast agreement comes with this graph.
+
+    Parameters
+    ----------
+    graph
+        directed or not
+    """
     laplacian = graph.laplacian
     values = np.linalg.eigvalsh(laplacian) if graph.symmetric else np.linalg.eigvals(laplacian)
     return max(float(np.sort(values.real)[1]), 0.0)

@@ -17,7 +17,15 @@ MOST_ROWS = 20
 
 
 def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
-    """The document of ``msg-agents live --json``; keys as in that of ``compare``."""
+    """The document of ``msg-agents live --json``; keys as in that of ``compare``.
+
+    Parameters
+    ----------
+    report
+        newest
+    record
+        of the run that is watched
+    """
     dt = record.experiment.step_length
     return {
         "run": str(record.run),
@@ -51,7 +59,17 @@ def live_line(report: LiveReport, record: RunRecord, rate: float) -> str:
 
 
 def live_table(report: LiveReport, record: RunRecord, rate: float) -> RenderableType:
-    """A table of the errors; arguments as in ``live_line``."""
+    """A table of the errors; arguments as in ``live_line``.
+
+    Parameters
+    ----------
+    report
+        newest
+    record
+        of the run that is watched
+    rate
+        steps per second
+    """
     experiment = record.experiment
     time = max(report.newest, 0) * experiment.step_length
     table = Table(

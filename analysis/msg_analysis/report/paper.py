@@ -111,7 +111,15 @@ class Example:
         return any("reconstruct" in line for line in self.remarks)
 
     def select(self, network: str, quantity: str) -> list[Curve]:
-        """The curves of one network and quantity."""
+        """The curves of one network and quantity.
+
+        Parameters
+        ----------
+        network
+            its name in the paper
+        quantity
+            what is drawn, such as "node certainty"
+        """
         return [curve for curve in self.curves if (curve.network, curve.quantity) == (network, quantity)]
 
 
@@ -120,12 +128,42 @@ Generator = Callable[[float, float, float], FloatArray]
 
 
 def two_graphs(epsilon: float, r12: float, r21: float) -> FloatArray:
-    """The paper's generator of examples 1 and 3."""
+    """The paper's generator of examples 1 and 3.
+
+    Parameters
+    ----------
+    epsilon
+        scale of all rates
+    r12
+        rate from graph 1 to 2, before scaling
+    r21
+        rate from graph 2 to 1
+
+    Returns
+    -------
+    FloatArray
+        (2, 2) generator
+    """
     return epsilon * np.array([[-r12, r12], [r21, -r21]])
 
 
 def three_graphs(epsilon: float, r12: float, r21: float) -> FloatArray:
-    """The paper's generator of example 2: r32 = r12, and r21 = r23 = r2j; no jumps between graphs 1 and 3."""
+    """The paper's generator of example 2: r32 = r12, and r21 = r23 = r2j; no jumps between graphs 1 and 3.
+
+    Parameters
+    ----------
+    epsilon
+        scale of all rates
+    r12
+        rate from graph 1 to 2, and from 3 to 2, before scaling
+    r21
+        rate from graph 2 to 1, and to 3
+
+    Returns
+    -------
+    FloatArray
+        (3, 3) generator
+    """
     return epsilon * np.array([[-r12, r12, 0.0], [r21, -2.0 * r21, r21], [0.0, r12, -r12]])
 
 
@@ -285,7 +323,13 @@ COLUMNS = (
 
 
 def table(example: Example) -> Iterable[tuple[str | int | float, ...]]:
-    """Every point of every curve, one row each, in the order of ``COLUMNS``; agents from 1, 0 for the system."""
+    """Every point of every curve, one row each, in the order of ``COLUMNS``; agents from 1, 0 for the system.
+
+    Parameters
+    ----------
+    example
+        of the paper
+    """
     for curve in example.curves:
         agent = 0 if curve.agent is None else curve.agent + 1
         columns = (curve.epsilon, curve.r12, curve.r21, curve.epsilon * curve.r12, curve.epsilon * curve.r21)
@@ -294,7 +338,15 @@ def table(example: Example) -> Iterable[tuple[str | int | float, ...]]:
 
 
 def order(curves: Sequence[Curve], point: int) -> list[int]:
-    """Agents, from 0, by decreasing value of their curves at one point."""
+    """Agents, from 0, by decreasing value of their curves at one point.
+
+    Parameters
+    ----------
+    curves
+        one for each agent
+    point
+        index of the point
+    """
     ranked = sorted(curves, key=lambda curve: -curve.value[point])
     return [curve.agent for curve in ranked if curve.agent is not None]
 

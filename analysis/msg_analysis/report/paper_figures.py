@@ -106,7 +106,13 @@ def write_figures(numbers: Sequence[int], directory: str | Path, formats: Sequen
 
 
 def csv_text(example: Example) -> str:
-    """The numbers: comment lines that begin with ``#``, a header with units, one row per point."""
+    """The numbers: comment lines that begin with ``#``, a header with units, one row per point.
+
+    Parameters
+    ----------
+    example
+        of the paper
+    """
     text = io.StringIO()
     for line in (f"Example {example.number}: {example.title}", "agent 0 is the system", *example.remarks):
         text.write(f"# {line}\n")

@@ -42,7 +42,7 @@ class Result:
     verdict
         of the comparison
     simulated_time
-        of all runs
+        of all runs [units of simulated time]
     measured, standard_error, low, high, predicted, z
         of the system error; low to high is the 95 % interval
     least_p
@@ -148,7 +148,7 @@ class Merged:
     files
         where they came from
     simulated_time
-        of all
+        of all [units of simulated time]
     measured, standard_error, predicted, z, p
         of the system error; every unit of time counts the same
     """
@@ -164,7 +164,13 @@ class Merged:
 
 
 def merge_results(rows: Sequence[Result]) -> list[Merged]:
-    """System errors of results of the same law, as one; without those that have no number, or an earlier one's seed."""
+    """System errors of results of the same law, as one; without those that have no number, or an earlier one's seed.
+
+    Parameters
+    ----------
+    rows
+        results, whose order decides which of two with one seed counts
+    """
     groups: dict[str, list[Result]] = {}
     for row in rows:
         if row.identity is None or row.measured is None or row.predicted is None or not row.standard_error:
@@ -193,6 +199,13 @@ def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
 
     Where every row has a leader, or leaders, of infinite gain, that is the order of their joint robustness centrality.
     None where not all rows have a measured error, or there is only one.
+
+    Parameters
+    ----------
+    rows
+        results of independent runs
+    level
+        chance of telling any two apart wrongly
     """
     errors = [(row.measured, row.standard_error) for row in rows]
     known = [(measured, error) for measured, error in errors if measured is not None and error is not None]
@@ -206,7 +219,15 @@ def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
 
 
 def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
-    """The document: ``results``, ``merged``, and ``order``, whose numbers are places among the results, from 1."""
+    """The document: ``results``, ``merged``, and ``order``, whose numbers are places among the results, from 1.
+
+    Parameters
+    ----------
+    rows
+        results
+    level
+        chance of telling any two apart wrongly
+    """
     order = order_of_results(rows, level)
     return {
         "results": [asdict(row) for row in rows],
@@ -216,7 +237,13 @@ def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
 
 
 def to_csv(rows: Sequence[Result]) -> str:
-    """A line for each result, under the names of the columns; all digits."""
+    """A line for each result, under the names of the columns; all digits.
+
+    Parameters
+    ----------
+    rows
+        results
+    """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([field.name for field in fields(Result)])
@@ -226,7 +253,13 @@ def to_csv(rows: Sequence[Result]) -> str:
 
 
 def to_markdown(rows: Sequence[Result]) -> str:
-    """A table for a text."""
+    """A table for a text.
+
+    Parameters
+    ----------
+    rows
+        results
+    """
     heads, body = _shown(rows)
     return markdown_table(heads, body, names=4)
 

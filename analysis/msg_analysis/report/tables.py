@@ -16,7 +16,19 @@ ROWS = 30
 
 
 def number_table(console: Console, title: str, first: str, *numbers: str) -> Table:
-    """A table under its heading: one column of names, the others of numbers."""
+    """A table under its heading: one column of names, the others of numbers.
+
+    Parameters
+    ----------
+    console
+        where the heading goes
+    title
+        of the table
+    first
+        head of the column of names
+    *numbers
+        heads of the other columns
+    """
     console.print(Text(title, style="bold"))
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column(Text(first))
@@ -26,7 +38,15 @@ def number_table(console: Console, title: str, first: str, *numbers: str) -> Tab
 
 
 def fact_table(console: Console, title: str) -> Table:
-    """A table of names and what they are, under its heading."""
+    """A table of names and what they are, under its heading.
+
+    Parameters
+    ----------
+    console
+        where the heading goes
+    title
+        of the table
+    """
     console.print(Text(title, style="bold"))
     table = Table(box=box.SIMPLE, show_header=False)
     table.add_column(style="dim", no_wrap=True)
@@ -35,23 +55,51 @@ def fact_table(console: Console, title: str) -> Table:
 
 
 def note_cut(table: Table, total: int, what: str) -> None:
-    """Say how many rows of the total are not shown."""
+    """Say how many rows of the total are not shown.
+
+    Parameters
+    ----------
+    table
+        that shows the first ``ROWS``
+    total
+        number of rows
+    what
+        the rows are
+    """
     if total > ROWS:
         table.caption = f"{total - ROWS} more {what}: use --json"
 
 
 def z_text(value: float | None) -> str:
-    """With its sign."""
+    """With its sign.
+
+    Parameters
+    ----------
+    value
+        z, if there is one
+    """
     return "-" if value is None else f"{value:+.2f}"
 
 
 def p_text(value: float | None) -> str:
-    """Three digits."""
+    """Three digits.
+
+    Parameters
+    ----------
+    value
+        p, if there is one
+    """
     return "-" if value is None else f"{value:.3g}"
 
 
 def interval_text(interval: Sequence[float | None] | None) -> str:
-    """Low .. high."""
+    """Low .. high.
+
+    Parameters
+    ----------
+    interval
+        low and high, if known
+    """
     if not interval or None in interval:
         return "-"
     return f"{number_text(interval[0])} .. {number_text(interval[1])}"

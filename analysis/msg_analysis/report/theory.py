@@ -31,6 +31,16 @@ Result = TypeVar("Result")
 def parse_times(text: str) -> FloatArray:
     """Times from ``START:STOP:STEP`` (STOP included) or ``t1,t2,...``.
 
+    Parameters
+    ----------
+    text
+        as on the command line
+
+    Returns
+    -------
+    FloatArray
+        (T,) [units of simulated time]
+
     Raises
     ------
     InputError
@@ -223,6 +233,11 @@ def _settling(
 def describe_facts(experiment: Experiment) -> dict[str, Any]:
     """The lemmas on eigenvalues checked, bounds of the error, indices of the graphs, two graphs in closed form.
 
+    Parameters
+    ----------
+    experiment
+        to check
+
     Returns
     -------
     dict[str, Any]
@@ -267,6 +282,11 @@ def write_transient_csv(document: dict[str, Any], path: Path) -> None:
         of ``describe_transient``
     path
         of the CSV file
+
+    Raises
+    ------
+    InputError
+        the file cannot be written
     """
     system, nodes = _mean_squares(document)
     agents = range(1, document["agents"] + 1)

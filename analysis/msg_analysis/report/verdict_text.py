@@ -12,13 +12,27 @@ from msg_analysis.report.tables import ROWS, note_cut, number_table, number_text
 
 
 def print_blame(document: dict[str, Any], console: Console) -> None:
-    """What is wrong, a sentence each."""
+    """What is wrong, a sentence each.
+
+    Parameters
+    ----------
+    document
+        of ``Comparison.to_json()``
+    console
+        where to print
+    """
     for cause in (document.get("blame") or [])[:ROWS]:
         console.print(Text(f"{sentence(cause['words'])}"), style="bold red")
 
 
 def sentence(words: str) -> str:
-    """With a capital letter and a full stop."""
+    """With a capital letter and a full stop.
+
+    Parameters
+    ----------
+    words
+        without them
+    """
     return f"{words[:1].upper()}{words[1:]}."
 
 
@@ -28,7 +42,15 @@ def _agents_first(words: str) -> str:
 
 
 def print_bags(document: dict[str, Any], console: Console) -> None:
-    """The runs of a pooled comparison."""
+    """The runs of a pooled comparison.
+
+    Parameters
+    ----------
+    document
+        of ``Comparison.to_json()``
+    console
+        where to print
+    """
     bags = document.get("bags") or []
     if not bags:
         return
@@ -52,7 +74,15 @@ def print_bags(document: dict[str, Any], console: Console) -> None:
 
 
 def print_order(document: dict[str, Any], console: Console) -> None:
-    """Which agents are more certain than which."""
+    """Which agents are more certain than which.
+
+    Parameters
+    ----------
+    document
+        of ``Comparison.to_json()``
+    console
+        where to print
+    """
     order = document.get("order")
     if order:
         agents = len(document["node_errors"])

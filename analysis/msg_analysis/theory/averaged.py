@@ -12,6 +12,8 @@ and with a reversible chain it is self-adjoint. With d_i = D_i - L, L the eigenv
 
 It takes more iterations than the two-level preconditioner, at a fifth of the work each or less, and no eigenvectors of
 single graphs.
+
+docs/accuracy.md says when it is used.
 """
 
 from __future__ import annotations
@@ -38,7 +40,13 @@ NEGLIGIBLE = 3.0
 
 
 def suitable(equations: CoupledEquations) -> bool:
-    """Whether M is positive, single precision will do, and the graphs do not switch too slowly for this to pay."""
+    """Whether M is positive, single precision will do, and the graphs do not switch too slowly for this to pay.
+
+    Parameters
+    ----------
+    equations
+        in continuous time or not
+    """
     whole = equations.whole
     if not (equations.symmetric and whole.mild and equations.leaving.min() >= SLOWEST * equations.decay.mean()):
         return False
@@ -53,6 +61,11 @@ def suitable(equations: CoupledEquations) -> bool:
 
 class AveragedEquations:
     """I + S. Its unknowns are U = M^1/2 X, its right-hand sides M^-1/2 B, in the eigenvectors of average and chain.
+
+    Parameters
+    ----------
+    equations
+        ``suitable`` ones
 
     Attributes
     ----------
@@ -99,7 +112,15 @@ class AveragedEquations:
             self._lower[:, diagonal, diagonal] += self._kept
 
     def enter(self, matrices: FloatArray, scale: FloatArray) -> FloatArray:
-        """M^-1/2 B / scale, from (q, n, d, d) right-hand sides of the equations and (q,) scales."""
+        """M^-1/2 B / scale, from (q, n, d, d) right-hand sides of the equations and (q,) scales.
+
+        Parameters
+        ----------
+        matrices
+            (q, n, d, d) B
+        scale
+            (q,) by which they are divided
+        """
         given = matrices[:, :1] if (matrices == matrices[:, :1]).all() else matrices
         factors = self._enter if given is matrices else self._enter.sum(axis=1, keepdims=True)
         inside = self._workspace(matrices.shape)[0][:, : given.shape[1]]
@@ -111,21 +132,55 @@ class AveragedEquations:
         return right
 
     def solution(self, scaled: FloatArray) -> FloatArray:
-        """X = M^-1/2 U, in the eigenvectors of the average; the next call of any method overwrites it."""
+        """X = M^-1/2 U, in the eigenvectors of the average; the next call of any method overwrites it.
+
+        Parameters
+        ----------
+        scaled
+            (q, n, d, d) U
+
+        Returns
+        -------
+        FloatArray
+            (q, n, d, d)
+        """
         x = self._workspace(scaled.shape)[0]
         for part in self._strips:
             np.matmul(self._back, self._scale[:, part] * flat(scaled)[..., part], out=flat(x)[..., part])
         return x
 
     def leave(self, scaled: FloatArray, scale: FloatArray, total: FloatArray) -> None:
-        """Add X times the scale to solutions of the equations."""
+        """Add X times the scale to solutions of the equations.
+
+        Parameters
+        ----------
+        scaled
+            (q, n, d, d) U
+        scale
+            (q,) by which X is multiplied
+        total
+            (q, n, d, d), is changed
+        """
         solution = self.solution(scaled)
         for place in np.ndindex(solution.shape[:2]):
             moved = self._vectors @ solution[place] @ self._vectors.T
             total[place] += 0.5 * scale[place[0]] * (moved + moved.T).astype(float)
 
     def apply(self, x: FloatArray, accuracy: float = 0.0) -> FloatArray:
-        """(I + S) X, about as accurate as asked for, relative to X; the next call of any method overwrites it."""
+        """(I + S) X, about as accurate as asked for, relative to X; the next call of any method overwrites it.
+
+        Parameters
+        ----------
+        x
+            (q, n, d, d)
+        accuracy
+            relative error that is let through
+
+        Returns
+        -------
+        FloatArray
+            (q, n, d, d)
+        """
         z, half = self.solution(x), self._workspace(x.shape)[1]
         np.matmul(self._distance, z, out=half)
         if self._discrete:
@@ -140,7 +195,18 @@ class AveragedEquations:
         return half
 
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(R, (I + S) R): nothing is left to precondition."""
+        """(R, (I + S) R): nothing is left to precondition.
+
+        Parameters
+        ----------
+        right
+            (q, n, d, d) R
+
+        Returns
+        -------
+        tuple[FloatArray, FloatArray]
+            two of the same shape
+        """
         return right, self.apply(right)
 
     def _second(self, half: FloatArray, out: FloatArray, accuracy: float) -> FloatArray:

@@ -1,6 +1,8 @@
 """The coupled equations as one dense matrix on the half-vectorised unknowns: the reference for small systems.
 
 One LU factorisation serves the steady moments and every dual. The cost is that of (n d (d + 1) / 2)^3 operations.
+
+The equations are those of Propositions 3 to 5 of the paper; docs/accuracy.md says when they are solved so.
 """
 
 from __future__ import annotations
@@ -84,7 +86,13 @@ class DenseSolver:
         return symmetric.unpack(solution.reshape(self._shape), system.dimension)
 
     def dual(self, forms: FloatArray) -> FloatArray:
-        """See ``MomentSolver.dual``."""
+        """See ``MomentSolver.dual``.
+
+        Parameters
+        ----------
+        forms
+            (q, d, d) symmetric H
+        """
         n, p = self._shape
         right = np.tile(symmetric.pack(forms), (1, n)).T
         solution, _ = self._solve(right, trans=1)

@@ -69,6 +69,11 @@ class CoupledEquations:
 
     Stacks of matrices are (q, n, d, d): q right-hand sides at once.
 
+    Parameters
+    ----------
+    forward
+        equations that these are the adjoint of; None: these are not
+
     Attributes
     ----------
     system
@@ -91,6 +96,11 @@ class CoupledEquations:
         whether the chain is
     whole
         solves of the average of all graphs
+
+    Raises
+    ------
+    InputError
+        a graph's own equations are singular
     """
 
     def __init__(self, system: JumpSystem, forward: CoupledEquations | None = None) -> None:
@@ -153,7 +163,13 @@ class CoupledEquations:
         return np.asarray(np.abs(np.diagonal(self.whole.drift[0])))
 
     def apply(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(A X, size): as accurately as rounding lets it be, and (q, n) norms of what was added up."""
+        """(A X, size): as accurately as rounding lets it be, and (q, n) norms of what was added up.
+
+        Parameters
+        ----------
+        x
+            (q, n, d, d) X
+        """
         total, moved = self._local(x)
         if self.leaving.max() <= FAST * self.decay.mean():
             _subtract_combined(total, self.rates - np.diag(self.leaving), moved)
@@ -166,7 +182,13 @@ class CoupledEquations:
         return total, size * given + given @ self.rates.T
 
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(Z, A Z) for Z near A^-1 R."""
+        """(Z, A Z) for Z near A^-1 R.
+
+        Parameters
+        ----------
+        right
+            (q, n, d, d) R
+        """
         z, moved = self.modes(right)
         rest = self._mixed(moved)  # R - A Z
         if self.system.loss_variance is not None:
@@ -174,7 +196,13 @@ class CoupledEquations:
         return self._averaged(z, rest, right)
 
     def average(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(Z, A Z) for the Z common to all graphs that leaves a residual of mean zero."""
+        """(Z, A Z) for the Z common to all graphs that leaves a residual of mean zero.
+
+        Parameters
+        ----------
+        right
+            (q, n, d, d) R
+        """
         return self._averaged(np.zeros_like(right), right.copy(), right)
 
     def _averaged(self, z: FloatArray, rest: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -220,11 +248,33 @@ class CoupledEquations:
         return local, np.subtract(x, local, out=half)
 
     def moved(self, x: FloatArray) -> FloatArray:
-        """K[X], or its adjoint. Discrete time."""
+        """K[X], or its adjoint. Discrete time.
+
+        Parameters
+        ----------
+        x
+            (q, n, d, d) X
+
+        Returns
+        -------
+        FloatArray
+            (q, n, d, d)
+        """
         return self._local(x)[1]
 
     def after_jump(self, y: FloatArray) -> FloatArray:
-        """sum_j T_ij Y_j. Discrete time."""
+        """sum_j T_ij Y_j. Discrete time.
+
+        Parameters
+        ----------
+        y
+            (q, n, d, d) Y
+
+        Returns
+        -------
+        FloatArray
+            (q, n, d, d)
+        """
         if (y == y[:, :1]).all():
             return y
         return np.asarray(self._mixed(y) + (1.0 - self.leaving)[:, None, None] * y)

@@ -87,6 +87,11 @@ def check_facts(experiment: Experiment) -> list[Fact]:
     everybody. Leaders of infinite gain are deleted. Of a linear protocol, what holds of W = exp(-Z) in discrete time is
     checked of its steps.
 
+    Parameters
+    ----------
+    experiment
+        with n m^2 up to ``MAX_UNKNOWNS``
+
     Raises
     ------
     InputError

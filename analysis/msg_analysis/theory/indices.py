@@ -1,6 +1,8 @@
 """Indices of the single graphs, for comparison, and bounds between which switching can move the system error.
 
 The errors and certainties themselves are properties of ``prediction.Moments``.
+
+Kirchhoff index: Klein and Randić (1993); information centrality: Stephenson and Zelen (1989); bounds: docs/theory.md.
 """
 
 from __future__ import annotations
@@ -54,6 +56,11 @@ def graph_indices(graph: Graph) -> GraphIndices | None:
     """Kirchhoff index and information centrality; None for a directed or disconnected graph.
 
     From r_uv = L^+_uu + L^+_vv - 2 L^+_uv: sum_v r_uv = m L^+_uu + tr(L^+).
+
+    Parameters
+    ----------
+    graph
+        weighted or not
     """
     if not graph.symmetric or not nx.is_connected(nx.from_numpy_array(graph.adjacency)):
         return None
@@ -101,6 +108,11 @@ def error_bounds(prediction: Prediction) -> Bounds:
 
     In discrete time the averaged graph is no lower bound: graphs that alternate can do better than independent draws.
     With unequal or correlated noise, or directed graphs, E can lie outside on both sides.
+
+    Parameters
+    ----------
+    prediction
+        of an experiment
     """
     experiment = prediction.experiment
     if experiment.protocol:
@@ -127,7 +139,13 @@ def error_bounds(prediction: Prediction) -> Bounds:
 
 
 def averaged(system: JumpSystem) -> JumpSystem:
-    """The limit of infinitely fast switching in continuous time: one graph, with Z and Q averaged over pi."""
+    """The limit of infinitely fast switching in continuous time: one graph, with Z and Q averaged over pi.
+
+    Parameters
+    ----------
+    system
+        in continuous time
+    """
     weights = system.stationary[:, None, None]
     return JumpSystem(
         time=system.time,

@@ -3,6 +3,8 @@
 Every cycle ends with the residual of the equations as they were given; so neither the Krylov recurrences nor the
 eigenvectors limit the accuracy. A solution is good when the correction that one more preconditioned step would make is
 small in every graph: unlike the residual this does not drown in the rounding of large rates.
+
+docs/accuracy.md has what comes of it.
 """
 
 from __future__ import annotations
@@ -75,7 +77,13 @@ class IterativeSolver:
         return np.asarray(np.multiply(weights, x[0], out=x[0]))
 
     def dual(self, forms: FloatArray) -> FloatArray:
-        """See ``MomentSolver.dual``."""
+        """See ``MomentSolver.dual``.
+
+        Parameters
+        ----------
+        forms
+            (q, d, d) symmetric H
+        """
         system = self._equations.system
         if self._adjoint is None:
             self._adjoint = self._equations.adjoint()

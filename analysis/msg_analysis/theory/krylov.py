@@ -1,4 +1,8 @@
-"""Krylov methods for stacks of equations: every right-hand side has its own, and all take their steps together."""
+"""Krylov methods for stacks of equations: every right-hand side has its own, and all take their steps together.
+
+Conjugate gradients after Hestenes and Stiefel (1952), GMRES after Saad and Schultz (1986); docs/accuracy.md has what
+they are used for.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,13 @@ class Preconditioned(Protocol):
     """A X = B with a preconditioner; stacks are (q, n, d, d)."""
 
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(Z, A Z) for Z near A^-1 R."""
+        """(Z, A Z) for Z near A^-1 R.
+
+        Parameters
+        ----------
+        right
+            (q, n, d, d) R
+        """
 
 
 class Equations(Preconditioned, Protocol):
@@ -33,7 +43,13 @@ class Equations(Preconditioned, Protocol):
     definite: bool
 
     def average(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(Z, A Z) for a start Z from which the preconditioner acts as a symmetric one."""
+        """(Z, A Z) for a start Z from which the preconditioner acts as a symmetric one.
+
+        Parameters
+        ----------
+        right
+            (q, n, d, d) R
+        """
 
 
 def conjugate_gradients(
@@ -175,17 +191,35 @@ def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, m
 
 
 def flat(stack: FloatArray) -> FloatArray:
-    """(q, n, d^2)."""
+    """(q, n, d^2).
+
+    Parameters
+    ----------
+    stack
+        (q, n, d, d)
+    """
     return stack.reshape(*stack.shape[:2], -1)
 
 
 def strips(length: int) -> list[slice]:
-    """Pieces of flat stacks that stay in the caches while they are worked on."""
+    """Pieces of flat stacks that stay in the caches while they are worked on.
+
+    Parameters
+    ----------
+    length
+        numbers of a row of a flat stack
+    """
     return [slice(first, first + STRIP) for first in range(0, length, STRIP)]
 
 
 def norms(a: FloatArray) -> FloatArray:
-    """(q, n): of every matrix."""
+    """(q, n): of every matrix.
+
+    Parameters
+    ----------
+    a
+        (q, n, d, d) matrices A
+    """
     return np.asarray(np.sqrt(np.einsum("qnab,qnab->qn", a, a)))
 
 
@@ -197,7 +231,15 @@ def _product(a: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def weighted_norm(a: FloatArray, weights: FloatArray) -> FloatArray:
-    """(q,): sqrt(sum_i pi_i |A_i|^2)."""
+    """(q,): sqrt(sum_i pi_i |A_i|^2).
+
+    Parameters
+    ----------
+    a
+        (q, n, d, d) matrices A
+    weights
+        (n,) pi
+    """
     return np.asarray(np.sqrt(_product(a, a, weights)))
 
 

@@ -45,11 +45,23 @@ class SetFunction(Protocol):
         ...
 
     def unreached(self, leaders: Leaders) -> int:
-        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0."""
+        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0.
+
+        Parameters
+        ----------
+        leaders
+            set S of agents, from 0
+        """
         ...
 
     def system_error(self, leaders: Leaders) -> float:
-        """E(S) of a set that reaches everybody."""
+        """E(S) of a set that reaches everybody.
+
+        Parameters
+        ----------
+        leaders
+            set S of agents, from 0
+        """
         ...
 
 

@@ -1,4 +1,7 @@
-"""Leaders: what a set of them is worth (joint robustness centrality), and which set is best."""
+"""Leaders: what a set of them is worth (joint robustness centrality), and which set is best.
+
+After the paper's section on robustness and leadership indices; docs/leaders.md has the bounds.
+"""
 
 from __future__ import annotations
 
@@ -92,11 +95,23 @@ class LeaderProblem:
         return np.asarray(np.isfinite(distances))
 
     def unreached(self, leaders: Leaders) -> int:
-        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0."""
+        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0.
+
+        Parameters
+        ----------
+        leaders
+            set S of agents, from 0
+        """
         return int((~self._reach[sorted(leaders)].any(axis=0)).sum())
 
     def system(self, leaders: Leaders) -> JumpSystem:
-        """The reduced system with these leaders: for infinite gain their rows and columns are deleted."""
+        """The reduced system with these leaders: for infinite gain their rows and columns are deleted.
+
+        Parameters
+        ----------
+        leaders
+            set S of agents, from 0
+        """
         return self._system(leaders, self.gain)
 
     def system_error(self, leaders: Leaders) -> float:
@@ -197,6 +212,8 @@ def resolve_law(experiment: Experiment, law: Law | None = None) -> Law:
 
     Parameters
     ----------
+    experiment
+        in continuous or discrete time
     law
         None for the paper's where the experiment has it, else that of the run's steps
 

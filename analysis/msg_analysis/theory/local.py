@@ -7,6 +7,8 @@ For each of k systems with the matrix D (Z in continuous time, I - W in discrete
 
 With the eigenvectors of D this is a division, entry by entry, between products of matrices. Symmetric matrices
 always have them; others use them if they are well conditioned, and the complex Schur form if they are not.
+
+The Schur form is that of Bartels and Stewart (1972).
 """
 
 from __future__ import annotations
@@ -147,7 +149,18 @@ class LocalSolves:
         return found if np.isfinite(found) else np.inf
 
     def without_null(self, matrices: FloatArray) -> FloatArray:
-        """(..., k, d, d) with the directions removed in which D is zero but for rounding."""
+        """(..., k, d, d) with the directions removed in which D is zero but for rounding.
+
+        Parameters
+        ----------
+        matrices
+            (..., k, d, d)
+
+        Returns
+        -------
+        FloatArray
+            of the same shape
+        """
         if self.eigenvectors is None or not self._null.any():
             return matrices
         _, vectors, inverse = self.eigenvectors
@@ -177,7 +190,18 @@ def _eigenvectors(drift: FloatArray, *, symmetric: bool) -> Eigenvectors | None:
 
 
 def single(array: AnyArray) -> AnyArray:
-    """The same in single precision."""
+    """The same in single precision.
+
+    Parameters
+    ----------
+    array
+        of any shape
+
+    Returns
+    -------
+    AnyArray
+        of the same shape
+    """
     return array.astype(np.complex64 if np.iscomplexobj(array) else np.float32)
 
 

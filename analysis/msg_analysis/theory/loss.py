@@ -1,6 +1,8 @@
 """What lost messages add to a step's map of second moments, and the adjoint of that, matrix-free.
 
 A message from j to i that may be lost adds variance_ij E[(x_i - x_j)^2] to the second moment of agent i.
+
+The map is that of docs/theory.md, "Beyond the paper".
 """
 
 from __future__ import annotations
@@ -21,6 +23,11 @@ def lost(lift: FloatArray, variance: FloatArray, moments: FloatArray) -> FloatAr
         (n, m, m), or (m, m) for one graph; see ``StepModel.loss_variance``
     moments
         (..., n, d, d) symmetric C
+
+    Returns
+    -------
+    FloatArray
+        of the same shape
     """
     full = lift @ moments @ lift.T
     own = np.diagonal(full, axis1=-2, axis2=-1)
@@ -40,6 +47,11 @@ def lost_adjoint(lift: FloatArray, variance: FloatArray, forms: FloatArray) -> F
         (n, m, m), or (m, m) for one graph
     forms
         (..., n, d, d) symmetric Y
+
+    Returns
+    -------
+    FloatArray
+        of the same shape
     """
     seen = variance * ((lift @ forms) * lift).sum(axis=-1)[..., None]
     laplacian = -(seen + seen.swapaxes(-1, -2))

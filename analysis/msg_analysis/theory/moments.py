@@ -1,4 +1,8 @@
-"""Second moments of jump linear systems: steady, dual (adjoint) and transient."""
+"""Second moments of jump linear systems: steady, dual (adjoint) and transient.
+
+Propositions 3 to 5 of the paper and its appendix; in general, Costa, Fragoso and Marques, Discrete-Time Markov Jump
+Linear Systems (2005).
+"""
 
 from __future__ import annotations
 

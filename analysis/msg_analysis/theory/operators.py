@@ -2,6 +2,8 @@
 
 Dense, so for small systems. Symmetric matrices are vectors of their p = d (d + 1) / 2 free entries, see
 ``symmetric``.
+
+These are the paper's M and N, in discrete time its A and H, on packed moments and means.
 """
 
 from __future__ import annotations
@@ -15,7 +17,13 @@ from msg_analysis.types import FloatArray
 
 
 def mode_operators(system: JumpSystem) -> FloatArray:
-    """(n, p, p) matrices of C -> Z_i C + C Z_i^T (continuous time) or of C -> C - K_i[C] (discrete time)."""
+    """(n, p, p) matrices of C -> Z_i C + C Z_i^T (continuous time) or of C -> C - K_i[C] (discrete time).
+
+    Parameters
+    ----------
+    system
+        small enough for matrices of (d (d + 1) / 2)^2 entries for each graph
+    """
     if system.time == "continuous":
         return np.stack([symmetric.lyapunov(z) for z in system.matrices])
     p = symmetric.size(system.dimension)
@@ -27,7 +35,13 @@ def mode_operators(system: JumpSystem) -> FloatArray:
 
 
 def second_moment_propagator(system: JumpSystem) -> Propagator:
-    """Of the stack (n, p + 1) of packed C_i above pi_i: the equations for c(t) and pi(t) in one, noise included."""
+    """Of the stack (n, p + 1) of packed C_i above pi_i: the equations for c(t) and pi(t) in one, noise included.
+
+    Parameters
+    ----------
+    system
+        small enough for matrices of (d (d + 1) / 2)^2 entries for each graph
+    """
     n, p = system.modes, symmetric.size(system.dimension)
     local = np.zeros((n, p + 1, p + 1))
     local[:, :p, :p] = -mode_operators(system)
@@ -36,12 +50,24 @@ def second_moment_propagator(system: JumpSystem) -> Propagator:
 
 
 def homogeneous_propagator(system: JumpSystem) -> Propagator:
-    """Of the stack (n, p) of packed C_i without noise: exp(-M t), or A^k."""
+    """Of the stack (n, p) of packed C_i without noise: exp(-M t), or A^k.
+
+    Parameters
+    ----------
+    system
+        small enough for matrices of (d (d + 1) / 2)^2 entries for each graph
+    """
     return Propagator(system.time, system.chain, system.stationary, -mode_operators(system))
 
 
 def mean_propagator(system: JumpSystem) -> Propagator:
-    """Of the stack nu (n, d) of means: exp(-N t), or H^k."""
+    """Of the stack nu (n, d) of means: exp(-N t), or H^k.
+
+    Parameters
+    ----------
+    system
+        continuous or discrete
+    """
     discrete = system.time == "discrete"
     local = system.matrices - np.eye(system.dimension) if discrete else -system.matrices
     return Propagator(system.time, system.chain, system.stationary, local)

@@ -1,4 +1,7 @@
-"""What theory says about an experiment: in continuous time, for the run's steps, and without switching."""
+"""What theory says about an experiment: in continuous time, for the run's steps, and without switching.
+
+Propositions 3 to 5 of the paper and their discrete twins; for the steps of a run, docs/theory.md.
+"""
 
 from __future__ import annotations
 
@@ -176,6 +179,11 @@ class Prediction:
 
 def predict(experiment: Experiment) -> Prediction:
     """Steady-state prediction of an experiment (Propositions 3 to 5 of the paper and their discrete twins).
+
+    Parameters
+    ----------
+    experiment
+        whose law is linear
 
     Raises
     ------

@@ -6,6 +6,8 @@ Two things keep slow motion accurate beside rates that are many orders faster. T
 what each is away from its share of it: the chain moves nothing between modes in the sum, and drops out of it exactly.
 And powers are kept as what they change, E in z -> z + E z, as long as little of z dies out: then 2 E + E^2 is the
 square of it, and small changes are not lost beside 1.
+
+docs/theory.md, "Transients", has what comes of it.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ class Power:
     Attributes
     ----------
     matrix
-        E or P
+        (k, k) E or P
     change
         whether the map is z + E z; otherwise P z, which is better once nearly everything has died out
     """
@@ -47,7 +49,13 @@ class Power:
         return np.asarray(z + moved if self.change else moved)
 
     def then(self, other: Power) -> Power:
-        """Both maps, one after the other (they commute)."""
+        """Both maps, one after the other (they commute).
+
+        Parameters
+        ----------
+        other
+            of the same flow
+        """
         if self.change and other.change:
             change = self.matrix + other.matrix + other.matrix @ self.matrix
             whole = change + np.eye(len(change))
@@ -91,15 +99,43 @@ class Flow:
         return -0.5 * math.log1p(growth) if growth > -1.0 else math.inf
 
     def rotated(self, z: FloatArray) -> FloatArray:
-        """Coordinates in which the powers work."""
+        """Coordinates in which the powers work.
+
+        Parameters
+        ----------
+        z
+            as the flow has them, such as (n, p + 1)
+
+        Returns
+        -------
+        FloatArray
+            of the shape that the powers work on
+        """
         return z
 
     def restored(self, y: FloatArray) -> FloatArray:
-        """What has these coordinates."""
+        """What has these coordinates.
+
+        Parameters
+        ----------
+        y
+            of the shape that ``rotated`` gives
+
+        Returns
+        -------
+        FloatArray
+            of the shape of z
+        """
         return y
 
     def over(self, duration: float) -> Power:
-        """The map from z(0) to z(duration)."""
+        """The map from z(0) to z(duration).
+
+        Parameters
+        ----------
+        duration
+            [units of time, or steps]
+        """
         if self._time == "discrete":
             result, left = Power(np.zeros_like(self._matrix)), round(duration)
             for power in self.doublings():
@@ -127,7 +163,20 @@ class Flow:
             power = power.then(power)
 
     def grid(self, start: FloatArray, times: FloatArray) -> FloatArray:
-        """(T, ...) at ascending times, from z(0) = start."""
+        """(T, ...) at ascending times, from z(0) = start.
+
+        Parameters
+        ----------
+        start
+            z(0), of the shape that the flow moves, such as (n, p + 1)
+        times
+            (T,) ascending [units of time, or steps]
+
+        Returns
+        -------
+        FloatArray
+            (T, n, p + 1) where z is (n, p + 1)
+        """
         # Differences of a uniform grid differ in their last bits; they share one power.
         unit = 16.0 * np.finfo(float).eps * float(times[-1]) or 1.0
         y, now = self.rotated(start), 0.0

@@ -175,7 +175,15 @@ def _course(matrix: FloatArray, first: float, last: float) -> FloatArray:
 
 
 def slowest_rate(system: JumpSystem, steady: FloatArray) -> float:
-    """Rate of the slowest part of second moments and graph, roughly: inverse iteration from the steady state."""
+    """Rate of the slowest part of second moments and graph, roughly: inverse iteration from the steady state.
+
+    Parameters
+    ----------
+    system
+        in continuous time
+    steady
+        (n, d, d) steady second moments
+    """
     moments, rate = steady, math.inf
     for _ in range(4):
         before = np.linalg.norm(moments)

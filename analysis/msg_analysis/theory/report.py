@@ -1,4 +1,7 @@
-"""How a solve went, and what is said if it did not go well."""
+"""How a solve went, and what is said if it did not go well.
+
+docs/accuracy.md says what the numbers mean.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,13 @@ class SolverReport:
 
 
 def singular_message(reason: str = "") -> str:
-    """What is said of equations that have no solution, or none that can be trusted."""
+    """What is said of equations that have no solution, or none that can be trusted.
+
+    Parameters
+    ----------
+    reason
+        what is known of it, put behind "singular"
+    """
     return (
         f"second moments: the equations are (nearly) singular{reason}, so the errors grow without bound or cannot be "
         "computed: check that the union of the graphs connects everybody and that the rates do not differ by many "

@@ -4,6 +4,9 @@ The end of a transient is certain, not guessed: if at some time -f C_i <= D_i <=
 of the second moments from their steady state C) and |pi_i(t) - pi_i| <= f pi_i, then this holds for ever, because
 both maps are positive and have (C, pi) as their fixed point. So the system error stays within the fraction f from then
 on, and only the time before has to be searched.
+
+That the maps are positive: Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear Systems (2005); docs/theory.md,
+"Transients", has the rest.
 """
 
 from __future__ import annotations

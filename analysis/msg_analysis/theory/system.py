@@ -1,4 +1,8 @@
-"""Reduced Markov jump linear systems: the states in which second moments stay finite."""
+"""Reduced Markov jump linear systems: the states in which second moments stay finite.
+
+The paper's sections III (consensus) and IV (tracking), and its appendix in discrete time; for the steps of a run,
+docs/theory.md.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +43,7 @@ class JumpSystem:
     stationary
         (n,) pi
     lift
-        (len(s), d), columns orthonormal, so that y = lift^T (s - what s should be)
+        (k, d) for k numbers s, columns orthonormal, so that y = lift^T (s - what s should be)
     loss_variance
         (n, len(s), len(s)) or None; see ``StepModel.loss_variance``. Discrete time only
     readout
@@ -71,19 +75,46 @@ class JumpSystem:
         return self.lift if self.readout is None else self.readout
 
     def lifted(self, moments: FloatArray) -> FloatArray:
-        """(..., m, m) of (..., d, d): second moments of the agents from those of the reduced coordinates."""
+        """(..., m, m) of (..., d, d): second moments of the agents from those of the reduced coordinates.
+
+        Parameters
+        ----------
+        moments
+            (..., d, d) of y y^T
+
+        Returns
+        -------
+        FloatArray
+            (..., m, m)
+        """
         return np.asarray(self.output @ moments @ self.output.T)
 
     def reduced(self, deviations: FloatArray) -> FloatArray:
         """(..., d) of (..., m): reduced coordinates of deviations; in consensus, of the states.
 
         With a delay, the earlier states are taken to be the same.
+
+        Parameters
+        ----------
+        deviations
+            (..., m) of the agents from what they should be
+
+        Returns
+        -------
+        FloatArray
+            (..., d)
         """
         lift = self.lift.reshape(-1, deviations.shape[-1], self.dimension).sum(axis=0)
         return np.asarray(deviations @ lift)
 
     def propagate(self, moments: FloatArray) -> FloatArray:
-        """(n, d, d): K_j[C_j] = E[W C_j W^T | mode j] for every mode. Discrete time."""
+        """(n, d, d): K_j[C_j] = E[W C_j W^T | mode j] for every mode. Discrete time.
+
+        Parameters
+        ----------
+        moments
+            (n, d, d) C_j
+        """
         after = self.matrices @ moments @ self.matrices.transpose(0, 2, 1)
         if self.loss_variance is not None:
             full = self.lift @ moments @ self.lift.T
@@ -104,6 +135,11 @@ class JumpSystem:
             (n, d, d) C_i(k) = E[y y^T; mode i]
         law
             (n,) of g(k)
+
+        Returns
+        -------
+        tuple[FloatArray, FloatArray]
+            moments (n, d, d) and law (n,) one step later
         """
         after = self.propagate(moments) + law[:, None, None] * self.noise
         return np.tensordot(self.chain, after, axes=(0, 0)), law @ self.chain
@@ -159,6 +195,11 @@ def continuous(experiment: Experiment) -> JumpSystem:
 
     Leaders of infinite gain are the exact limit: their rows and columns are deleted, ``lift`` puts the zeros
     back. Noise on the air, lost and late messages belong to steps; they have no place here.
+
+    Parameters
+    ----------
+    experiment
+        in continuous time, without protocol, loss, delay or noise on the air
     """
     gains = experiment.leader_gains
     follows = np.isfinite(gains)
@@ -177,7 +218,15 @@ def continuous(experiment: Experiment) -> JumpSystem:
 
 
 def held(system: JumpSystem, mode: int) -> JumpSystem:
-    """The same system with one graph held for ever."""
+    """The same system with one graph held for ever.
+
+    Parameters
+    ----------
+    system
+        continuous or discrete
+    mode
+        graph, from 0
+    """
     return JumpSystem(
         time=system.time,
         matrices=system.matrices[mode : mode + 1],

@@ -4,6 +4,8 @@
     discrete:   nu(k+1) = H nu(k), C_i(k+1) = sum_j P_ji (K_j[C_j] + pi_j(k) N_j),   pi(k+1) = P^T pi(k)
 
 Where there is a steady state, the distance to it is what moves: so it is reached exactly, however long the time.
+
+Proposition 1 of the paper for the means, and its discrete twin; docs/theory.md, "Transients", has the rest.
 """
 
 from __future__ import annotations
@@ -154,6 +156,11 @@ def unreduced_consensus(experiment: Experiment) -> JumpSystem:
     """Consensus in continuous time with the agents' mean in it: its second moments grow without bound.
 
     The twin for the steps of a run is ``systems.emulated(step, "tracking")``, which reduces nothing.
+
+    Parameters
+    ----------
+    experiment
+        consensus in continuous time
     """
     gain = experiment.noise_gain
     drift = np.stack([graph.laplacian for graph in experiment.graph_list])
@@ -194,7 +201,13 @@ def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Fl
 
 
 def unknowns(system: JumpSystem) -> int:
-    """Size n p + n of the joint equations of second moments and graph law."""
+    """Size n p + n of the joint equations of second moments and graph law.
+
+    Parameters
+    ----------
+    system
+        reduced or not
+    """
     return system.modes * (symmetric.size(system.dimension) + 1)
 
 
@@ -249,17 +262,41 @@ def _powered(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Flo
 
 
 def distance(system: JumpSystem, snapshot: Snapshot, steady: FloatArray) -> Snapshot:
-    """What is left to the steady state, which moves by the same equations."""
+    """What is left to the steady state, which moves by the same equations.
+
+    Parameters
+    ----------
+    system
+        that has a steady state
+    snapshot
+        at some time
+    steady
+        (n, d, d) steady second moments
+    """
     return Snapshot(snapshot.law - system.stationary, snapshot.means, snapshot.moments - steady)
 
 
 def joint_stack(snapshot: Snapshot) -> FloatArray:
-    """(n, p + 1) packed second moments and probability of every mode."""
+    """(n, p + 1) packed second moments and probability of every mode.
+
+    Parameters
+    ----------
+    snapshot
+        at some time
+    """
     return np.concatenate([symmetric.pack(snapshot.moments), snapshot.law[:, None]], axis=1)
 
 
 def advance(system: JumpSystem, snapshot: Snapshot) -> Snapshot:
-    """One step. Discrete time; right for the distance to the steady state too."""
+    """One step. Discrete time; right for the distance to the steady state too.
+
+    Parameters
+    ----------
+    system
+        in discrete time
+    snapshot
+        before the step
+    """
     moments, law = system.advance(snapshot.moments, snapshot.law)
     moved = np.einsum("nab,nb->na", system.matrices, snapshot.means)
     return Snapshot(law, system.chain.T @ moved, moments)
