@@ -1,8 +1,35 @@
-"""Networks of agents under Markov-switching graphs, as ROS 2 nodes."""
+"""Networks of agents under Markov-switching graphs, as ROS 2 nodes.
+
+    from msg_agents import run_network
+
+What can be imported from here is that of ``msg_agents.runner``, and is imported when it is first asked for.
+"""
+
+from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from msg_agents.runner import RunResult as RunResult
+    from msg_agents.runner import conclude as conclude
+    from msg_agents.runner import run_network as run_network
 
 try:
     __version__ = version("msg_agents")
 except PackageNotFoundError:  # run from a source tree that nobody installed
     __version__ = "0.0.0"
+
+__all__ = ["RunResult", "conclude", "run_network"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from msg_agents import runner
+
+    return getattr(runner, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

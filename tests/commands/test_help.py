@@ -155,3 +155,17 @@ def test_a_slip_of_the_pen_is_told_the_nearest(words: list[str], suggestion: str
     result = CliRunner().invoke(PROGRAMS[words[0]], words[1:], prog_name=words[0])
     assert (result.exit_code, result.stdout) == (2, "")
     assert re.search(rf"(Did you mean|Possible options).*{suggestion}", result.stderr)
+
+
+@pytest.mark.parametrize(("program", "name"), COMMANDS)
+def test_wrong_usage(program: str, name: str) -> None:
+    """Of every command: exit code 2, nothing on stdout, what is wrong and where to read on on stderr."""
+    result = CliRunner().invoke(PROGRAMS[program], [name, "--no-such-option"], prog_name=program)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert f"Try '{program} {name} --help' for help." in result.stderr
+    assert "No such option '--no-such-option'" in result.stderr
+    many = CliRunner().invoke(PROGRAMS[program], [name, *["x"] * 9], prog_name=program)
+    endless = any(each.nargs == -1 for each in command_of(program, name).params)
+    if not endless:
+        assert (many.exit_code, many.stdout) == (2, "")
+        assert "Traceback" not in many.stderr
