@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 import msg_analysis
-from msg_analysis import cli_compare, cli_theory
+from msg_analysis import cli_compare, cli_sweep, cli_theory
 from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, print_json, result_console
 from msg_analysis.errors import InputError
@@ -201,6 +201,7 @@ main.add_command(cli_compare.compare)
 main.add_command(cli_compare.tabulate)
 main.add_command(cli_theory.transient)
 main.add_command(cli_theory.facts)
+main.add_command(cli_sweep.sweep)
 
 
 @main.command(epilog=examples("msg-analysis schema > experiment.schema.json"))

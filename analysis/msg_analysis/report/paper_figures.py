@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +16,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import NullLocator
 
 from msg_analysis.errors import InputError
+from msg_analysis.files import write_whole
 from msg_analysis.model.graphs import Graph
 from msg_analysis.report import paper
 from msg_analysis.report.figures import BLACK, BLUE, GREEN, ORANGE, PURPLE, STYLE, VERMILLION, draw_graph
@@ -95,8 +94,8 @@ def write_figures(numbers: Sequence[int], directory: str | Path, formats: Sequen
             with mpl.rc_context(_STYLE):
                 figure = draw(example)
                 for name in formats:
-                    written.append(_replace(directory / f"{stem}.{name}", _rendered(figure, name)))
-            written.append(_replace(directory / f"{stem}.csv", csv_text(example).encode()))
+                    written.append(write_whole(directory / f"{stem}.{name}", _rendered(figure, name)))
+            written.append(write_whole(directory / f"{stem}.csv", csv_text(example).encode()))
     except OSError as error:
         place = error.filename or directory
         raise InputError(f"{place}: cannot be written ({error.strerror}): choose another place with --out") from error
@@ -328,19 +327,3 @@ def _rendered(figure: Figure, name: str) -> bytes:
     )
     figure.savefig(stream, format=name, metadata=metadata, dpi=_DPI)
     return stream.getvalue()
-
-
-def _replace(path: Path, content: bytes) -> Path:
-    """Write a file under another name first, so that it is never there in part."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
-        temporary = Path(stream.name)
-        stream.write(content)
-    try:
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink()
-        raise
-    return path
