@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -11,9 +13,19 @@ from msg_analysis.console import complain, examples, finite, print_json, result_
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    from msg_analysis.sweep.conduct import OtherSoftware
+    from msg_analysis.sweep.conduct import Conducted, OtherSoftware
+    from msg_analysis.sweep.point import Job
+    from msg_analysis.sweep.store import Store
 
-INCOMPLETE = 3
+DISAGREES, INCOMPLETE = 1, 3
+
+other_software = click.option(
+    "--other-software",
+    type=click.Choice(["refuse", "redo", "keep"]),
+    default="refuse",
+    show_default=True,
+    help="What to do with results in the directory that other versions made.",
+)
 
 
 @click.command(
@@ -33,13 +45,7 @@ INCOMPLETE = 3
 @click.option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of this Dask scheduler instead.")
 @click.option("--column", help="What to draw and list: system_error by default, or a column of the tables.")
 @click.option("--retry", is_flag=True, help="Try again what has failed.")
-@click.option(
-    "--other-software",
-    type=click.Choice(["refuse", "redo", "keep"]),
-    default="refuse",
-    show_default=True,
-    help="What to do with results in the directory that other versions made.",
-)
+@other_software
 @click.option("--keep-bags", is_flag=True, help="Keep the bags of networks that agree with the prediction, too.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 @click.pass_context
@@ -72,41 +78,29 @@ def sweep(
     from msg_analysis.progress import SweepProgress
     from msg_analysis.report.sweep_figure import write_figure
     from msg_analysis.report.sweep_text import describe_sweep, print_sweep
-    from msg_analysis.sweep.conduct import conduct, judge
+    from msg_analysis.sweep.conduct import judge
     from msg_analysis.sweep.network import options
     from msg_analysis.sweep.plan import load_sweep
     from msg_analysis.sweep.series import picture
     from msg_analysis.sweep.store import Store
     from msg_analysis.sweep.table import rows_of, write_tables
-    from msg_analysis.sweep.workers import WorkersLostError
 
     with SweepProgress("checking the points") as checking:
         plan = load_sweep(sweep_file, checking.checked)
     directory = out or Path("sweeps") / plan.name
     network = options(directory, keep_bags, workers or 1) if plan.kind == "network" else None
     with Store.open(directory) as store:
-        if store.damaged:
-            click.echo(f"note: {directory}: {store.damaged} lines cannot be read: done again", err=True)
-        try:
-            with SweepProgress(plan.name) as progress:
-                done = conduct(
-                    [point.job for point in plan.points],
-                    store,
-                    workers=workers,
-                    scheduler=scheduler,
-                    network=network,
-                    other_software=other_software,
-                    retry=retry,
-                    watch=progress.done,
-                )
-        except (KeyboardInterrupt, WorkersLostError) as error:
-            there = sum(point.job.id in store.outcomes for point in plan.points)
-            kept = f"{there} of {len(plan.points)} points are kept in {directory}: the same command goes on"
-            if isinstance(error, KeyboardInterrupt):
-                click.echo(f"\ninterrupted: {kept}", err=True)
-                raise
-            complain(f"{error}: {kept}")
-            context.exit(INCOMPLETE)
+        done = _conduct(
+            context,
+            plan.name,
+            [point.job for point in plan.points],
+            store,
+            workers=workers,
+            scheduler=scheduler,
+            network=network,
+            other_software=other_software,
+            retry=retry,
+        )
         judgement = judge(done.outcomes, plan.spec.level)
         rows = rows_of(plan, done.outcomes, judgement)
         document = finite(describe_sweep(plan, done, judgement, rows))
@@ -123,3 +117,53 @@ def sweep(
         for file in files:
             click.echo(file)
     context.exit(judgement.exit_code)
+
+
+def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Store, **how: Any) -> Conducted:
+    """Do all jobs, with progress on stderr; if that is interrupted, say what is kept."""
+    from msg_analysis.progress import SweepProgress
+    from msg_analysis.sweep.conduct import conduct
+    from msg_analysis.sweep.workers import WorkersLostError
+
+    if store.damaged:
+        click.echo(f"note: {store.directory}: {store.damaged} lines cannot be read: done again", err=True)
+    try:
+        with SweepProgress(title) as progress:
+            return conduct(jobs, store, watch=progress.done, **how)
+    except (KeyboardInterrupt, WorkersLostError) as error:
+        there = sum(job.id in store.outcomes for job in jobs)
+        kept = f"{there} of {len(jobs)} points are kept in {store.directory}: the same command goes on"
+        if isinstance(error, KeyboardInterrupt):
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # we are leaving
+            click.echo(f"\ninterrupted: {kept}", err=True)
+            raise
+        complain(f"{error}: {kept}")
+        context.exit(INCOMPLETE)
+
+
+def emulate(
+    context: click.Context, numbers: Sequence[int], out: Path, formats: Sequence[str], other_software: OtherSoftware
+) -> int:
+    """``msg-analysis figures --emulate``: run the networks, write the figures; the exit code."""
+    from msg_analysis.report.emulation import disagreeing, measured, runs_of, summary
+    from msg_analysis.report.paper_figures import write_figures
+    from msg_analysis.sweep.network import options
+    from msg_analysis.sweep.point import FAILED
+    from msg_analysis.sweep.store import Store
+
+    runs = [run for number in numbers for run in runs_of(number)]
+    directory = out / "emulation"
+    network = options(directory, False, 1)
+    with Store.open(directory) as store:
+        jobs = [run.job() for run in runs]
+        done = _conduct(context, "networks", jobs, store, network=network, other_software=other_software, retry=True)
+    points = measured(runs, done.outcomes)
+    failed = [outcome for outcome in done.outcomes if outcome.status == FAILED]
+    for outcome in failed:
+        complain(f"no result: {outcome.reason}")
+    if not points:
+        return INCOMPLETE
+    for path in write_figures(numbers, out, formats, points):
+        click.echo(path)
+    click.echo(summary(points, len(runs) - len(failed)))
+    return DISAGREES if disagreeing(points) else INCOMPLETE if failed else 0

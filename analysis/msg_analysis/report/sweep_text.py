@@ -88,9 +88,6 @@ def _summary(document: dict[str, Any]) -> str:
     tested = [row["p_holm"] for row in document["points"] if row.get("p_holm") is not None]
     if tested:
         apart = sum(row.get("verdict") == "disagrees" for row in document["points"])
-        text += (
-            f". {apart or 'None'} of {len(tested)} disagree{'' if apart > 1 else 's'} with its prediction (Holm over all "
-            f"of them, level "
-            f"{document['level']:g}; least p {min(tested):.3g})"
-        )
+        text += f". {apart or 'None'} of {len(tested)} {'disagree' if apart > 1 else 'disagrees'} with its prediction"
+        text += f" (Holm over all of them, level {document['level']:g}; least p {min(tested):.3g})"
     return text + "."

@@ -97,11 +97,16 @@ def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
     options = job.network
     assert options is not None
     directory = Path(options.directory) / job.id
-    with _slot(options.at_once, stopping) as slot, tempfile.TemporaryDirectory(prefix="msg_sweep_") as folder:
-        shutil.rmtree(directory, ignore_errors=True)  # of a run that was interrupted
-        file = Path(folder) / "experiment.json"
+    with _slot(options.at_once, stopping) as slot:
+        shutil.rmtree(directory, ignore_errors=True)  # of a run whose worker was killed
+        directory.mkdir(parents=True)
+        file = directory / "experiment.json"
         file.write_text(job.document, encoding="utf-8")
-        document, said, code = _run(options, file, directory, slot, stopping)
+        try:
+            document, said, code = _run(options, file, directory, slot, stopping)
+        except NetworkStoppedError:
+            shutil.rmtree(directory, ignore_errors=True)
+            raise
     if document is None:
         shutil.rmtree(directory, ignore_errors=True)
         last = said.strip().splitlines()[-1:] or ["it said nothing"]

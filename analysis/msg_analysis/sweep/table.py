@@ -44,7 +44,8 @@ def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], judgement: Judgement) -> 
             row["bag"] = outcome.result.get("bag")
         row |= {"seconds": outcome.seconds, "software": outcome.software}
         rows.append(row)
-    return rows
+    used = {name for row in rows for name, value in row.items() if value is not None} | {"reason", *sweep.keys}
+    return [{name: value for name, value in row.items() if name in used} for row in rows]
 
 
 def _columns(name: str, value: Any) -> Row:

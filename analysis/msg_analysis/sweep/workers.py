@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
 import logging
 import math
 import multiprocessing
@@ -105,7 +107,9 @@ class Workers:
         import distributed
 
         # What it has to say concerns us, and we tell it to the user in our words.
-        logging.getLogger("distributed").setLevel(logging.CRITICAL + 1)
+        for name in list(logging.root.manager.loggerDict):
+            if name.partition(".")[0] == "distributed":
+                logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         if self._scheduler:
             try:
                 self._client = distributed.Client(self._scheduler, timeout=_CONNECT, name="msg-analysis")
@@ -117,21 +121,28 @@ class Workers:
             return self
         method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
         dask.config.set({"distributed.worker.multiprocessing-method": method})
-        with _ignoring(signal.SIGINT):
-            self._cluster = distributed.LocalCluster(
-                n_workers=self._count,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address=None,
-                silence_logs=logging.CRITICAL + 1,
-            )
-            self._client = distributed.Client(self._cluster)
+        try:
+            with _deferring_interrupts():
+                self._cluster = distributed.LocalCluster(
+                    n_workers=self._count,
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    dashboard_address=None,
+                    silence_logs=logging.CRITICAL + 1,
+                )
+                self._client = distributed.Client(self._cluster)
+        except KeyboardInterrupt:
+            self._close()
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._close()
+
+    def _close(self) -> None:
         # Whoever presses Ctrl-C again while this ends everything in order would get in the way of it.
         with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
             if self._client is not None:
@@ -190,8 +201,10 @@ class Workers:
                     each = took / len(batch)
                     seconds = each if math.isinf(seconds) else 0.7 * seconds + 0.3 * each
                 yield list(zip(batch, found, strict=True))
-        except BaseException:
+        except BaseException as error:
             self._stop(list(running), patience)
+            if isinstance(error, OSError | asyncio.CancelledError | concurrent.futures.CancelledError):
+                raise WorkersLostError("the scheduler has gone") from error
             raise
 
     def _result(self, future: Future, batch: Sequence[T]) -> tuple[list[Any] | None, float]:
@@ -202,7 +215,7 @@ class Workers:
             found: tuple[list[Any], float] = future.result()
             return found
         if future.status != "error":
-            raise WorkersLostError("the scheduler has gone, or has forgotten its work")
+            raise WorkersLostError("the scheduler has gone")
         error = future.exception()
         if isinstance(error, KilledWorker):
             if len(batch) > 1:
@@ -302,6 +315,22 @@ def _ignoring(*numbers: signal.Signals) -> Iterator[None]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _deferring_interrupts() -> Iterator[None]:
+    """What is done in here is done as a whole: Ctrl-C counts when it is over."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    received: list[int] = []
+    previous = signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    if received:
+        raise KeyboardInterrupt
 
 
 @contextmanager
