@@ -187,7 +187,7 @@ def _draw_2(example: Example, measured: Sequence[Measured]) -> Figure:
     for (colour, _, _), curve in zip(_LOOKS, curves, strict=False):
         peak = (curve.r12[curve.peak], curve.value[curve.peak])
         system.plot(*peak, "*", ms=9, color=colour, mec="white", mew=0.6, zorder=4)
-        text = f"{peak[1]:.4f}"
+        text = "" if measured else f"{peak[1]:.4f}"
         system.annotate(text, peak, (0, 6), textcoords="offset points", ha="center", color=colour, size=7.5)
     system.set_title("(d) largest values: stars", loc="left")
     halves = grid[2].subgridspec(2, 1)
@@ -220,7 +220,9 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
         centrality.set(ylabel="robustness centrality $1/E$")
         certainty.set(ylabel="node certainty $1/E_i$")
         for axes, curves in ((centrality, central), (certainty, certain)):
-            low, high = min(c.value.min() for c in curves), max(c.value.max() for c in curves)
+            found = [point for c in curves for point in _on_curve(_agent(c), c, "epsilon", measured)]
+            low = min([c.value.min() for c in curves] + [point.low for point in found])
+            high = max([c.value.max() for c in curves] + [point.high for point in found])
             axes.set_ylim(low - 0.06 * (high - low), high + 0.36 * (high - low))
             _plot(axes, "epsilon", [(_agent(c), c) for c in curves], heading="agent", height=1.8, measured=measured)
             axes.text(0.03, 0.985, _orders(curves), transform=axes.transAxes, va="top", size=7, color=_GREY)
@@ -266,6 +268,8 @@ def _plot(
     points = [_on_curve(label, curve, swept, measured) for label, curve in curves]
     ends = [end for found in points for point in found for end in (point.low, point.high)]
     axes.set_ylim(min([axes.get_ylim()[0], *ends]), max([axes.get_ylim()[1], *ends]))
+    if ends and not logarithmic:  # points at the end of the curves are whole
+        axes.set_xlim(right=1.03 * max(curve_x.max() for curve_x in (getattr(curve, swept) for _, curve in curves)))
     for look, (_, curve) in enumerate(curves):
         colour, dashes, marker = _LOOKS[look]
         x = getattr(curve, swept)
@@ -282,7 +286,8 @@ def _plot(
             mec="white",
             mew=0.4,
         )
-        _plot_points(axes, swept, points[look], colour, marker)
+        beside = _SIDE * (look - (len(curves) - 1) / 2) if logarithmic else 0.0  # these curves are close to each other
+        _plot_points(axes, swept, points[look], colour, marker, beside)
     ends = [*axes.get_ylim(), *(curve.value[-1] for _, curve in curves)]
     low, high, *ends = axes.transScale.transform([(1.0, end) for end in ends])[:, 1]
     heights = _apart([(end - low) / (high - low) for end in ends], _LINE / height)
@@ -304,13 +309,13 @@ def _on_curve(label: str, curve: Curve, swept: str, measured: Sequence[Measured]
     ]
 
 
-def _plot_points(axes: Axes, swept: str, points: Sequence[Measured], colour: str, marker: str) -> None:
-    """Measured points with their intervals, and beside each what is exact for the steps of its run."""
+def _plot_points(axes: Axes, swept: str, points: Sequence[Measured], colour: str, marker: str, beside: float) -> None:
+    """Measured points with their intervals, and what is exact for the steps of their runs; ``beside`` in inches."""
     for point in points:
         x = getattr(point.run, swept)
         # Side by side where several agents share a curve.
         here = [other for other in points if getattr(other.run, swept) == x]
-        shift = _SIDE * (here.index(point) - (len(here) - 1) / 2)
+        shift = beside + _SIDE * (here.index(point) - (len(here) - 1) / 2)
         place = axes.transData + mtransforms.ScaledTranslation(shift, 0, axes.figure.dpi_scale_trans)
         bars = axes.vlines(x, point.low, point.high, color=colour, lw=0.9, zorder=3)
         bars.set_transform(place)

@@ -128,7 +128,8 @@ class Workers:
                     threads_per_worker=1,
                     processes=True,
                     host="127.0.0.1",
-                    dashboard_address=None,
+                    dashboard_address="127.0.0.1:0",
+                    scheduler_kwargs={"dashboard": False},
                     silence_logs=logging.CRITICAL + 1,
                 )
                 self._client = distributed.Client(self._cluster)
@@ -180,51 +181,64 @@ class Workers:
         from distributed import as_completed
 
         assert self._client is not None
-        pending = deque([item] for item in items)
+        pending = deque(items)
+        suspects: deque[T] = deque()
         running: dict[Future, list[T]] = {}
         seconds = math.inf
         done = as_completed()
         try:
-            while pending or running:
+            while pending or suspects or running:
                 while pending and len(running) < QUEUED * max(self.threads, 1):
-                    batch = _take(pending, seconds, self.threads)
-                    future = self._client.submit(_do, function, batch, self._stop_name, installed(), pure=False)
-                    running[future] = batch
-                    done.add(future)
+                    self._submit(function, _take(pending, seconds, self.threads), running, done)
+                alone = not running
+                if alone:
+                    self._submit(function, [suspects.popleft()], running, done)
                 future = next(done)
                 batch = running.pop(future)
-                found, took = self._result(future, batch)
-                if found is None:
-                    pending.extendleft([item] for item in batch)
-                    continue
-                if took:
+                found = self._result(future)
+                if found is not None:
+                    results, took = found
                     each = took / len(batch)
                     seconds = each if math.isinf(seconds) else 0.7 * seconds + 0.3 * each
-                yield list(zip(batch, found, strict=True))
+                    yield list(zip(batch, results, strict=True))
+                elif alone:
+                    yield [(batch[0], Lost("killed every worker that tried it, or used up its memory"))]
+                else:
+                    suspects += batch
         except BaseException as error:
             self._stop(list(running), patience)
             if isinstance(error, OSError | asyncio.CancelledError | concurrent.futures.CancelledError):
                 raise WorkersLostError("the scheduler has gone") from error
             raise
 
-    def _result(self, future: Future, batch: Sequence[T]) -> tuple[list[Any] | None, float]:
-        """Results of a batch and the seconds that it took; None where its items are to be tried one by one."""
+    def _submit(self, function: Function[T, R], batch: list[T], running: dict[Future, list[T]], done: Any) -> None:
+        assert self._client is not None
+        future = self._client.submit(_do, function, batch, self._stop_name, installed(), pure=False)
+        running[future] = batch
+        done.add(future)
+
+    def _result(self, future: Future) -> tuple[list[Any], float] | None:
+        """Results of a batch and the seconds that it took; None where workers died over and over.
+
+        One of the items in it may have killed them, or one that a worker had at the same time: each is tried alone.
+        """
         from distributed import KilledWorker
 
+        assert self._client is not None
         if future.status == "finished":
             found: tuple[list[Any], float] = future.result()
             return found
-        if future.status != "error":
+        if future.status == "error":
+            error = future.exception()
+            if isinstance(error, KilledWorker):
+                return None
+            if isinstance(error, ModuleNotFoundError | InputError):
+                raise InputError(f"a worker cannot do it: {error}: install the same software there") from error
+            assert error is not None
+            raise error
+        if self._client.status != "running":
             raise WorkersLostError("the scheduler has gone")
-        error = future.exception()
-        if isinstance(error, KilledWorker):
-            if len(batch) > 1:
-                return None, 0.0
-            return [Lost("killed every worker that tried it, or used up its memory")], 0.0
-        if isinstance(error, ModuleNotFoundError | InputError):
-            raise InputError(f"a worker cannot do it: {error}: install the same software there") from error
-        assert error is not None
-        raise error
+        return None  # the only worker that had the result has died
 
     def _stop(self, running: Sequence[Future], patience: float) -> None:
         """Drop what has not begun, and have what runs end in order."""
@@ -252,14 +266,11 @@ class Workers:
                 )
 
 
-def _take(pending: deque[list[T]], seconds: float, threads: int) -> list[T]:
+def _take(pending: deque[T], seconds: float, threads: int) -> list[T]:
     """As many items as make a batch, fewer towards the end, so that all workers end together."""
     most = 1 if math.isinf(seconds) else int(BATCH_SECONDS / max(seconds, 1e-9))
     most = max(1, min(most, MOST_IN_BATCH, len(pending) // (QUEUED * max(threads, 1))))
-    batch: list[T] = []
-    while pending and len(batch) < most:
-        batch += pending.popleft()
-    return batch
+    return [pending.popleft() for _ in range(most)]
 
 
 def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: str) -> tuple[list[R], float]:
