@@ -230,10 +230,16 @@ main.add_command(cli_theory.facts)
 main.add_command(cli_sweep.sweep)
 
 
-@main.command(epilog=examples("msg-analysis schema > experiment.schema.json"))
-def schema() -> None:
-    """Print the JSON Schema of experiment files, for editors."""
-    from msg_analysis.model.experiment import json_schema
+@main.command(
+    epilog=examples("msg-analysis schema > experiment.schema.json", "msg-analysis schema sweep > sweep.schema.json")
+)
+@click.argument("what", type=click.Choice(["experiment", "sweep"]), default="experiment")
+def schema(what: str) -> None:
+    """Print the JSON Schema of experiment files, or of sweep files, for editors."""
+    if what == "sweep":
+        from msg_analysis.sweep.spec import json_schema
+    else:
+        from msg_analysis.model.experiment import json_schema
 
     click.echo(json.dumps(json_schema(), indent=2))
 

@@ -286,7 +286,7 @@ def _plot(
             mec="white",
             mew=0.4,
         )
-        beside = _SIDE * (look - (len(curves) - 1) / 2) if logarithmic else 0.0  # these curves are close to each other
+        beside = 0.4 * _SIDE * (look - (len(curves) - 1) / 2) if logarithmic else 0.0
         _plot_points(axes, swept, points[look], colour, marker, beside)
     ends = [*axes.get_ylim(), *(curve.value[-1] for _, curve in curves)]
     low, high, *ends = axes.transScale.transform([(1.0, end) for end in ends])[:, 1]
