@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -69,7 +69,7 @@ def command_seconds(path: Path, workers: int) -> float:
         return time.perf_counter() - begin
 
 
-def report(name: str, seconds: dict[int, Sequence[float]]) -> float:
+def report(name: str, seconds: Mapping[int, Sequence[float]]) -> float:
     """One line: the least of each, and what two workers gain."""
     one, two = min(seconds[1]), min(seconds[2])
     print(f"| {name} | {one:.2f} s | {two:.2f} s | {one / two:.2f} |")

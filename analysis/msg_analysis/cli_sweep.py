@@ -11,6 +11,7 @@ import click
 
 from msg_analysis.console import complain, examples, finite, print_json, result_console
 from msg_analysis.errors import InputError
+from msg_analysis.sweep.software import require_libraries
 
 if TYPE_CHECKING:
     from msg_analysis.sweep.conduct import Conducted, OtherSoftware
@@ -71,6 +72,7 @@ def sweep(
     """
     if workers and scheduler:
         raise InputError("--workers: given with --scheduler, whose workers are used: give one of them")
+    require_libraries()
     if not scheduler:
         from msg_analysis.sweep.workers import warm_up
 
@@ -151,6 +153,7 @@ def emulate(
     from msg_analysis.sweep.point import FAILED
     from msg_analysis.sweep.store import Store
 
+    require_libraries()
     runs = [run for number in numbers for run in runs_of(number)]
     directory = out / "emulation"
     network = options(directory, False, 1)

@@ -4,12 +4,31 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.util
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import msg_analysis
+from msg_analysis.errors import InputError
 
 _ROOMS = ("model", "theory", "inference")
+
+
+_LIBRARIES = ("distributed", "pyarrow")
+
+
+def require_libraries() -> None:
+    """Refuse to begin without the libraries that only sweeps need: a system's packages may not have them.
+
+    Raises
+    ------
+    InputError : names those that are missing
+    """
+    missing = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"{' and '.join(missing)}: not installed: sweeps need them: pip install dask {' '.join(missing)}"
+        )
 
 
 @functools.cache
