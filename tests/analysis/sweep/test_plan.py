@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.sweep.keys import KeyProblemError, put
 from msg_analysis.sweep.plan import Sweep, load_sweep, own_seed
+from msg_analysis.sweep.spec import json_schema
 
 EXPERIMENT: dict[str, Any] = {
     "name": "two",
@@ -233,6 +235,10 @@ def test_put_sets_one_place_and_leaves_the_original(document: dict[str, Any], da
     here[place] = "new"
     assert put(document, key, "new") == expected
     assert document == before
+
+
+def test_the_schema_in_the_documentation_is_that_of_this_version() -> None:
+    assert json.loads((Path(__file__).parents[3] / "docs/sweep.schema.json").read_text()) == json_schema()
 
 
 def test_names_with_dots() -> None:
