@@ -1,7 +1,9 @@
-"""Places of files that are written at the end of long work."""
+"""Files that are written at the end of long work: a place for them, and never in part."""
 
 from __future__ import annotations
 
+import os
+import tempfile
 from pathlib import Path
 
 from msg_analysis.errors import InputError
@@ -26,3 +28,37 @@ def require_place(file: Path | None) -> None:
         raise InputError(f"{file}: no such directory {file.parent}: create it")
     if file.exists() and not file.is_file():
         raise InputError(f"{file}: no regular file: name another")
+
+
+def write_whole(path: Path, content: bytes) -> Path:
+    """Write a file under another name first, then give it its own.
+
+    Parameters
+    ----------
+    path
+        replaced if it is there
+    content
+        all of it
+
+    Returns
+    -------
+    Path
+        The path.
+
+    Raises
+    ------
+    OSError
+        it cannot be written; what was there is as it was
+    """
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
+        temporary = Path(stream.name)
+        stream.write(content)
+    try:
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink()
+        raise
+    return path

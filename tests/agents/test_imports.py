@@ -16,7 +16,7 @@ import msg_analysis
 
 ANALYSIS = Path(msg_analysis.__file__).parent
 AGENTS = Path(msg_agents.__file__).parent
-ROOMS = ["base", "model", "theory", "twin", "bags", "inference", "report", "api", "cli"]
+ROOMS = ["base", "model", "theory", "twin", "bags", "inference", "sweep", "report", "api", "cli"]
 FRONT_DOOR = "msg_analysis.__init__"
 ROS = ("rclpy", "msg_agents", "rosidl", "ament", "launch")
 
