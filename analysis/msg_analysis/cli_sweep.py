@@ -154,7 +154,23 @@ def emulate(
     *,
     as_json: bool,
 ) -> int:
-    """``msg-analysis figures --emulate``: run the networks, write the figures; the exit code."""
+    """``msg-analysis figures --emulate``: run the networks, write the figures; the exit code.
+
+    Parameters
+    ----------
+    context
+        of the command
+    numbers
+        of the examples
+    out
+        directory of the figures
+    formats
+        of the drawings
+    other_software
+        what becomes of results that other versions made
+    as_json
+        whether stdout is one JSON object
+    """
     from msg_analysis.report.emulation import disagreeing, measured, runs_of, summary
     from msg_analysis.report.paper_figures import write_figures
     from msg_analysis.sweep.network import options

@@ -51,11 +51,29 @@ class SweepProgress:
         return self
 
     def checked(self, done: int, total: int) -> None:
-        """So many of the points have been checked."""
+        """So many of the points have been checked.
+
+        Parameters
+        ----------
+        done
+            how many
+        total
+            of how many
+        """
         self.done(done, total, 0)
 
     def done(self, done: int, total: int, failed: int) -> None:
-        """So many points are done, and so many of these failed; see ``Watch`` of ``msg_analysis.sweep.conduct``."""
+        """So many points are done, and so many of these failed; see ``Watch`` of ``msg_analysis.sweep.conduct``.
+
+        Parameters
+        ----------
+        done
+            how many
+        total
+            of how many
+        failed
+            how many have no result
+        """
         without = f"{failed} without a result" if failed else ""
         self._bar.update(self._task, completed=done, total=total, failed=without)
         if not self._console.is_terminal and time.monotonic() - self._told >= _LINE_PERIOD:

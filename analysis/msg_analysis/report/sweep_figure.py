@@ -15,7 +15,8 @@ from matplotlib.lines import Line2D
 
 from msg_analysis.files import write_whole
 from msg_analysis.model.problems import show
-from msg_analysis.report.figures import BLACK, MODE_COLOURS, STYLE
+from msg_analysis.report.figures import STYLE
+from msg_analysis.report.palette import BLACK, MODE_COLOURS
 from msg_analysis.sweep.series import Picture, Place, Series
 
 FORMATS = ("svg", "png")

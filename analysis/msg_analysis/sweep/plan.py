@@ -211,7 +211,13 @@ def own_seed(seed: int, values: Mapping[str, Any], repetition: int) -> int:
 
 
 def label(values: Mapping[str, Any]) -> str:
-    """A point in words: the swept keys and their values."""
+    """A point in words: the swept keys and their values.
+
+    Parameters
+    ----------
+    values
+        of the keys
+    """
     return ", ".join(f"{key} = {show(value)}" for key, value in values.items())
 
 

@@ -70,7 +70,17 @@ class Job:
 
     @classmethod
     def of(cls, kind: Kind, document: Mapping[str, Any], level: float = 0.01) -> Self:
-        """The job for an experiment."""
+        """The job for an experiment.
+
+        Parameters
+        ----------
+        kind
+            what is to be done with it
+        document
+            the experiment, as in its file
+        level
+            of the tests of a run
+        """
         text = json.dumps(document)
         what = json.dumps([kind, None if kind == "predict" else level, document], sort_keys=True)
         # The order of the graphs is that of the modes.
@@ -93,7 +103,7 @@ class Outcome:
     result
         what is kept: a document; empty where it failed
     seconds
-        that it took
+        that it took [s]
     place
         host and process that did it
     software
@@ -165,7 +175,13 @@ def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
 
 
 def of_prediction(document: Mapping[str, Any]) -> dict[str, Any]:
-    """What is kept of a prediction: the errors under every law, without the matrices."""
+    """What is kept of a prediction: the errors under every law, without the matrices.
+
+    Parameters
+    ----------
+    document
+        as ``predict --json`` prints it
+    """
     keys = ("system_error", "system_certainty", "node_errors")
     laws = {law: document[law] for law in (*_LAWS, "static") if document.get(law)}
     kept: dict[str, Any] = {law: {key: found[key] for key in keys} for law, found in laws.items()}
@@ -176,6 +192,11 @@ def of_comparison(document: Mapping[str, Any]) -> dict[str, Any]:
     """What is kept of a comparison: the errors, and the least p-value of the family, which stands for the whole run.
 
     As the p-values are adjusted, the least one is a p-value of "the run follows its law" itself.
+
+    Parameters
+    ----------
+    document
+        as ``compare --json`` prints it
     """
     tests = document.get("tests") or []
     least = min(tests, key=lambda test: test["p_adjusted"], default=None)

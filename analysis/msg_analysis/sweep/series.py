@@ -120,7 +120,13 @@ def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None) -> Pic
 
 
 def value_text(value: Any) -> str:
-    """A value of a key for a table or a label: numbers with six digits."""
+    """A value of a key for a table or a label: numbers with six digits.
+
+    Parameters
+    ----------
+    value
+        as in an experiment file
+    """
     return f"{value:.6g}" if isinstance(value, float) else show(value)
 
 

@@ -77,7 +77,13 @@ class Store:
         return cls(directory, outcomes, damaged, descriptor)
 
     def add(self, outcomes: Iterable[Outcome]) -> None:
-        """Keep outcomes: when this returns, they are on the disk."""
+        """Keep outcomes: when this returns, they are on the disk.
+
+        Parameters
+        ----------
+        outcomes
+            of points, each once
+        """
         lines = b""
         for outcome in outcomes:
             self.outcomes[outcome.id] = outcome

@@ -70,12 +70,24 @@ def _columns(name: str, value: Any) -> Row:
 
 
 def column_names(rows: Sequence[Row]) -> list[str]:
-    """Of all rows, in the order in which they come first."""
+    """Of all rows, in the order in which they come first.
+
+    Parameters
+    ----------
+    rows
+        of the table
+    """
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
 def arrow_table(rows: Sequence[Row]) -> pa.Table:
-    """The table: numbers where all of a column are numbers, else texts; what is no scalar is JSON."""
+    """The table: numbers where all of a column are numbers, else texts; what is no scalar is JSON.
+
+    Parameters
+    ----------
+    rows
+        of the table
+    """
     import pyarrow as pa
 
     columns = {}

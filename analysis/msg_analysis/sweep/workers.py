@@ -50,7 +50,13 @@ class WorkersLostError(Exception):
 
 
 class Lost:
-    """In place of a result: the item killed every worker that tried it."""
+    """In place of a result: the item killed every worker that tried it.
+
+    Parameters
+    ----------
+    reason
+        what is known of that, for people
+    """
 
     def __init__(self, reason: str) -> None:
         self.reason = reason
