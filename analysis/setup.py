@@ -32,8 +32,10 @@ setup(
     ],
     zip_safe=False,
     install_requires=[
+        "bokeh",
         "click",
         "jinja2",
+        "markupsafe",
         "matplotlib",
         "mcap",
         "networkx",

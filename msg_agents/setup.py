@@ -12,14 +12,14 @@ setup(
     maintainer_email="maintainers@msg-agents.example.org",
     python_requires=">=3.11",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "loopback.xml"]},
+    package_data={PACKAGE: ["py.typed", "loopback.xml", "pages/*.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
     zip_safe=False,
     # rclpy, std_msgs and the interfaces come with ROS 2, as system packages or as wheels: see package.xml.
-    install_requires=["click", "msg_analysis", "numpy", "rich"],
+    install_requires=["click", "msg_analysis", "numpy", "rich", "threadpoolctl"],
     extras_require={"test": ["pytest"]},  # by which colcon knows how to test it
     # What `ros2 run msg_agents` can run: the command line, and each node by itself.
     entry_points={

@@ -12,8 +12,8 @@ from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 
 from msg_agents.checkpoint import Checkpoint, longest_heard
-from msg_agents.network import RECORDER
-from msg_agents.node import FAREWELL, NetworkNode, agent_name, state_topic, truth_topic
+from msg_agents.network import RECORDER, agent_name
+from msg_agents.node import FAREWELL, NetworkNode, state_topic, truth_topic
 from msg_agents.pace import Pace
 from msg_agents.qos import STREAM
 from msg_analysis.bags.cdr import ActiveGraph, StateCodec, StateFrame, with_state

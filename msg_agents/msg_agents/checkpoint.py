@@ -20,7 +20,7 @@ MOST, LEAST, ROOM = AGAIN, 256, 1 << 24
 behind (what the middleware keeps of a writer), where that is possible; and always more than agents may be apart."""
 
 # Length of the message, and step + 1, written after it: 0 or an older step's mark until it is whole.
-_MARK = struct.Struct("<QQ")
+MARK = struct.Struct("<QQ")
 
 
 def longest_heard(record: RunRecord) -> int:
@@ -31,7 +31,7 @@ def longest_heard(record: RunRecord) -> int:
 
 def room_for(size: int) -> int:
     """Bytes of the file of an agent whose longest message has so many."""
-    slot = size + _MARK.size
+    slot = size + MARK.size
     return slot * max(LEAST, min(MOST, ROOM // slot))
 
 
@@ -59,7 +59,7 @@ class Checkpoint:
     def __init__(self, path: Path | None, size: int) -> None:
         self.found = False
         self._size = size
-        self._slot = size + _MARK.size
+        self._slot = size + MARK.size
         total = room_for(size)
         self._capacity = total // self._slot
         if path is None:
@@ -88,14 +88,14 @@ class Checkpoint:
         """Keep the message of a step; steps must come one after the other."""
         start = step % self._capacity * self._slot
         self._map[start : start + len(message)] = message
-        _MARK.pack_into(self._map, start + self._size, len(message), step + 1)
+        MARK.pack_into(self._map, start + self._size, len(message), step + 1)
 
     def read(self, first: int = 0) -> list[tuple[int, bytes]]:
         """(step, message) of the newest unbroken row of steps, from a first one on, ascending.
 
         The slot after the newest is left out: it may be torn.
         """
-        marks = [_MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self._capacity)]
+        marks = [MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self._capacity)]
         newest = max(mark for _, mark in marks) - 1
         found: list[tuple[int, bytes]] = []
         for step in range(newest, max(first - 1, newest - self._capacity + 1, -1), -1):

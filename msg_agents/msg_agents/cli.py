@@ -16,6 +16,7 @@ import click
 
 import msg_agents
 from msg_agents import cli_nodes, cli_replay
+from msg_agents.cli_web import WebCommand, announce, page, web_options
 from msg_agents.environment import RESTARTS
 from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, result_console
@@ -35,10 +36,12 @@ def main() -> None:
 
 
 @main.command(
+    cls=WebCommand,
     epilog=examples(
         "msg-agents run line_ring.yaml",
+        "msg-agents run line_ring.yaml --web",
         "msg-agents run line_ring.yaml --seed 3 --duration 100 --out runs --json",
-    )
+    ),
 )
 @click.argument("experiment", type=click.Path(path_type=Path))
 @click.option(
@@ -70,6 +73,7 @@ def main() -> None:
     help="Keep each process to one core, where there are more of them than cores: faster (lockstep).",
 )
 @storage_options
+@web_options
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout and nothing else.")
 def run(
@@ -88,54 +92,70 @@ def run(
     pin: bool,
     compression: Compression,
     split_size: float | None,
+    web: int | None,
+    web_host: str,
     executor: str | None,
     as_json: bool,
 ) -> None:
-    """Run EXPERIMENT as a network of processes, record it, and compare the record with the theory."""
+    """Run EXPERIMENT as a network of processes, record it, and compare the record with the theory.
+
+    On a terminal, a panel shows how the run stands; with --web, a page for browsers does, too.
+    """
     from msg_agents.runner import run_network
+    from msg_agents.view import RunView
 
     changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
     if processes is not None:
         changes["processes"] = int(processes) if processes.isdigit() else processes
     what = _load(experiment).with_run(**{key: value for key, value in changes.items() if value is not None})
-    console, note = _notes()
-    with _progress_bar(console, what) as on_progress:
-        result = run_network(
-            what,
-            None if no_record else out,
-            domain=domain,
-            restarts=restarts,
-            use_sim_time=use_sim_time,
-            storage=storage(compression, split_size),
-            pin=pin,
-            on_progress=on_progress,
-            on_note=note,
-            environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
-        )
-    _end(result, as_json)
+    with page(web, web_host) as served:
+        with RunView(what, served) as view:
+            if served is not None:
+                announce(served, web_host, view.note)
+            result = run_network(
+                what,
+                None if no_record else out,
+                domain=domain,
+                restarts=restarts,
+                use_sim_time=use_sim_time,
+                storage=storage(compression, split_size),
+                pin=pin,
+                on_note=view.note,
+                view=view,
+                environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
+            )
+        _end(result, as_json, view.say)
 
 
-def _notes() -> tuple[Any, Callable[[str], None]]:
-    """A console on stderr, and what prints a note there."""
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console(stderr=True)
-    return console, lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
-
-
-def _end(result: RunResult, as_json: bool) -> None:
+def _end(result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
     """Say what failed, judge what was recorded, show the result, and leave with the exit code."""
     from msg_agents.runner import conclude
 
     for line in result.failures:
         click.echo(f"{click.style('failed:', fg='red', bold=True)} {line}", err=True)
     conclude(result)
+    say(_ending(result))
     _show(result, as_json)
     if result.failures or (result.bag is not None and result.comparison is None):
         sys.exit(INCOMPLETE)
     if result.comparison is not None:
         sys.exit(result.comparison.exit_code)
+
+
+def _ending(result: RunResult) -> dict[str, Any]:
+    """The end of a run, for who watches it."""
+    if result.failures:
+        return {"text": f"The run has ended early: {result.failures[0]}", "verdict": "incomplete"}
+    if result.comparison is None:
+        return {"text": "The run has ended.", "verdict": None}
+    verdict = result.comparison.verdict
+    words = {
+        "agrees": "The run has ended; it agrees with the prediction.",
+        "disagrees": "The run has ended; it disagrees with the prediction.",
+        "incomplete": "The run has ended; the data are incomplete.",
+        "unpredicted": "The run has ended; there is no prediction.",
+    }
+    return {"text": words[verdict], "verdict": verdict}
 
 
 def _show(result: RunResult, as_json: bool) -> None:
@@ -166,37 +186,6 @@ def _show(result: RunResult, as_json: bool) -> None:
         click.echo(f"bag:    {document['bag']}\nreport: {document['report']}")
     if result.rate:
         click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
-
-
-class _progress_bar:  # noqa: N801  used like a function
-    """A progress bar on stderr: steps, steps/s, time left. On a terminal only."""
-
-    def __init__(self, console: Any, experiment: Experiment) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]:.0f} steps/s"),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-            transient=True,
-        )
-        self._task = self._progress.add_task(f"{experiment.name}: starting", total=experiment.steps, rate=0.0)
-        self._name = experiment.name
-
-    def __enter__(self) -> Callable[[int], None]:
-        self._progress.start()
-        return self._update
-
-    def _update(self, step: int) -> None:
-        rate = self._progress.tasks[0].speed or 0.0
-        self._progress.update(self._task, completed=step, description=self._name, rate=rate)
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
 
 
 @main.command(epilog=examples("msg-agents check runs/line_ring_20250101_120000", "msg-agents check"))
@@ -304,6 +293,7 @@ def host(
     """
     from msg_agents.hosts import Hosts, this_host
     from msg_agents.runner import run_network
+    from msg_agents.view import RunView
     from msg_agents.workshop import workshop
     from msg_analysis.model.problems import show
 
@@ -314,18 +304,18 @@ def host(
         click.echo(places.profile(what), nl=False)
         return
     share = places.share(name or this_host(), discovery_timeout=discovery_timeout, patience=patience)
-    console, note = _notes()
     mine = show([agent + 1 for agent in share.agents])
-    note(f"this host runs agents {mine}{' and the recorder' if share.home else ''} in ROS_DOMAIN_ID {places.domain}")
-    with workshop() as folder, _progress_bar(console, what) as on_progress:
+    with workshop() as folder, RunView(what) as view:
+        also = " and the recorder" if share.home else ""
+        view.note(f"this host runs agents {mine}{also} in ROS_DOMAIN_ID {places.domain}")
         result = run_network(
             what,
             out,
             domain=places.domain,
             restarts=restarts,
             storage=storage(compression, split_size),
-            on_progress=on_progress,
-            on_note=note,
+            on_note=view.note,
+            view=view,
             environment=places.environment(what, folder),
             record=record,
             share=share,

@@ -111,7 +111,7 @@ def agent(
 
     def nodes() -> list[NetworkNode]:
         from msg_agents.group import AgentGroup
-        from msg_agents.node import agent_name
+        from msg_agents.network import agent_name
         from msg_agents.succession import enter, succeed
 
         indices = [number - 1 for number in agents]

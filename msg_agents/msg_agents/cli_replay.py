@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from msg_agents.cli_web import WebRosCommand, announce, page, web_options
 from msg_agents.ros_command import RosCommand
 from msg_analysis.console import examples, print_json, result_console
 
 if TYPE_CHECKING:
+    from msg_agents.live import Watched
     from msg_agents.player import Played
+    from msg_agents.web import Web
 
 INCOMPLETE = 3
 _domain = click.option("--domain", type=click.IntRange(0, 232), help="Instead of the environment's ROS_DOMAIN_ID.")
@@ -229,9 +232,10 @@ def _enter(domain: int | None) -> None:
 
 
 @click.command(
-    cls=RosCommand,
+    cls=WebRosCommand,
     epilog=examples(
         "msg-agents live --domain 42",
+        "msg-agents live --domain 42 --web",
         "msg-agents live --reliable --json    # then, elsewhere: msg-agents play BAG --rate max --await live",
     ),
 )
@@ -242,22 +246,52 @@ def _enter(domain: int | None) -> None:
 )
 @click.option("--timeout", type=float, callback=_positive, help="Seconds to wait for a network; by default for ever.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, at the end, and nothing else.")
+@web_options
 @_domain
-def live(*, reliable: bool, timeout: float | None, as_json: bool, domain: int | None) -> None:
+def live(
+    *, reliable: bool, timeout: float | None, as_json: bool, web: int | None, web_host: str, domain: int | None
+) -> None:
     """Watch a network, running or played: its errors up to now beside their prediction.
 
     It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). The numbers are those of `msg-analysis
     compare`, on the topic `estimate` too, but they are no verdict.
     """
-    from msg_agents.live import Watched, watch
-    from msg_analysis.report.live import live_document, live_line, live_table
+    from msg_analysis.report.live import live_document
+
+    with page(web, web_host) as served:
+        found = _watch(reliable=reliable, timeout=timeout, as_json=as_json, domain=domain, served=served, host=web_host)
+        if served is not None and found is not None:
+            words = "The run has ended." if found.finished else "Nobody watches any more."
+            served.end({"text": words, "verdict": None if found.finished else "incomplete"})
+    if found is None:
+        _notes()("no network was seen")
+        sys.exit(INCOMPLETE)
+    if as_json:
+        print_json(live_document(found.report, found.record))
+    elif found.report.note and not result_console().is_terminal:
+        _notes()(found.report.note)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0 if found.finished else INCOMPLETE)  # nothing is left to do, and the middleware may not let go
+
+
+def _watch(
+    *, reliable: bool, timeout: float | None, as_json: bool, domain: int | None, served: Web | None, host: str
+) -> Watched | None:
+    """What was seen of a network, which is shown on the way; None: there was none."""
+    from msg_agents.live import watch
+    from msg_analysis.report.live import live_line, live_table
 
     _enter(domain)
     note = _notes()
+    if served is not None:
+        announce(served, host, note)
+    publish = _publisher(served)
     console = result_console()
     if as_json or not console.is_terminal:
 
         def show(watched: Watched, rate: float) -> None:
+            publish(watched, rate)
             if not as_json:
                 click.echo(live_line(watched.report, watched.record, rate))
 
@@ -269,24 +303,32 @@ def live(*, reliable: bool, timeout: float | None, as_json: bool, domain: int | 
 
         screen = Live(console=console, auto_refresh=False)
         with screen, JobControl(before=screen.stop, after=lambda: screen.start(refresh=True)):
-            found = watch(
-                reliable=reliable,
-                timeout=timeout,
-                on_report=lambda watched, rate: screen.update(
-                    live_table(watched.report, watched.record, rate), refresh=True
-                ),
-                on_note=note,
-            )
-    if found is None:
-        note("no network was seen")
-        sys.exit(INCOMPLETE)
-    if as_json:
-        print_json(live_document(found.report, found.record))
-    elif found.report.note and not console.is_terminal:
-        note(found.report.note)
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(0 if found.finished else INCOMPLETE)  # nothing is left to do, and the middleware may not let go
+
+            def draw(watched: Watched, rate: float) -> None:
+                publish(watched, rate)
+                screen.update(live_table(watched.report, watched.record, rate), refresh=True)
+
+            found = watch(reliable=reliable, timeout=timeout, on_report=draw, on_note=note)
+    return found
+
+
+def _publisher(served: Web | None) -> Callable[[Watched, float], None]:
+    """What puts a report on the page, if there is one."""
+    if served is None:
+        return lambda *_: None
+    from msg_agents.moment import Clockwork, moment_document, setting
+
+    clockworks: list[Clockwork] = []
+
+    def publish(watched: Watched, _: float) -> None:
+        if not clockworks:
+            clockworks.append(Clockwork(watched.record.experiment))
+            served.begin(setting(watched.record.experiment))
+        # Which agent is how far, is not counted here: the newest step of any of them stands for all.
+        moment = clockworks[0].moment([watched.report.newest], watched.report)
+        served.show(moment_document(moment) | {"steps": []})
+
+    return publish
 
 
 @click.command(

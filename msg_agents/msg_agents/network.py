@@ -20,6 +20,11 @@ MOST_PROCESSES = 90
 loopback.xml, of which switcher, recorder and what the user watches the run with need some."""
 
 
+def agent_name(agent: int) -> str:
+    """Name of the node, and namespace of the topics, of an agent (index from 0)."""
+    return f"agent_{agent + 1}"
+
+
 @dataclass(frozen=True, slots=True)
 class ProcessPlan:
     """One process of a network.

@@ -13,7 +13,7 @@ from rclpy.task import Future
 from rclpy.time_source import CLOCK_TOPIC
 
 from msg_agents.health import Health
-from msg_agents.network import RECORDER, SWITCHER
+from msg_agents.network import RECORDER, SWITCHER, agent_name
 from msg_agents.qos import LATCHED
 from msg_agents.quiet import QuietNode
 from msg_agents.synchronizer import Refusal
@@ -37,11 +37,6 @@ WRONG_LENGTH, OTHER_LAYOUT = "wrong length", "not in the layout of the agents"
 OUT_OF_RANGE = "step out of range"
 RECORDED = "recorded already"
 REPEATS = {Refusal.OLD, Refusal.KNOWN, RECORDED}
-
-
-def agent_name(agent: int) -> str:
-    """Name of the node, and namespace of the topics, of an agent (index from 0)."""
-    return f"agent_{agent + 1}"
 
 
 def state_topic(agent: int) -> str:

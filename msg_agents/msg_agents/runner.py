@@ -32,6 +32,7 @@ from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.twin import new_record
 
 if TYPE_CHECKING:
+    from msg_agents.view import RunView
     from msg_analysis.inference.compare import Comparison
 
 POLL = 0.05  # s
@@ -96,6 +97,7 @@ def run_network(
     pin: bool = True,
     on_progress: Callable[[int], None] = lambda _: None,
     on_note: Callable[[str], None] = lambda _: None,
+    view: RunView | None = None,
     environment: Mapping[str, str] | None = None,
     record: RunRecord | None = None,
     share: Share | None = None,
@@ -122,6 +124,8 @@ def run_network(
         called a few times a second with the step that every agent has reached
     on_note
         called with a line about what happens: a restart, a standstill
+    view
+        shows the run while it goes on
     environment
         changes to the environment of the processes
     record
@@ -171,7 +175,11 @@ def run_network(
                 if pin and experiment.run.pace == "lockstep":
                     supervisor.cores = place(plans, available_cores(), first=chosen)
                 supervisor.start(plans)
-                _watch(supervisor, experiment.steps, result, restarts, interrupted, on_progress, on_note)
+                if view is not None:
+                    view.begin(record, checkpoints if share is None else None)
+                _watch(supervisor, experiment.steps, result, restarts, interrupted, on_progress, on_note, view)
+                if view is not None:
+                    view.end()
                 # Before the others are ended: what ends because we end it has not failed.
                 _collect_failures(supervisor, result, interrupted, restarts)
             result.strangers = supervisor.account().strangers()
@@ -194,6 +202,7 @@ def _watch(
     interrupted: list[int],
     on_progress: Callable[[int], None],
     on_note: Callable[[str], None],
+    view: RunView | None = None,
 ) -> None:
     """Until all have done their part, one has failed for good, or the user has had enough."""
     began: float | None = None
@@ -201,6 +210,8 @@ def _watch(
     while not interrupted and _revive(supervisor, result, restarts, on_note) and supervisor.awaited:
         time.sleep(POLL)
         supervisor.read_status()
+        if view is not None:
+            view.look(supervisor.steps)
         reached = min(supervisor.steps, default=-1)
         if pace.look(sum(supervisor.steps)) and 0 <= reached < steps:
             on_note(f"no step for {pace.stalled:.0f} s: {_standstill(supervisor)}")

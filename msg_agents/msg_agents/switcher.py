@@ -16,7 +16,7 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 
 from msg_agents.health import Health
-from msg_agents.network import RECORDER
+from msg_agents.network import RECORDER, agent_name
 from msg_agents.node import (
     END_TOPIC,
     EPOCH_TOPIC,
@@ -26,7 +26,6 @@ from msg_agents.node import (
     NOT_AN_AGENT,
     PROGRESS_TOPIC,
     NetworkNode,
-    agent_name,
 )
 from msg_agents.qos import LATCHED
 from msg_agents.schedule import Schedule

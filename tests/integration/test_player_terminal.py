@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import pty
 import re
-import select
 import signal
 import subprocess
 import sys
-import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,66 +13,10 @@ from typing import Any
 
 import pytest
 from recorded import contents, mcap
+from terminal import Terminal
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 SINGLE_KEYS = 0  # of ICANON and ECHO
-
-
-class Terminal:
-    """A program on a terminal of its own."""
-
-    def __init__(self, *command: str | Path) -> None:
-        self._master, slave = pty.openpty()
-        self.before = termios.tcgetattr(slave)
-        self._slave = slave
-        self.text = ""
-
-        def own() -> None:
-            os.setsid()
-            import fcntl
-
-            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-
-        self.process = subprocess.Popen(
-            command,
-            stdin=slave,
-            stdout=slave,
-            stderr=slave,
-            preexec_fn=own,
-        )
-
-    def type(self, keys: bytes) -> None:
-        os.write(self._master, keys)
-
-    def mode(self) -> list[Any]:
-        return termios.tcgetattr(self._slave)
-
-    def local_flags(self) -> int:
-        """Whether lines are edited, and whether what is typed is shown."""
-        return int(termios.tcgetattr(self._slave)[3] & (termios.ICANON | termios.ECHO))
-
-    def read(self, seconds: float) -> str:
-        """What is printed within so much time."""
-        end, new = time.monotonic() + seconds, ""
-        while (left := end - time.monotonic()) > 0:
-            if select.select([self._master], [], [], left)[0]:
-                new += os.read(self._master, 65536).decode(errors="replace")
-        self.text += new
-        return new
-
-    def wait_for(self, *texts: str, seconds: float = 30) -> None:
-        """Until one of them is printed, wherever the lines are wrapped."""
-        end = time.monotonic() + seconds
-        while not any(text in self.text.replace("\r\n", "") for text in texts):
-            assert time.monotonic() < end, f"no {texts} in {self.text!r}"
-            self.read(0.1)
-
-    def close(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-        os.close(self._master)
-        os.close(self._slave)
 
 
 def state(pid: int) -> str:

@@ -29,6 +29,8 @@ _STATE_FIXED = struct.Struct("<4s8x21s3xI4xQIII4x")
 _HEARD = struct.Struct("<I")
 _HEARD_START = _STATE.size - 8
 _LENGTH = struct.Struct("<I4x")  # of the state, before it
+STATE_MODE = _STATE.size - 16
+"""Where ``mode`` stands in the bytes of a state."""
 
 
 def stamp_ns(data: bytes) -> int:

@@ -44,12 +44,18 @@ class InnovationTests:
         regression on what the agents heard: wrong gains, references, offsets
     p_common_gain
         the same for one factor of all gains: messages that are ignored
+    ratios
+        (m,) variance of each agent's innovations over what it should be; NaN where that is nothing
+    samples
+        innovations of each agent, replicas counted: times their number, a ratio has their chi-square law
     """
 
     p_covariance: float | None
     p_whiteness: float | None
     p_gain: float | None
     p_common_gain: float | None = None
+    ratios: tuple[float, ...] | None = None
+    samples: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,18 +147,29 @@ class InnovationSums:
 
     def tests(self) -> InnovationTests:
         """The tests of all of them."""
+        ratios: tuple[float, ...] | None = None
         # What NO_NOISE hides may be there: ten standard deviations of it.
         hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
         p_whiteness = self._whiteness.p_value()
         if self._equalizer and not self._equalizer.possible:
             p_covariance, p_whiteness = self._equalizer.p_size(), None
         else:
-            p_covariance = self._covariance_p()
+            p_covariance, ratios = self._covariance_p(), self._ratios()
         if self.quiet > max(ROUNDING * self.largest, hidden):
             p_covariance = 0.0
         chi2, dof = quadratic_form(self.score, self.covariance)
         p_gain = float(stats.chi2.sf(chi2, dof)) if dof else None
-        return InnovationTests(p_covariance, p_whiteness, p_gain, self._common_gain_p() if dof else None)
+        p_common_gain = self._common_gain_p() if dof else None
+        return InnovationTests(p_covariance, p_whiteness, p_gain, p_common_gain, ratios, int(self.samples.sum()))
+
+    def _ratios(self) -> tuple[float, ...]:
+        """(m,): see ``InnovationTests``."""
+        seen = self.samples > 0
+        noise = np.diagonal(self.noises, axis1=1, axis2=2)[seen]
+        scatter = np.diagonal(self.scatter, axis1=1, axis2=2)[seen]
+        noisy = noise > NO_NOISE * noise.max(initial=0.0)
+        parts = np.divide(scatter, noise, out=np.full_like(scatter, np.nan), where=noisy)
+        return tuple((parts.sum(axis=0) / max(int(self.samples.sum()), 1)).tolist())
 
     def _common_gain_p(self) -> float | None:
         """One direction of the regression: every message counts for less, or for more, than it should."""

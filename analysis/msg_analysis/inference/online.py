@@ -48,6 +48,8 @@ class LiveReport:
         why there is no prediction, or no standard error; None where there are both
     refused
         states or steps that do not count, by reason
+    latest
+        of the newest whole step: its number, its graph from 0 (in real time: 0), and the first replica (m,)
     """
 
     first: int
@@ -58,6 +60,7 @@ class LiveReport:
     nodes: list[Estimate]
     note: str | None
     refused: dict[str, int] = field(default_factory=dict)
+    latest: tuple[int, int, FloatArray] | None = None
 
     @property
     def missing(self) -> int:
@@ -75,6 +78,8 @@ class LiveEstimate:
     ----------
     record
         of the run
+    nodes
+        whether to give standard errors of the nodes, too, where that is not too much
 
     Raises
     ------
@@ -82,14 +87,16 @@ class LiveEstimate:
         no prediction (too large, unbounded)
     """
 
-    def __init__(self, record: RunRecord) -> None:
+    def __init__(self, record: RunRecord, *, nodes: bool = True) -> None:
         experiment = record.experiment
         lockstep = experiment.run.pace == "lockstep"
         self.record = record
         self.steps = StepCollector(experiment.agents, len(experiment.graph_list), experiment.steps, lockstep=lockstep)
         reason = experiment.protocol.unpredictable() if experiment.protocol else None
         prediction = None if reason else predict(experiment)
-        self._errors = RunningErrors(record, prediction)
+        self._errors = RunningErrors(record, prediction, nodes=nodes)
+        self._latest: tuple[int, int, FloatArray] | None = None
+        self._newest = -1
         self._note = reason
         if prediction is not None and not lockstep:
             self._note = "in real time, what is expected depends on how late agents are: compare the bag"
@@ -100,20 +107,31 @@ class LiveEstimate:
         """See ``StepCollector.add``."""
         self.steps.add(agent, step, mode, payload)
 
+    def add_whole(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
+        """Take steps that have come whole by another way, each once ever; arrays as of ``StepCollector.take``."""
+        if not len(steps):
+            return
+        self._errors.add(steps, modes, states, after)
+        newest = int(np.argmax(steps))
+        self._newest = max(self._newest, int(steps[newest]))
+        if self._latest is None or steps[newest] > self._latest[0]:
+            self._latest = int(steps[newest]), int(modes[newest]), states[newest, :, 0].copy()
+
     def report(self) -> LiveReport:
         """The numbers up to now."""
-        self._errors.add(*self.steps.take())
+        self.add_whole(*self.steps.take())
         errors = self._errors
         system, nodes = errors.estimates()
         return LiveReport(
             first=errors.first,
             last=errors.last,
             steps=errors.count,
-            newest=self.steps.newest,
+            newest=max(self.steps.newest, self._newest),
             system=system,
             nodes=nodes,
             note=self._note,
             refused={reason: count for reason, count in sorted(self.steps.refused.items()) if count},
+            latest=self._latest,
         )
 
 
@@ -126,6 +144,8 @@ class RunningErrors:
         of the run
     prediction
         of its experiment; None: the errors are only measured
+    nodes
+        whether there should be standard errors of the nodes too
 
     Attributes
     ----------
@@ -135,7 +155,7 @@ class RunningErrors:
         whether there are standard errors of the nodes too
     """
 
-    def __init__(self, record: RunRecord, prediction: Prediction | None) -> None:
+    def __init__(self, record: RunRecord, prediction: Prediction | None, *, nodes: bool = True) -> None:
         experiment = record.experiment
         self._record, self._prediction = record, prediction
         self._agents, self._replicas = experiment.agents, experiment.run.replicas
@@ -148,7 +168,7 @@ class RunningErrors:
         if prediction is not None:
             self._expected = _Expected(prediction)
             if experiment.run.pace == "lockstep":
-                self._judge = _Judge(prediction, self._replicas)
+                self._judge = _Judge(prediction, self._replicas, nodes=nodes)
                 self.nodes_judged = self._judge.nodes
 
     def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
@@ -208,14 +228,14 @@ class _Judge:
     Attributes
     ----------
     nodes
-        whether of the node errors too, and not only of the system error
+        whether of the node errors too, and not only of the system error; not where it would take too much
     """
 
-    def __init__(self, prediction: Prediction, replicas: int) -> None:
+    def __init__(self, prediction: Prediction, replicas: int, *, nodes: bool = True) -> None:
         system = prediction.system
         p = symmetric.size(system.dimension)
         agents = len(system.output)
-        self.nodes = 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
+        self.nodes = nodes and 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
         forms, _, trace = forms_of(system, "nodes" if self.nodes else "system")
         self._system, self._replicas = system, replicas
         self._values = values_of(prediction, forms)

@@ -64,6 +64,8 @@ class Timing:
         steps for which an agent used another graph than the network's of that time
     histogram
         of lateness: edges [ms] (BINS + 1,) and counts (BINS,); beyond the last edge there is nothing
+    ages
+        the same of the age of the values used
     """
 
     period_ms: float
@@ -78,6 +80,7 @@ class Timing:
     never_heard: int
     outdated_graphs: int
     histogram: tuple[FloatArray, AnyArray]
+    ages: tuple[FloatArray, AnyArray]
 
     @property
     def missed_share(self) -> float:
@@ -96,7 +99,7 @@ class Timing:
 
     def to_json(self) -> dict[str, Any]:
         """The document."""
-        edges, counts = self.histogram
+        (edges, counts), (age_edges, age_counts) = self.histogram, self.ages
         return {
             "period_ms": self.period_ms,
             "lateness_ms": _document(self.lateness_ms),
@@ -107,7 +110,12 @@ class Timing:
             "ideal_uses": {"uses": self.uses, "ideal": self.ideal_uses, "share": self.ideal_share},
             "never_heard": self.never_heard,
             "outdated_graph": {"steps": self.outdated_graphs, "share": self.outdated_share},
-            "histogram": {"lateness_ms": edges.tolist(), "steps": counts.tolist()},
+            "histogram": {
+                "lateness_ms": edges.tolist(),
+                "steps": counts.tolist(),
+                "staleness_ms": age_edges.tolist(),
+                "uses": age_counts.tolist(),
+            },
         }
 
 
@@ -133,8 +141,6 @@ def measure_timing(observation: Observation) -> Timing:
     behind = (np.arange(1, steps + 1)[:, None, None] - timers.used)[heard]
     ideal = ideal_uses(step, phase)[timers.graphs, agents] + np.arange(steps)[:, None, None]
     jitter = np.abs(np.diff(timers.made[1:], axis=0) - period) * milliseconds
-    low, high = min(0.0, float(late_ms.min(initial=0.0))), max(float(late_ms.max(initial=0.0)), 1e-3)
-    counts, edges = np.histogram(late_ms, bins=BINS, range=(low, high))
     return Timing(
         period_ms=period * milliseconds,
         lateness_ms=Quantiles.of(late_ms),
@@ -147,8 +153,15 @@ def measure_timing(observation: Observation) -> Timing:
         ideal_uses=int((heard & (timers.used == ideal)).sum()),
         never_heard=int((there & ~heard).sum()),
         outdated_graphs=int((timers.graphs != observation.modes[:, None]).sum()),
-        histogram=(edges, counts),
+        histogram=_histogram(late_ms),
+        ages=_histogram(age),
     )
+
+
+def _histogram(values: AnyArray) -> tuple[FloatArray, AnyArray]:
+    low, high = min(0.0, float(values.min(initial=0.0))), max(float(values.max(initial=0.0)), 1e-3)
+    counts, edges = np.histogram(values, bins=BINS, range=(low, high))
+    return edges, counts
 
 
 def _document(quantiles: Quantiles) -> dict[str, float | None]:

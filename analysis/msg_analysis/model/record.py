@@ -24,7 +24,7 @@ FORMAT = 1
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of what computes a run's numbers."""
+    """Versions of what computes a run's numbers, and where that is."""
     import scipy  # here, since the processes of a run only read their record
 
     return {
@@ -33,6 +33,8 @@ def software_versions() -> dict[str, str]:
         "numpy": np.__version__,
         "scipy": scipy.__version__,
         "machine": platform.machine(),
+        "system": f"{platform.system()} {platform.release()}",
+        "host": platform.node(),
     }
 
 
@@ -50,7 +52,7 @@ class RunRecord:
         (m, width) x(0). Computed once and carried along, because it comes out of linear algebra whose last bits depend
         on the machine
     versions
-        versions of the software that started the run
+        versions of the software that started the run, and the machine that it was started on
     """
 
     run: uuid.UUID

@@ -142,7 +142,7 @@ def build_model(experiment: Experiment) -> Wiring:
     return Wiring(
         links=_arcs(experiment),
         chain=experiment.chain,
-        initial=_first_graph(experiment),
+        initial=first_graph(experiment),
         dt=experiment.step_length,
         loss=experiment.noise.loss,
     )
@@ -195,7 +195,7 @@ def build_step_model(experiment: Experiment) -> StepModel:
         loss=loss,
         loss_variance=loss * (1 - loss) * coupling**2,
         chain=experiment.chain,
-        initial=_first_graph(experiment),
+        initial=first_graph(experiment),
         grounded=grounded,
         reference=reference,
         dt=dt,
@@ -223,7 +223,7 @@ def _built_in(experiment: Experiment) -> FloatArray:
     return weights
 
 
-def _first_graph(experiment: Experiment) -> FloatArray:
+def first_graph(experiment: Experiment) -> FloatArray:
     """(n,): the law of g(0)."""
     first = experiment.switching.initial
     if first == "stationary":

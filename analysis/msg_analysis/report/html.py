@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import datetime
 import os
+import platform
 import shlex
 import sys
 import tempfile
@@ -14,11 +14,18 @@ from typing import Any
 
 import jinja2
 import numpy as np
+import yaml
+from bokeh.embed import components
+from bokeh.models import UIElement
+from bokeh.resources import Resources
+from markupsafe import Markup
 
 from msg_analysis.errors import InputError
 from msg_analysis.inference.compare import Comparison
+from msg_analysis.inference.observation import bounded
 from msg_analysis.model.trajectory import Trajectory
-from msg_analysis.report import figures
+from msg_analysis.report import drawings, plots
+from msg_analysis.report.explained import explain, graph_facts
 from msg_analysis.report.text import LAWS, QUANTILES, SUPPORT, TIMES, timing_facts, verdict_line
 from msg_analysis.report.verdict_text import order_statements, sentence
 
@@ -30,6 +37,7 @@ _HEADLINES = {
 }
 _OPEN_TABLE = 12  # agents up to which the table of the nodes is open from the start
 _SMALL_CHAIN = 8  # graphs up to which all transitions are listed
+_FIRST_LINES = 5
 _NODE_TEST = "error of agent "  # how the tests of the nodes begin
 
 
@@ -95,7 +103,6 @@ def render(
     """
     document = comparison.to_json()
     experiment = trajectory.record.experiment
-    covariance = document["covariance"]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("msg_analysis.report"),
         autoescape=True,
@@ -104,22 +111,10 @@ def render(
         lstrip_blocks=True,
     )
     environment.filters |= {"number": _number, "p": _p_value, "z": _distance}
-    known = trajectory.modes[: max(document["steps"], 0)]
-    chain = experiment.chain
     names = [graph.name for graph in experiment.graph_list]
-    pictures = {
-        "graphs": figures.graphs(experiment),
-        "nodes": figures.node_errors(document["node_errors"], document["level"]),
-        "covariance": figures.covariances(_matrix(covariance["measured"]), _matrix(covariance["predicted"])),
-    }
-    if len(known):
-        pictures["modes"] = figures.active_graph(known, names, chain.stationary, experiment.step_length)
-    if len(comparison.running["time"]) > 1:
-        predicted = document["system_error"]["predicted"]
-        pictures["running"] = figures.running_estimate(comparison.running, predicted)
+    models, sojourns = _models(document, comparison, trajectory)
+    script, divs = components(models)
     timing = document["timing"]
-    if timing:
-        pictures["lateness"] = figures.lateness(timing)
     return environment.get_template("report.html.j2").render(
         document=document,
         restarts=restarts,
@@ -135,16 +130,67 @@ def render(
         order=_order(document),
         experiment=experiment,
         versions=trajectory.record.versions,
-        pictures={name: _data_uri(svg) for name, svg in pictures.items()},
+        plots={name: Markup(div) for name, div in divs.items()},
+        script=Markup(script),
+        library=Markup(Resources(mode="inline", components=["bokeh"]).js_raw[0]),
+        first_agents=_furthest(document),
+        sojourns=sojourns[1],
+        shown_sojourns=sojourns[0],
+        at_once=plots.FIRST_SOJOURNS,
+        explained=explain(experiment),
+        drawings=drawings.graph_drawings(experiment),
+        graph_facts=graph_facts(experiment),
+        chain=drawings.chain_drawing(experiment),
+        yaml=yaml.safe_dump(experiment.to_document(), sort_keys=False, allow_unicode=True, default_flow_style=None),
+        host=platform.node() or "a host without a name",
         tests=[test for test in document["tests"] if not test["name"].startswith(_NODE_TEST)],
         node_tests=_node_tests(document),
         nodes_open=experiment.agents <= _OPEN_TABLE,
         names=names,
         transitions=document["switching"]["counts"] is not None and 1 < len(names) <= _SMALL_CHAIN,
-        drawn=min(len(names), 8),
         command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         written=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
+
+
+def _models(
+    document: dict[str, Any], comparison: Comparison, trajectory: Trajectory
+) -> tuple[dict[str, UIElement], tuple[int, int]]:
+    """The figures that there are, and how many sojourns are in that of the path, of how many."""
+    experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
+    covariance, ratios = document["covariance"], document["innovations"]["ratios"]
+    models: dict[str, UIElement | None] = {
+        "nodes": plots.node_errors(document["node_errors"], document["level"]),
+        "covariance": plots.covariances(_matrix(covariance["measured"]), _matrix(covariance["predicted"])),
+    }
+    if len(comparison.running["time"]) > 1:
+        models["running"] = plots.convergence(comparison.running, document["system_error"]["predicted"])
+    known, sojourns = trajectory.modes[:steps], (0, 0)
+    if len(known):
+        names = [graph.name for graph in experiment.graph_list]
+        models["modes"], *counts = plots.active_graph(known, names, experiment.step_length)
+        sojourns = counts[0], counts[1]
+        models["occupancy"] = plots.occupancy(known, names, experiment.chain.stationary)
+        if not document["unpredicted"]:
+            reference = None if experiment.problem == "consensus" else experiment.reference
+            states = bounded(trajectory.values[:steps])
+            models["agents"] = plots.agent_convergence(
+                states, reference, experiment.step_length, document["node_errors"]
+            )
+    if ratios is not None and any(ratio is not None for ratio in ratios):
+        sizes = np.array([np.nan if ratio is None else ratio for ratio in ratios])
+        models["innovations"] = plots.innovation_sizes(sizes, document["innovations"]["samples"])
+    if document["timing"]:
+        models["lateness"] = plots.lateness(document["timing"])
+        models["staleness"] = plots.staleness(document["timing"])
+    return {name: model for name, model in models.items() if model is not None}, sojourns
+
+
+def _furthest(document: dict[str, Any]) -> list[int]:
+    """The agents whose convergence is drawn at first: those furthest off, in the order of their numbers."""
+    distances = [abs(node["z"] or 0.0) for node in document["node_errors"]]
+    most = min(len(distances), _FIRST_LINES)
+    return sorted(sorted(range(1, len(distances) + 1), key=lambda agent: -distances[agent - 1])[:most])
 
 
 def _explanation(document: dict[str, Any]) -> str:
@@ -213,11 +259,6 @@ def _p_value(p: float | None, equals: str = "") -> str:
 
 def _matrix(rows: list[list[float]] | None) -> Any:
     return None if rows is None else np.array(rows, dtype=float)
-
-
-def _data_uri(svg: str) -> str:
-    """Of a picture: inside an image, the names within one SVG cannot meddle with those of another."""
-    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()
 
 
 def _umask() -> int:

@@ -65,7 +65,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
                 "stability_limit": limit,
             }
             for graph, share, holding_time, limit in zip(
-                experiment.graph_list, chain.stationary, _holding_times(experiment), limits, strict=True
+                experiment.graph_list, chain.stationary, holding_times(experiment), limits, strict=True
             )
         ],
         "stability_limit": min((limit for limit in limits if limit is not None), default=None),
@@ -212,8 +212,8 @@ def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
     return limit if math.isfinite(limit) else None
 
 
-def _holding_times(experiment: Experiment) -> list[float | None]:
-    """Mean time in each graph at a stretch; None where it is never left."""
+def holding_times(experiment: Experiment) -> list[float | None]:
+    """Mean time [units of simulated time] in each graph at a stretch; None where it is never left."""
     matrix = experiment.chain.matrix
     leaving = (matrix - np.diag(np.diag(matrix))).sum(axis=1)
     return [1.0 / rate if rate > 0 else None for rate in leaving.tolist()]

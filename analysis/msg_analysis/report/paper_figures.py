@@ -20,7 +20,8 @@ from matplotlib.ticker import NullLocator
 from msg_analysis.errors import InputError
 from msg_analysis.model.graphs import Graph
 from msg_analysis.report import paper
-from msg_analysis.report.figures import BLACK, BLUE, GREEN, ORANGE, PURPLE, STYLE, VERMILLION, draw_graph
+from msg_analysis.report.figures import STYLE, draw_graph
+from msg_analysis.report.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILLION
 from msg_analysis.report.paper import CENTRALITY, NODE, SYSTEM, Curve, Example
 
 FORMATS = ("png", "svg", "pdf")

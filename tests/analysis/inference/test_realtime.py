@@ -124,7 +124,9 @@ def test_lockstep_is_the_same_with_or_without_a_log_of_it(late_timers):
         agent_modes=graphs, used=used, made=made,
     )  # fmt: skip
     found = innovation_tests(observe(logged))
-    assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(plain), rel=1e-6)
+    found, plain = dataclasses.asdict(found), dataclasses.asdict(plain)
+    assert found.pop("ratios") == pytest.approx(plain.pop("ratios"), rel=1e-6)
+    assert found == pytest.approx(plain, rel=1e-6)
 
 
 def test_regression_frees_innovations_of_those_made_before(late_timers):

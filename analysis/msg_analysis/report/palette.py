@@ -1,0 +1,20 @@
+"""Colours of Okabe and Ito, which the colour-blind can tell apart; shapes and line styles go with them."""
+
+from __future__ import annotations
+
+BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
+    *("#000000", "#E69F00", "#56B4E9", "#009E73"),
+    *("#F0E442", "#0072B2", "#D55E00", "#CC79A7"),
+)
+MODE_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, YELLOW, BLACK)
+GREY, PALE, INK = "#6b7280", "#e5e7eb", "#374151"
+
+
+def mode_colour(mode: int) -> str:
+    """Of a graph, index from 0."""
+    return MODE_COLOURS[mode % len(MODE_COLOURS)]
+
+
+def shorten(name: str, length: int = 18) -> str:
+    """Short enough for a label."""
+    return name if len(name) <= length else name[: length - 1] + "…"

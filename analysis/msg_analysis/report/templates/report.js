@@ -1,0 +1,115 @@
+"use strict";
+// Choosing agents: by numbers in the field, or in the figure; the table and the lines follow.
+(() => {
+  const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a7d00"];
+  const DASHES = ["solid", "dashed", "dotted", "dotdash"];
+  const MOST = 8, MOST_BANDS = 3;
+  const field = document.getElementById("agents");
+  const said = document.getElementById("chosen");
+  const rows = [...document.querySelectorAll("#node-table tbody tr")];
+  const first = JSON.parse(document.body.dataset.first);
+  let model = () => null;
+  let busy = false;
+
+  function parse(text) {
+    const chosen = new Set();
+    for (const part of text.split(/[\s,;]+/).filter(Boolean)) {
+      const found = /^(\d+)(?:[-–](\d+))?$/.exec(part);
+      const from = found ? Number(found[1]) : 0, to = found ? Number(found[2] || found[1]) : 0;
+      if (!found || from < 1 || to > rows.length || from > to) return { wrong: part };
+      for (let agent = from; agent <= to; agent += 1) chosen.add(agent);
+    }
+    return { agents: [...chosen].sort((a, b) => a - b) };
+  }
+
+  function draw(agents) {
+    const lines = model("lines"), bands = model("bands"), all = model("all_agents");
+    if (!lines || !all) return;
+    const times = model("all_times").data.time, parts = all.data.part, widths = model("all_widths").data.width;
+    const points = times.length, last = times[points - 1];
+    const known = agents.filter((agent) => !Number.isNaN(parts[(agent - 1) * points + points - 1])).slice(0, MOST);
+    const x = Array.from(times);
+    lines.data = {
+      xs: known.map(() => x),
+      ys: known.map((agent) => Array.from(parts.slice((agent - 1) * points, agent * points))),
+      agent: known.map((agent) => `agent ${agent}`),
+      colour: known.map((_, place) => COLOURS[place % COLOURS.length]),
+      dash: known.map((_, place) => DASHES[place % DASHES.length]),
+    };
+    const banded = known.filter((agent) => known.length <= MOST_BANDS && Number.isFinite(widths[agent - 1]));
+    bands.data = {
+      xs: banded.map(() => x.concat(x.slice().reverse())),
+      ys: banded.map((agent) => {
+        const half = x.map((time) => widths[agent - 1] * Math.sqrt(last / time));
+        return half.map((value) => 1 + value).concat(half.map((value) => 1 - value).reverse());
+      }),
+      colour: banded.map((agent) => COLOURS[known.indexOf(agent) % COLOURS.length]),
+    };
+  }
+
+  // agents: numbers from 1; none: all in the table, the first choice as lines.
+  function choose(agents) {
+    busy = true;
+    const chosen = new Set(agents);
+    rows.forEach((row, place) => { row.hidden = chosen.size > 0 && !chosen.has(place + 1); });
+    if (chosen.size > 0) document.getElementById("node-details").open = true;
+    const nodes = model("nodes");
+    if (nodes) nodes.selected.indices = agents.map((agent) => agent - 1);
+    draw(agents.length ? agents : first);
+    said.textContent = agents.length > MOST ? `${agents.length} agents; lines of the first ${MOST}` :
+      agents.length ? `${agents.length} of ${rows.length} agents` : "";
+    busy = false;
+  }
+
+  function start() {
+    const shown = window.Bokeh && window.Bokeh.documents[0];
+    if (!shown) return setTimeout(start, 20);
+    model = (name) => shown.get_model_by_name(name);
+    const nodes = model("nodes");
+    if (nodes) nodes.selected.properties.indices.change.connect(() => {
+      if (busy) return;
+      const agents = nodes.selected.indices.map((index) => index + 1).sort((a, b) => a - b);
+      field.value = agents.join(", ");
+      choose(agents);
+    });
+    choose([]);
+    const drawn = () => { document.body.dataset.ready = "yes"; };
+    if (shown.is_idle) drawn();
+    else shown.idle.connect(drawn);
+  }
+
+  field.addEventListener("input", () => {
+    const { agents, wrong } = parse(field.value);
+    if (wrong === undefined) choose(agents);
+    else said.textContent = `${wrong}: expected numbers from 1 to ${rows.length}, such as 3, 10-14`;
+  });
+  document.getElementById("all-agents").addEventListener("click", () => { field.value = ""; choose([]); });
+
+  // On paper nothing can be opened, and figures, which keep the width of the screen, would be cut: pictures are not.
+  let closed = [], pictures = [];
+  window.addEventListener("beforeprint", () => {
+    closed = [...document.querySelectorAll("details:not([open])")];
+    closed.forEach((one) => { one.open = true; });
+    if (!window.Bokeh) return;
+    for (const view of window.Bokeh.index.roots) {
+      const place = view.el.closest(".plot") || view.el.getRootNode().host?.closest(".plot");
+      if (!place) continue;
+      const canvas = view.export("png", true).canvas;
+      const picture = new Image();
+      picture.src = canvas.toDataURL();
+      picture.style.width = `${view.el.clientWidth}px`;
+      place.append(picture);
+      place.classList.add("pictured");
+      pictures.push([place, picture]);
+    }
+  });
+  window.addEventListener("afterprint", () => {
+    closed.forEach((one) => { one.open = false; });
+    for (const [place, picture] of pictures) {
+      picture.remove();
+      place.classList.remove("pictured");
+    }
+    pictures = [];
+  });
+  start();
+})();

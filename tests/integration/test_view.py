@@ -1,0 +1,156 @@
+"""What people see of a running network: the panel on a terminal, lines elsewhere, the page in a browser."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from browser import Log, chromium
+from terminal import Terminal
+
+PROGRAM = Path(sys.executable).with_name("msg-agents")
+HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
+
+
+@pytest.fixture
+def terminal(network: Any) -> Iterator[Any]:
+    opened: list[Terminal] = []
+
+    def start(*command: str | Path, **size: int) -> Terminal:
+        opened.append(Terminal(*command, **size))
+        return opened[-1]
+
+    yield start
+    for each in opened:
+        each.close()
+
+
+def _long(network: Any) -> Path:
+    """Paced, so that it takes long enough to be looked at on any machine: 8 s."""
+    return network.file(run={"pace": "realtime", "speed": 5, "duration": 40})  # type: ignore[no-any-return]
+
+
+def _bottom(screen: Terminal) -> int:
+    """Width of the newest panel."""
+    return max(map(len, re.findall(r"╰─*╯", screen.text)[-1:]), default=0)
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
+
+
+def test_panel_and_ctrl_c(network: Any, terminal: Any) -> None:
+    """Graph, steps and errors; smaller windows get less; Ctrl-C ends the run in order and leaves the terminal tidy."""
+    screen = terminal(PROGRAM, "run", _long(network), "--out", network.directory / "runs")
+    screen.wait_for("starting")
+    screen.wait_for("predicted 1.", seconds=60)
+    screen.read(0.5)
+    seen = _plain(screen.text)
+    assert re.search(r"step \d+ of 800 +\d+ % +\d+ steps/s", seen)
+    assert re.search(r"graph (line|ring) +for [\d.e-]+ units of time", seen)
+    assert re.search(r"│ +5 +\d+ +\d+ +[\d.]+ +[\d.]+", seen)
+    screen.resize(40, 10)
+    network.wait_for(lambda: screen.read(0.1) and _bottom(screen) == 40, 5, "a narrow panel")
+    screen.type(b"\x03")
+    assert screen.read_to_the_end() == 3
+    assert "ended by SIGINT" in _plain(screen.text)
+    assert "Traceback" not in screen.text
+    assert screen.text.rindex(SHOW_CURSOR) > screen.text.rindex(HIDE_CURSOR)
+    assert screen.mode() == screen.before
+
+
+def test_json_on_a_terminal_is_json_elsewhere(network: Any, terminal: Any) -> None:
+    """The panel goes to stderr: stdout is one object."""
+    out = network.directory / "result"
+    command = f"exec {PROGRAM} run {network.file()} --out {network.directory / 'runs'} --json > {out}"
+    screen = terminal("sh", "-c", command)
+    assert screen.read_to_the_end() in (0, 1)
+    assert json.loads(out.read_text())["steps"] == 300
+    assert "net: 5 agents, lockstep" in _plain(screen.text)
+    assert "verdict" not in screen.text
+
+
+@pytest.fixture
+def page(network: Any) -> Iterator[Any]:
+    with chromium() as browser:
+        yield browser.new_page()
+
+
+def _address(process: subprocess.Popen[str]) -> str:
+    assert process.stderr is not None
+    for line in process.stderr:
+        if found := re.search(r"live page at (http://127\.0\.0\.1:\d+/)", line):
+            return found[1]
+    raise AssertionError("no page")
+
+
+def _follow(page: Any, address: str) -> Log:
+    log = Log(page)
+    page.goto(address)
+    page.wait_for_selector("#chart polyline", state="attached")
+    return log
+
+
+def test_page_of_a_run(network: Any, page: Any) -> None:
+    """Steps, graph, states and errors come in; the end is told, with the verdict and the numbers of the comparison."""
+    run = network.start("run", network.file(), "--out", network.directory / "runs", "--json", "--web", "0")
+    log = Log(page)
+    page.goto(address := _address(run))
+    page.wait_for_selector("body[data-over=yes]")
+    assert log.complaints == []
+    assert set(log.requests) == {address, f"{address}events"}
+    stdout, stderr = run.communicate(timeout=60)
+    result = json.loads(stdout)
+    assert "Traceback" not in stderr
+    assert {0: "agrees", 1: "disagrees"}[run.returncode] == page.get_attribute("#state", "class")
+    assert "The run has ended" in page.inner_text("#state")
+    assert page.inner_text("#step") == "300 of 300"
+    assert page.inner_text("#graph") in ("line", "ring")
+    assert page.locator("#network line.active").count() in (4, 5)
+    assert page.locator("#agents tr").count() == 5
+    error = result["system_error"]
+    assert float(page.inner_text("#measured")) == pytest.approx(error["measured"], rel=1e-3)
+    assert float(page.inner_text("#predicted")) == pytest.approx(error["predicted"], rel=1e-3)
+
+
+def test_page_of_a_run_in_time_and_two_browsers(network: Any, page: Any) -> None:
+    """While it goes on: the active graph and the numbers change, for several browsers; one closes, nothing stops."""
+    run = network.start("run", _long(network), "--out", network.directory / "runs", "--web", "0")
+    log = _follow(page, address := _address(run))
+    other = page.context.browser.new_page()
+    _follow(other, address)
+    other.close()
+    step = int(page.inner_text("#step").split()[0])
+    page.locator("#step", has_text=re.compile(rf"^(?!{step} of)\d+ of 800")).wait_for()
+    assert page.inner_text("#state") == "running"
+    fills = page.evaluate("[...document.querySelectorAll('#network circle')].map((one) => one.getAttribute('fill'))")
+    assert len(fills) == 5
+    assert len(set(fills)) > 1
+    run.send_signal(signal.SIGINT)
+    page.wait_for_selector("body[data-over=yes]")
+    assert "ended by SIGINT" in page.inner_text("#state")
+    assert log.complaints == []
+    run.communicate(timeout=60)
+    assert run.returncode == 3
+
+
+def test_page_of_a_replay(network: Any, domain: int, twin_bag: Path, page: Any) -> None:
+    live = network.start("live", "--web", "0", "--json", "--reliable", "--timeout", "60")
+    address = _address(live)
+    play = network.start("play", twin_bag, "--rate", "5", "--await", "live")
+    log = _follow(page, address)
+    page.wait_for_selector("body[data-over=yes]")
+    assert log.complaints == []
+    stdout, _ = live.communicate(timeout=60)
+    play.communicate(timeout=60)
+    assert (live.returncode, play.returncode) == (0, 0)
+    assert page.inner_text("#step") == "300 of 300"
+    measured = json.loads(stdout)["system_error"]["measured"]
+    assert float(page.inner_text("#measured")) == pytest.approx(measured, rel=1e-3)

@@ -1,0 +1,86 @@
+"""A terminal for tests: what a program prints on it, and what is typed."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import subprocess
+import termios
+import time
+from pathlib import Path
+from typing import Any
+
+
+class Terminal:
+    """A program on a terminal of its own."""
+
+    def __init__(self, *command: str | Path, columns: int = 80, rows: int = 24) -> None:
+        self._master, slave = pty.openpty()
+        termios.tcsetwinsize(slave, (rows, columns))
+        self.before = termios.tcgetattr(slave)
+        self._slave = slave
+        self.text = ""
+
+        def own() -> None:
+            os.setsid()
+            import fcntl
+
+            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+
+        self.process = subprocess.Popen(
+            command,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            preexec_fn=own,
+            env=dict(
+                os.environ
+            ),  # as Python knows it: readline adds a COLUMNS behind its back, which would fix the width
+        )
+
+    def type(self, keys: bytes) -> None:
+        os.write(self._master, keys)
+
+    def mode(self) -> list[Any]:
+        return termios.tcgetattr(self._slave)
+
+    def local_flags(self) -> int:
+        """Whether lines are edited, and whether what is typed is shown."""
+        return int(termios.tcgetattr(self._slave)[3] & (termios.ICANON | termios.ECHO))
+
+    def read(self, seconds: float) -> str:
+        """What is printed within so much time."""
+        end, new = time.monotonic() + seconds, ""
+        while (left := end - time.monotonic()) > 0:
+            if select.select([self._master], [], [], left)[0]:
+                new += os.read(self._master, 65536).decode(errors="replace")
+        self.text += new
+        return new
+
+    def wait_for(self, *texts: str, seconds: float = 30) -> None:
+        """Until one of them is printed, wherever the lines are wrapped."""
+        end = time.monotonic() + seconds
+        while not any(text in self.text.replace("\r\n", "") for text in texts):
+            assert time.monotonic() < end, f"no {texts} in {self.text!r}"
+            self.read(0.1)
+
+    def resize(self, columns: int, rows: int) -> None:
+        """Make the window larger or smaller; the program is told."""
+        termios.tcsetwinsize(self._slave, (rows, columns))
+
+    def read_to_the_end(self, seconds: float = 120) -> int:
+        """Until the program ends; its exit code."""
+        end = time.monotonic() + seconds
+        while self.process.poll() is None:
+            assert time.monotonic() < end, f"still running: {self.text[-2000:]!r}"
+            self.read(0.1)
+        self.read(0.2)
+        return self.process.returncode
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        os.close(self._master)
+        os.close(self._slave)
