@@ -37,6 +37,11 @@ def _long(network: Any) -> Path:
     return network.file(run={"pace": "realtime", "speed": 5, "duration": 40})  # type: ignore[no-any-return]
 
 
+def _bottom(screen: Terminal) -> int:
+    """Width of the newest panel."""
+    return max(map(len, re.findall(r"╰─*╯", screen.text)[-1:]), default=0)
+
+
 def _plain(text: str) -> str:
     return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
 
@@ -51,12 +56,8 @@ def test_panel_and_ctrl_c(network: Any, terminal: Any) -> None:
     assert re.search(r"step \d+ of 800 +\d+ % +\d+ steps/s", seen)
     assert re.search(r"graph (line|ring) +for [\d.e-]+ units of time", seen)
     assert re.search(r"│ +5 +\d+ +\d+ +[\d.]+ +[\d.]+", seen)
-    before = len(screen.text)
     screen.resize(40, 10)
-    screen.read(1.0)
-    narrow = [line for line in _plain(screen.text[before:]).split("\n") if line.startswith("│")]
-    assert narrow
-    assert max(len(line.rstrip("\r")) for line in narrow[-5:]) <= 40
+    network.wait_for(lambda: screen.read(0.1) and _bottom(screen) == 40, 5, "a narrow panel")
     screen.type(b"\x03")
     assert screen.read_to_the_end() == 3
     assert "ended by SIGINT" in _plain(screen.text)
@@ -143,7 +144,7 @@ def test_page_of_a_run_in_time_and_two_browsers(network: Any, page: Any) -> None
 def test_page_of_a_replay(network: Any, domain: int, twin_bag: Path, page: Any) -> None:
     live = network.start("live", "--web", "0", "--json", "--reliable", "--timeout", "60")
     address = _address(live)
-    play = network.start("play", twin_bag, "--rate", "3", "--await", "live")
+    play = network.start("play", twin_bag, "--rate", "5", "--await", "live")
     log = _follow(page, address)
     page.wait_for_selector("body[data-over=yes]")
     assert log.complaints == []

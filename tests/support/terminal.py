@@ -34,6 +34,9 @@ class Terminal:
             stdout=slave,
             stderr=slave,
             preexec_fn=own,
+            env=dict(
+                os.environ
+            ),  # as Python knows it: readline adds a COLUMNS behind its back, which would fix the width
         )
 
     def type(self, keys: bytes) -> None:

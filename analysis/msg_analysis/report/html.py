@@ -136,6 +136,7 @@ def render(
         first_agents=_furthest(document),
         sojourns=sojourns[1],
         shown_sojourns=sojourns[0],
+        at_once=plots.FIRST_SOJOURNS,
         explained=explain(experiment),
         drawings=drawings.graph_drawings(experiment),
         graph_facts=graph_facts(experiment),

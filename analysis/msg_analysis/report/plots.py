@@ -42,7 +42,7 @@ HALF = 1.959963984540054  # standard errors to either side of a 95 % interval
 MOST_LINES = 8
 """Agents whose convergence is drawn at once."""
 _NUMBERED = 8  # agents up to which heat maps show their numbers
-_FIRST_SOJOURNS, _MOST_SOJOURNS = 120, 4000  # shown at first; kept
+FIRST_SOJOURNS, _MOST_SOJOURNS = 120, 4000  # shown at first; kept
 _POINTS = 200  # of the convergence of an agent
 _SANS = "system-ui, -apple-system, 'Segoe UI', 'Noto Sans', 'DejaVu Sans', sans-serif"
 
@@ -337,7 +337,7 @@ def active_graph(modes: IntArray, names: Sequence[str], dt: float) -> tuple[UIEl
         "colour": [mode_colour(g) for g in mode[known].tolist()],
         "held": (ends - starts)[:kept][known] * dt,
     }
-    first = ends[min(kept, _FIRST_SOJOURNS) - 1] * dt
+    first = ends[min(kept, FIRST_SOJOURNS) - 1] * dt
     path = _figure(
         _height(names),
         "xpan,xbox_zoom,xwheel_zoom,reset,save",
