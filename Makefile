@@ -68,6 +68,7 @@ bench: setup ## Measure speed side by side with the bare middleware, other solve
 	$(BIN)/python benchmarks/moments.py
 	$(BIN)/python benchmarks/leaders.py
 	$(BIN)/python benchmarks/reading.py
+	$(BIN)/python benchmarks/sweep.py
 
 calibrate: setup ## Measure error rates and power of the verdict into docs/statistics.md: some 10 minutes on two CPUs
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --write

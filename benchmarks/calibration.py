@@ -13,23 +13,22 @@ import dataclasses
 import functools
 import hashlib
 import json
-import multiprocessing
 import re
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
-from threadpoolctl import threadpool_limits
 
 import msg_analysis
 from msg_analysis.inference.compare import Comparison, compare
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord
+from msg_analysis.sweep.workers import Lost, Workers
 from msg_analysis.twin import new_record, simulate
 
 ROOT = Path(__file__).parents[1]
@@ -132,7 +131,7 @@ def experiment(case: str) -> tuple[Experiment, Experiment]:
     return Experiment.parse(FALSE[case][0]), Experiment.parse(line_ring(**LONG))
 
 
-def one_run(job: tuple[str, int]) -> tuple[str, int, dict[str, Any]]:
+def one_run(job: tuple[str, int], _stopping: Callable[[], bool]) -> dict[str, Any]:
     """Simulate and compare a run; what is kept of it."""
     case, number = job
     # Runs of different experiments with equal seeds would have the same noise.
@@ -141,7 +140,7 @@ def one_run(job: tuple[str, int]) -> tuple[str, int, dict[str, Any]]:
     record = new_record(claimed)
     trajectory = simulate(true, record=RunRecord(record.run, true, record.start))
     comparison = compare(dataclasses.replace(trajectory, record=record, lost=None))
-    return case, number, summary(case, comparison)
+    return summary(case, comparison)
 
 
 def summary(case: str, comparison: Comparison) -> dict[str, Any]:
@@ -207,12 +206,18 @@ def run_all(runs: Mapping[str, int], store: Path, processes: int) -> dict[str, l
     jobs = [(case, seed) for case, count in runs.items() for seed in range(count) if (case, seed) not in done]
     jobs.sort(key=lambda job: job[1])  # all cases side by side, so that the time left can be told
     begin = time.monotonic()
-    with multiprocessing.Pool(processes, initializer=threadpool_limits, initargs=(1,)) as pool, store.open("a") as file:
-        for count, (case, seed, kept) in enumerate(pool.imap_unordered(one_run, jobs, chunksize=4), start=1):
-            done[case, seed] = kept
-            file.write(json.dumps([case, seed, kept]) + "\n")
+    told = count = 0
+    with Workers(processes) as pool, store.open("a") as file:
+        for batch in pool.outcomes(one_run, jobs):
+            for (case, seed), kept in batch:
+                if isinstance(kept, Lost):
+                    sys.exit(f"error: {case}, run {seed}: {kept.reason}")
+                done[case, seed] = kept
+                file.write(json.dumps([case, seed, kept]) + "\n")
             file.flush()
-            if count % 100 == 0:
+            count += len(batch)
+            if count // 100 > told:
+                told = count // 100
                 left = (time.monotonic() - begin) / count * (len(jobs) - count) / 60
                 print(f"{count} of {len(jobs)} runs, {left:.0f} minutes left", file=sys.stderr, flush=True)
     return {case: [done[case, seed] for seed in range(count)] for case, count in runs.items()}

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 import click
 
 import msg_analysis
-from msg_analysis import cli_compare, cli_theory
+from msg_analysis import cli_compare, cli_sweep, cli_theory
 from msg_analysis.cli_storage import storage, storage_options
 from msg_analysis.console import CommandGroup, examples, print_json, result_console
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
     from msg_analysis.bags.storage import Compression
+    from msg_analysis.sweep.conduct import OtherSoftware
 
 
 _json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
@@ -134,7 +135,13 @@ def leaders(experiment: Path, count: int, method: str, law: str | None, gain: fl
         print_leaders(document, result_console())
 
 
-@main.command(epilog=examples("msg-analysis figures", "msg-analysis figures 3 --out paper --format pdf"))
+@main.command(
+    epilog=examples(
+        "msg-analysis figures",
+        "msg-analysis figures 3 --out paper --format pdf",
+        "msg-analysis figures 1 --emulate",
+    )
+)
 @click.argument("example", type=click.Choice(["1", "2", "3", "all"]), default="all")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("figures"), help="Directory; figures by default.")
 @click.option(
@@ -145,15 +152,34 @@ def leaders(experiment: Path, count: int, method: str, law: str | None, gain: fl
     default=("png", "svg", "pdf"),
     help="May be given several times; all three by default.",
 )
-def figures(example: str, out: Path, formats: tuple[str, ...]) -> None:
+@click.option(
+    "--emulate", is_flag=True, help="Run networks as well (msg-agents, minutes), and draw what they measured."
+)
+@cli_sweep.other_software
+@click.pass_context
+def figures(
+    context: click.Context,
+    example: str,
+    out: Path,
+    formats: tuple[str, ...],
+    *,
+    emulate: bool,
+    other_software: OtherSoftware,
+) -> None:
     """Draw the EXAMPLEs of the paper, with the numbers as CSV; print the files' names.
 
-    Files of the same names in the directory are replaced.
+    Files of the same names in the directory are replaced. With --emulate, real networks are run and their points drawn
+    on the curves, in files of their own; what has been run is kept, and exit code 1 says that some point disagrees with
+    theory, 3 that some network failed.
     """
     from msg_analysis.report.paper_figures import write_figures
 
-    for number in (1, 2, 3) if example == "all" else (int(example),):
-        for path in write_figures([number], out, tuple(dict.fromkeys(formats))):
+    numbers = (1, 2, 3) if example == "all" else (int(example),)
+    chosen = tuple(dict.fromkeys(formats))
+    if emulate:
+        context.exit(cli_sweep.emulate(context, numbers, out, chosen, other_software))
+    for number in numbers:
+        for path in write_figures([number], out, chosen):
             click.echo(path)
 
 
@@ -201,12 +227,19 @@ main.add_command(cli_compare.compare)
 main.add_command(cli_compare.tabulate)
 main.add_command(cli_theory.transient)
 main.add_command(cli_theory.facts)
+main.add_command(cli_sweep.sweep)
 
 
-@main.command(epilog=examples("msg-analysis schema > experiment.schema.json"))
-def schema() -> None:
-    """Print the JSON Schema of experiment files, for editors."""
-    from msg_analysis.model.experiment import json_schema
+@main.command(
+    epilog=examples("msg-analysis schema > experiment.schema.json", "msg-analysis schema sweep > sweep.schema.json")
+)
+@click.argument("what", type=click.Choice(["experiment", "sweep"]), default="experiment")
+def schema(what: str) -> None:
+    """Print the JSON Schema of experiment files, or of sweep files, for editors."""
+    if what == "sweep":
+        from msg_analysis.sweep.spec import json_schema
+    else:
+        from msg_analysis.model.experiment import json_schema
 
     click.echo(json.dumps(json_schema(), indent=2))
 

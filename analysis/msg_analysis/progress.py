@@ -8,6 +8,66 @@ from types import TracebackType
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal
 
 
+class SweepProgress:
+    """How far a sweep is, to be used with ``with``.
+
+    Parameters
+    ----------
+    title
+        what is being worked on
+    """
+
+    def __init__(self, title: str) -> None:
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        console = Console(stderr=True, highlight=False, markup=False)
+        self._bar = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[failed]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+            transient=True,
+        )
+        self._console = console
+        self._title = title
+        self._task = self._bar.add_task(title, total=None, failed="")
+        self._told = time.monotonic()
+
+    def __enter__(self) -> SweepProgress:
+        self._bar.start()
+        return self
+
+    def checked(self, done: int, total: int) -> None:
+        """So many of the points have been checked."""
+        self.done(done, total, 0)
+
+    def done(self, done: int, total: int, failed: int) -> None:
+        """So many points are done, and so many of these failed; see ``Watch`` of ``msg_analysis.sweep.conduct``."""
+        without = f"{failed} without a result" if failed else ""
+        self._bar.update(self._task, completed=done, total=total, failed=without)
+        if not self._console.is_terminal and time.monotonic() - self._told >= _LINE_PERIOD:
+            self._told = time.monotonic()
+            self._console.print(f"{self._title}: {done} of {total}{', ' if without else ''}{without}")
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+
 class SolveProgress:
     """How far a search is: a ``Watch`` of ``msg_analysis.theory.leader_search``, to be used with ``with``.
 

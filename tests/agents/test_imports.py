@@ -16,8 +16,8 @@ import msg_analysis
 
 ANALYSIS = Path(msg_analysis.__file__).parent
 AGENTS = Path(msg_agents.__file__).parent
-ROOMS = ["base", "model", "theory", "twin", "bags", "inference", "report", "cli"]
-BASE = {"__init__", "errors", "types", "console"}  # what every room may use
+ROOMS = ["base", "model", "theory", "twin", "bags", "inference", "sweep", "report", "cli"]
+BASE = {"__init__", "errors", "types", "console", "files"}  # what every room may use
 ROS = ("rclpy", "msg_agents", "rosidl", "ament", "launch")
 
 

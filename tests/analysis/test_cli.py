@@ -19,8 +19,8 @@ from msg_analysis.model import experiment as experiments
 ROOT = Path(__file__).parents[2]
 GOLDEN = ROOT / "tests/data/golden"
 LINE_RING = str(GOLDEN / "line_ring.yaml")
-HEAVY = ["numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich"]
-COMMANDS = ["compare", "facts", "info", "predict", "salvage", "schema", "simulate", "transient"]
+HEAVY = ["numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich", "dask", "distributed", "pyarrow"]
+COMMANDS = ["compare", "facts", "info", "predict", "salvage", "schema", "simulate", "sweep", "transient"]
 
 
 def call(*arguments: str | Path) -> Result:

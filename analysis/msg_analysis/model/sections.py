@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,13 @@ from msg_analysis.model.problems import problem, translate
 from msg_analysis.model.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.model.spec import ExperimentSpec, GraphSpec, RunSpec
 from msg_analysis.types import FloatArray
+
+
+@functools.cache
+def _adapter(key: str) -> TypeAdapter[Any]:
+    """What checks one section; to make it takes longer than to use it."""
+    annotation: Any = ExperimentSpec.model_fields[key].annotation
+    return TypeAdapter(annotation)
 
 
 class Sections:
@@ -52,8 +60,7 @@ class Sections:
             info = ExperimentSpec.model_fields[key]
             if key not in mapping:
                 return info.get_default(call_default_factory=True, validated_data={})
-            annotation: Any = info.annotation
-            return TypeAdapter(annotation).validate_python(mapping[key])
+            return _adapter(key).validate_python(mapping[key])
 
         self.values = {key: section(key) for key in ExperimentSpec.model_fields}
         self.known = set(self.values) - bad

@@ -5,21 +5,22 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib import transforms as mtransforms
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import NullLocator
 
 from msg_analysis.errors import InputError
+from msg_analysis.files import write_whole
 from msg_analysis.model.graphs import Graph
-from msg_analysis.report import paper
+from msg_analysis.report import emulation, paper
+from msg_analysis.report.emulation import Measured
 from msg_analysis.report.figures import BLACK, BLUE, GREEN, ORANGE, PURPLE, STYLE, VERMILLION, draw_graph
 from msg_analysis.report.paper import CENTRALITY, NODE, SYSTEM, Curve, Example
 
@@ -60,10 +61,22 @@ _LOOKS = (
 _MARKERS = 5  # on a curve
 _GREY = "#4b5563"
 _LINE = 0.125  # inches from one label to the next
+_SIDE = 0.05  # inches between points that belong to the same place
+_NOTE = (
+    "Curves: continuous time.  Points: networks of ROS 2 processes, 95 % intervals.  "
+    f"Dashes: exact for their steps (dt = {emulation.DT:g})."
+)
 
 
-def write_figures(numbers: Sequence[int], directory: str | Path, formats: Sequence[str] = FORMATS) -> list[Path]:
+def write_figures(
+    numbers: Sequence[int],
+    directory: str | Path,
+    formats: Sequence[str] = FORMATS,
+    measured: Sequence[Measured] = (),
+) -> list[Path]:
     """Write examples of the paper: ``example_<number>`` in every format, and the numbers as CSV.
+
+    With measured points these are on the curves, and ``_emulated`` is appended to the names.
 
     Files of these names are replaced, whole or not at all; nothing else in the directory is touched. The same
     versions of the packages write the same bytes.
@@ -76,6 +89,8 @@ def write_figures(numbers: Sequence[int], directory: str | Path, formats: Sequen
         made where it does not exist
     formats
         Sequence[str] "png", "svg", "pdf"
+    measured
+        Sequence[Measured] of networks that were run
 
     Returns
     -------
@@ -93,12 +108,13 @@ def write_figures(numbers: Sequence[int], directory: str | Path, formats: Sequen
         directory.mkdir(parents=True, exist_ok=True)
         for number in numbers:
             example = paper.EXAMPLES[number]()
-            stem = f"example_{number}"
+            stem = f"example_{number}{'_emulated' if measured else ''}"
             with mpl.rc_context(_STYLE):
-                figure = draw(example)
+                figure = draw(example, measured)
                 for name in formats:
-                    written.append(_replace(directory / f"{stem}.{name}", _rendered(figure, name)))
-            written.append(_replace(directory / f"{stem}.csv", csv_text(example).encode()))
+                    written.append(write_whole(directory / f"{stem}.{name}", _rendered(figure, name)))
+            text = emulation.csv_text(number, measured) if measured else csv_text(example)
+            written.append(write_whole(directory / f"{stem}.csv", text.encode()))
     except OSError as error:
         place = error.filename or directory
         raise InputError(f"{place}: cannot be written ({error.strerror}): choose another place with --out") from error
@@ -116,20 +132,24 @@ def csv_text(example: Example) -> str:
     return text.getvalue()
 
 
-def draw(example: Example) -> Figure:
+def draw(example: Example, measured: Sequence[Measured] = ()) -> Figure:
     """The figure of an example; the caller sets the style.
 
     Parameters
     ----------
     example
         of ``msg_analysis.report.paper``
+    measured
+        Sequence[Measured] points that are drawn on its curves
     """
-    figure = {1: _draw_1, 2: _draw_2, 3: _draw_3}[example.number](example)
+    figure = {1: _draw_1, 2: _draw_2, 3: _draw_3}[example.number](example, measured)
+    if measured:
+        figure.supxlabel(_NOTE, size=7.5, color=_GREY)
     _settle(figure)
     return figure
 
 
-def _draw_1(example: Example) -> Figure:
+def _draw_1(example: Example, measured: Sequence[Measured]) -> Figure:
     figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=(0.6, 1, 1))
     for row, graph in enumerate(example.networks["line_ring"]):
@@ -143,15 +163,15 @@ def _draw_1(example: Example) -> Figure:
         node.set(ylabel="node certainty $1/E_i$", ylim=(1.3, 5.4), xlim=(0, 5), xlabel=_rate(swept))
         curves = [c for c in example.select("line_ring", SYSTEM) if np.ptp(getattr(c, swept)) > 0]
         named = [(f"{getattr(curve, held)[0]:g}", curve) for curve in curves]
-        _plot(system, swept, named, heading=_rate(held), height=1.45)
+        _plot(system, swept, named, heading=_rate(held), height=1.45, measured=measured)
         nodes = _coinciding([c for c in example.select("line_ring", NODE) if np.ptp(getattr(c, swept)) > 0])
-        _plot(node, swept, nodes, heading="agents", height=1.45)
+        _plot(node, swept, nodes, heading="agents", height=1.45, measured=measured)
         system.set_title(rf"({'cd'[row]}) $\epsilon$ = {curves[0].epsilon[0]:g}", loc="left")
         node.set_title(f"({'ef'[row]}) {_rate(held)} = 1", loc="left")
     return figure
 
 
-def _draw_2(example: Example) -> Figure:
+def _draw_2(example: Example, measured: Sequence[Measured]) -> Figure:
     figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
     grid = figure.add_gridspec(1, 3, width_ratios=(0.5, 1, 1))
     places = grid[0].subgridspec(3, 1)
@@ -163,11 +183,13 @@ def _draw_2(example: Example) -> Figure:
     system = figure.add_subplot(grid[1])
     system.set(ylabel="system certainty $1/E$", xlabel=rates, xlim=(0, 1), ylim=(0.495, 0.645))
     curves = example.select("three_lines", SYSTEM)
-    _plot(system, "r12", [(f"{c.epsilon[0]:g}", c) for c in curves], heading=r"$\epsilon$", height=3.1)
+    _plot(
+        system, "r12", [(f"{c.epsilon[0]:g}", c) for c in curves], heading=r"$\epsilon$", height=3.1, measured=measured
+    )
     for (colour, _, _), curve in zip(_LOOKS, curves, strict=False):
         peak = (curve.r12[curve.peak], curve.value[curve.peak])
         system.plot(*peak, "*", ms=9, color=colour, mec="white", mew=0.6, zorder=4)
-        text = f"{peak[1]:.4f}"
+        text = "" if measured else f"{peak[1]:.4f}"
         system.annotate(text, peak, (0, 6), textcoords="offset points", ha="center", color=colour, size=7.5)
     system.set_title("(d) largest values: stars", loc="left")
     halves = grid[2].subgridspec(2, 1)
@@ -175,12 +197,12 @@ def _draw_2(example: Example) -> Figure:
     for letter, panel, scale in zip("ef", panels, paper.NODE_SCALES, strict=True):
         panel.set(ylabel="node certainty $1/E_i$", xlabel=rates, xlim=(0, 1), ylim=(1.5, 5.2))
         nodes = _coinciding([c for c in example.select("three_lines", NODE) if c.epsilon[0] == scale])
-        _plot(panel, "r12", nodes, heading="agents", height=1.4)
+        _plot(panel, "r12", nodes, heading="agents", height=1.4, measured=measured)
         panel.set_title(rf"({letter}) $\epsilon$ = {scale:g}", loc="left")
     return figure
 
 
-def _draw_3(example: Example) -> Figure:
+def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
     figure = Figure(figsize=(WIDTH, 5.4), layout=ConstrainedLayoutEngine(hspace=0.04))
     letters = iter("abcdefghij")
     names = {"knife_edge": "Knife-edge pair", "smallest": "Smallest pair"}
@@ -200,9 +222,11 @@ def _draw_3(example: Example) -> Figure:
         centrality.set(ylabel="robustness centrality $1/E$")
         certainty.set(ylabel="node certainty $1/E_i$")
         for axes, curves in ((centrality, central), (certainty, certain)):
-            low, high = min(c.value.min() for c in curves), max(c.value.max() for c in curves)
+            found = [point for c in curves for point in _on_curve(_agent(c), c, "epsilon", measured)]
+            low = min([c.value.min() for c in curves] + [point.low for point in found])
+            high = max([c.value.max() for c in curves] + [point.high for point in found])
             axes.set_ylim(low - 0.06 * (high - low), high + 0.36 * (high - low))
-            _plot(axes, "epsilon", [(_agent(c), c) for c in curves], heading="agent", height=1.8)
+            _plot(axes, "epsilon", [(_agent(c), c) for c in curves], heading="agent", height=1.8, measured=measured)
             axes.text(0.03, 0.985, _orders(curves), transform=axes.transAxes, va="top", size=7, color=_GREY)
         lead.set(ylabel="agent 1 above agent 3 [%]", ylim=(-2, 2))
         lead.set_yscale("symlog", linthresh=0.01, linscale=0.6)
@@ -227,25 +251,78 @@ def _orders(curves: Sequence[Curve]) -> str:
     return "\n".join(lines)
 
 
-def _plot(axes: Axes, swept: str, curves: Sequence[tuple[str, Curve]], *, heading: str, height: float) -> None:
+def _plot(
+    axes: Axes,
+    swept: str,
+    curves: Sequence[tuple[str, Curve]],
+    *,
+    heading: str,
+    height: float,
+    measured: Sequence[Measured] = (),
+) -> None:
     """Curves over one of their rates, their labels at the right end under a heading; set the limits before.
+
+    Measured points that are on them, if any, are what has markers then.
 
     ``height`` is that of the axes, roughly [inches]: the layout is not known yet.
     """
     logarithmic = axes.get_xscale() == "log"
+    points = [_on_curve(label, curve, swept, measured) for label, curve in curves]
+    ends = [end for found in points for point in found for end in (point.low, point.high)]
+    axes.set_ylim(min([axes.get_ylim()[0], *ends]), max([axes.get_ylim()[1], *ends]))
+    if ends and not logarithmic:  # points at the end of the curves are whole
+        axes.set_xlim(right=1.03 * max(curve_x.max() for curve_x in (getattr(curve, swept) for _, curve in curves)))
     for look, (_, curve) in enumerate(curves):
         colour, dashes, marker = _LOOKS[look]
         x = getattr(curve, swept)
         place = np.log(x) if logarithmic else x
         places = (np.arange(_MARKERS) + (look + 0.2) / len(_LOOKS)) / _MARKERS  # no markers on top of each other
         marked = sorted({int(np.abs(place - target).argmin()) for target in place[0] + places * np.ptp(place)})
-        axes.plot(x, curve.value, color=colour, ls=dashes, marker=marker, markevery=marked, mec="white", mew=0.4)
+        axes.plot(
+            x,
+            curve.value,
+            color=colour,
+            ls=dashes,
+            marker="" if measured else marker,
+            markevery=marked,
+            mec="white",
+            mew=0.4,
+        )
+        beside = 0.4 * _SIDE * (look - (len(curves) - 1) / 2) if logarithmic else 0.0
+        _plot_points(axes, swept, points[look], colour, marker, beside)
     ends = [*axes.get_ylim(), *(curve.value[-1] for _, curve in curves)]
     low, high, *ends = axes.transScale.transform([(1.0, end) for end in ends])[:, 1]
     heights = _apart([(end - low) / (high - low) for end in ends], _LINE / height)
     for (label, _), share, (colour, _, _) in zip(curves, heights, _LOOKS, strict=False):
         _beside(axes, label, share, 0, colour, "center_baseline")
     _beside(axes, heading, 1.0, 5, BLACK, "bottom")
+
+
+def _on_curve(label: str, curve: Curve, swept: str, measured: Sequence[Measured]) -> list[Measured]:
+    """The points that a curve, which may stand for several agents, goes through."""
+    held = [name for name in ("epsilon", "r12", "r21") if name != swept]
+    agents = {None} if curve.agent is None else {int(number) - 1 for number in label.split(", ") if number.isdigit()}
+    return [
+        point
+        for point in measured
+        if (point.run.network, point.quantity) == (curve.network, curve.quantity)
+        and point.agent in agents
+        and all(np.isclose(getattr(curve, name), getattr(point.run, name)).all() for name in held)
+    ]
+
+
+def _plot_points(axes: Axes, swept: str, points: Sequence[Measured], colour: str, marker: str, beside: float) -> None:
+    """Measured points with their intervals, and what is exact for the steps of their runs; ``beside`` in inches."""
+    for point in points:
+        x = getattr(point.run, swept)
+        # Side by side where several agents share a curve.
+        here = [other for other in points if getattr(other.run, swept) == x]
+        shift = beside + _SIDE * (here.index(point) - (len(here) - 1) / 2)
+        place = axes.transData + mtransforms.ScaledTranslation(shift, 0, axes.figure.dpi_scale_trans)
+        bars = axes.vlines(x, point.low, point.high, color=colour, lw=0.9, zorder=3)
+        bars.set_transform(place)
+        axes.plot(x, point.value, marker, color=colour, ms=3.8, mec="white", mew=0.4, zorder=4, transform=place)
+        axes.plot(x, point.predicted, "_", color=BLACK, ms=4.5, mew=0.8, zorder=5, transform=place)
 
 
 def _beside(axes: Axes, text: str, height: float, raised: float, colour: str, align: str) -> None:
@@ -330,19 +407,3 @@ def _rendered(figure: Figure, name: str) -> bytes:
     )
     figure.savefig(stream, format=name, metadata=metadata, dpi=_DPI)
     return stream.getvalue()
-
-
-def _replace(path: Path, content: bytes) -> Path:
-    """Write a file under another name first, so that it is never there in part."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
-        temporary = Path(stream.name)
-        stream.write(content)
-    try:
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink()
-        raise
-    return path

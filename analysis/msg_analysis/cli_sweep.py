@@ -1,0 +1,172 @@
+"""Command of ``msg-analysis`` about many runs or predictions: ``sweep``."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from msg_analysis.console import complain, examples, finite, print_json, result_console
+from msg_analysis.errors import InputError
+from msg_analysis.sweep.software import require_libraries
+
+if TYPE_CHECKING:
+    from msg_analysis.sweep.conduct import Conducted, OtherSoftware
+    from msg_analysis.sweep.point import Job
+    from msg_analysis.sweep.store import Store
+
+DISAGREES, INCOMPLETE = 1, 3
+
+other_software = click.option(
+    "--other-software",
+    type=click.Choice(["refuse", "redo", "keep"]),
+    default="refuse",
+    show_default=True,
+    help="What to do with results in the directory that other versions made.",
+)
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis sweep rates.yaml",
+        "msg-analysis sweep rates.yaml --workers 4 --json | jq '.points[].\"emulated.system_error\"'",
+        "msg-analysis sweep rates.yaml --scheduler tcp://10.0.0.1:8786 --out sweeps/rates",
+    )
+)
+@click.argument("sweep_file", metavar="SWEEP", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Directory of the results; sweeps/<name> by default.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1),
+    help="Processes; by default one for each CPU, or one where networks run, which need a machine each.",
+)
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of this Dask scheduler instead.")
+@click.option("--column", help="What to draw and list: system_error by default, or a column of the tables.")
+@click.option("--retry", is_flag=True, help="Try again what has failed.")
+@other_software
+@click.option("--keep-bags", is_flag=True, help="Keep the bags of networks that agree with the prediction, too.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@click.pass_context
+def sweep(
+    context: click.Context,
+    sweep_file: Path,
+    *,
+    out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    column: str | None,
+    retry: bool,
+    other_software: OtherSoftware,
+    keep_bags: bool,
+    as_json: bool,
+) -> None:
+    """Predict, simulate or run an experiment at many values of its keys, as the file SWEEP says.
+
+    What has been done is kept: after an interruption, the same command goes on. Tables (Parquet, CSV, JSON) and a
+    figure are written beside it.
+
+    Exit code 0: fine, 1: some run disagrees with its prediction, all runs judged together, 3: some point has no result.
+    """
+    if workers and scheduler:
+        raise InputError("--workers: given with --scheduler, whose workers are used: give one of them")
+    require_libraries()
+    if not scheduler:
+        from msg_analysis.sweep.workers import warm_up
+
+        warm_up()  # the workers import while the points are checked
+    from msg_analysis.progress import SweepProgress
+    from msg_analysis.report.sweep_figure import write_figure
+    from msg_analysis.report.sweep_text import describe_sweep, print_sweep
+    from msg_analysis.sweep.conduct import judge
+    from msg_analysis.sweep.network import options
+    from msg_analysis.sweep.plan import load_sweep
+    from msg_analysis.sweep.series import picture
+    from msg_analysis.sweep.store import Store
+    from msg_analysis.sweep.table import rows_of, write_tables
+
+    with SweepProgress("checking the points") as checking:
+        plan = load_sweep(sweep_file, checking.checked)
+    directory = out or Path("sweeps") / plan.name
+    network = options(directory, keep_bags, workers or 1) if plan.kind == "network" else None
+    with Store.open(directory) as store:
+        done = _conduct(
+            context,
+            plan.name,
+            [point.job for point in plan.points],
+            store,
+            workers=workers,
+            scheduler=scheduler,
+            network=network,
+            other_software=other_software,
+            retry=retry,
+        )
+        judgement = judge(done.outcomes, plan.spec.level)
+        rows = rows_of(plan, done.outcomes, judgement)
+        document = finite(describe_sweep(plan, done, judgement, rows))
+        try:
+            files = write_tables(rows, document, directory)
+            shown = picture(plan, rows, column)
+            files += write_figure(shown, f"{plan.name}: {plan.kind}", directory)
+        except OSError as error:
+            raise InputError(f"{error.filename or directory}: cannot be written: {error.strerror}") from error
+    if as_json:
+        print_json(document | {"files": [str(file) for file in files]})
+    else:
+        print_sweep(plan, document, shown, result_console())
+        for file in files:
+            click.echo(file)
+    context.exit(judgement.exit_code)
+
+
+def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Store, **how: Any) -> Conducted:
+    """Do all jobs, with progress on stderr; if that is interrupted, say what is kept."""
+    from msg_analysis.progress import SweepProgress
+    from msg_analysis.sweep.conduct import conduct
+    from msg_analysis.sweep.workers import WorkersLostError
+
+    if store.damaged:
+        click.echo(f"note: {store.directory}: {store.damaged} lines cannot be read: done again", err=True)
+    try:
+        with SweepProgress(title) as progress:
+            return conduct(jobs, store, watch=progress.done, **how)
+    except (KeyboardInterrupt, WorkersLostError) as error:
+        there = sum(job.id in store.outcomes for job in jobs)
+        kept = f"{there} of {len(jobs)} points are kept in {store.directory}: the same command goes on"
+        if isinstance(error, KeyboardInterrupt):
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # we are leaving
+            click.echo(f"\ninterrupted: {kept}", err=True)
+            raise
+        complain(f"{error}: {kept}")
+        context.exit(INCOMPLETE)
+
+
+def emulate(
+    context: click.Context, numbers: Sequence[int], out: Path, formats: Sequence[str], other_software: OtherSoftware
+) -> int:
+    """``msg-analysis figures --emulate``: run the networks, write the figures; the exit code."""
+    from msg_analysis.report.emulation import disagreeing, measured, runs_of, summary
+    from msg_analysis.report.paper_figures import write_figures
+    from msg_analysis.sweep.network import options
+    from msg_analysis.sweep.point import FAILED
+    from msg_analysis.sweep.store import Store
+
+    require_libraries()
+    runs = [run for number in numbers for run in runs_of(number)]
+    directory = out / "emulation"
+    network = options(directory, False, 1)
+    with Store.open(directory) as store:
+        jobs = [run.job() for run in runs]
+        done = _conduct(context, "networks", jobs, store, network=network, other_software=other_software, retry=True)
+    points = measured(runs, done.outcomes)
+    failed = [outcome for outcome in done.outcomes if outcome.status == FAILED]
+    for outcome in failed:
+        complain(f"no result: {outcome.reason}")
+    if not points:
+        return INCOMPLETE
+    for path in write_figures(numbers, out, formats, points):
+        click.echo(path)
+    click.echo(summary(points, len(runs) - len(failed)))
+    return DISAGREES if disagreeing(points) else INCOMPLETE if failed else 0

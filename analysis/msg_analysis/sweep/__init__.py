@@ -1,0 +1,1 @@
+"""Sweeps: one experiment at many values of its keys, on the processors of this machine or of a cluster."""

@@ -1,0 +1,228 @@
+"""From a sweep file to its points: every one of them a valid experiment before anything is computed."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from msg_analysis.model.document import read_yaml
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.problems import ExperimentError, problem, show, translate
+from msg_analysis.sweep.keys import KeyProblemError, put
+from msg_analysis.sweep.point import Job
+from msg_analysis.sweep.spec import MOST_POINTS, Kind, SweepSpec
+
+SEED = "run.seed"
+_NAMED = 3
+"""Points that a complaint names."""
+
+Checked = Callable[[int, int], None]
+"""Told how many of how many points have been checked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One run, or one prediction.
+
+    Attributes
+    ----------
+    values
+        of the swept keys
+    repetition
+        which run at these values, from 0; None for predictions
+    seed
+        of the run; None for predictions
+    job
+        what is to be done
+    """
+
+    values: Mapping[str, Any]
+    repetition: int | None
+    seed: int | None
+    job: Job
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """A sweep whose points are all valid.
+
+    Attributes
+    ----------
+    name
+        of the file, without its ending
+    spec
+        the file
+    experiment
+        name of the experiment
+    points
+        in the order of the file: the first key changes slowest, repetitions fastest
+    """
+
+    name: str
+    spec: SweepSpec
+    experiment: str
+    points: tuple[Point, ...]
+
+    @property
+    def kind(self) -> Kind:
+        """What is done at every point."""
+        return self.spec.kind
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The swept keys."""
+        return tuple(self.spec.over)
+
+
+def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) -> Sweep:
+    """Read a sweep file and check every point of it.
+
+    Parameters
+    ----------
+    path
+        the file (YAML; JSON is YAML too)
+    checked
+        told of progress
+
+    Raises
+    ------
+    InputError
+        the file, or that of the experiment, cannot be read
+    ExperimentError
+        names every mistake, and the points that have it
+    """
+    path = Path(path)
+    mapping = read_yaml(path)
+    if not isinstance(mapping, Mapping):
+        lines = [problem("sweep", show(mapping), "expected keys with values", "start with `experiment:`")]
+        raise ExperimentError(str(path), lines)
+    try:
+        spec = SweepSpec.model_validate(dict(mapping))
+    except ValidationError as error:
+        found = [translate(detail, SweepSpec) for detail in error.errors(include_url=False)]
+        raise ExperimentError(str(path), found) from error
+    directory = path.parent
+    base: Any = spec.experiment
+    if isinstance(base, str):
+        directory = (directory / base).parent
+        base = read_yaml(path.parent / base)
+        if not isinstance(base, Mapping):
+            raise ExperimentError(
+                str(path), [problem("experiment", show(base), "expected a file of keys", "correct it")]
+            )
+    lines = _spec_problems(spec)
+    if lines:
+        raise ExperimentError(str(path), lines)
+    return _plan(path, spec, base, directory, checked)
+
+
+def _spec_problems(spec: SweepSpec) -> list[str]:
+    """What several keys of the sweep file say together."""
+    found = []
+    lengths = {key: len(values) for key, values in spec.over.items()}
+    if spec.combine == "zip" and len(set(lengths.values())) > 1:
+        text = ", ".join(f"{key}: {length}" for key, length in lengths.items())
+        found.append(problem("over", text, "expected as many values of every key with combine: zip", "or use grid"))
+    if spec.kind == "predict" and spec.repetitions > 1:
+        wanted = "expected 1: a prediction does not depend on chance"
+        found.append(problem("repetitions", spec.repetitions, wanted, "remove it, or use kind: simulate"))
+    if SEED in spec.over and spec.repetitions > 1:
+        found.append(problem("repetitions", spec.repetitions, f"expected 1, since {SEED} is swept", "use one of both"))
+    total = spec.repetitions
+    for length in lengths.values() if spec.combine == "grid" else [max(lengths.values())]:
+        total *= length
+    if total > MOST_POINTS:
+        found.append(problem("over", f"{total} points", f"expected at most {MOST_POINTS}", "sweep fewer values"))
+    return found
+
+
+def _combinations(spec: SweepSpec) -> Iterator[dict[str, Any]]:
+    joined = itertools.product(*spec.over.values()) if spec.combine == "grid" else zip(*spec.over.values(), strict=True)
+    for values in joined:
+        yield dict(zip(spec.over, values, strict=True))
+
+
+def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
+    combinations = list(_combinations(spec))
+    wrong: dict[str, list[int]] = {}  # line: combinations that it is about
+    points: list[Point] = []
+    name = ""
+    for number, values in enumerate(combinations):
+        document: Mapping[str, Any] = base
+        try:
+            for key, value in values.items():
+                document = put(document, key, value)
+            experiment = Experiment.parse(document, source=str(path), directory=directory)
+            lines = experiment.unavailable("predict" if spec.kind == "predict" else "run")
+        except KeyProblemError as error:
+            lines = [str(error)]
+        except ExperimentError as error:
+            lines = error.problems
+        for line in lines:
+            wrong.setdefault(line, []).append(number)
+        if not wrong:
+            name = experiment.name
+            points += _runs(spec, values, experiment)
+        checked(number + 1, len(combinations))
+    if wrong:
+        raise ExperimentError(str(path), _grouped(wrong, combinations))
+    return Sweep(path.stem, spec, name, tuple(points))
+
+
+def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: Experiment) -> Iterator[Point]:
+    document = experiment.to_document()
+    if spec.kind == "predict":
+        yield Point(values, None, None, Job.of("predict", document))
+        return
+    for repetition in range(spec.repetitions):
+        seed = experiment.run.seed
+        if SEED not in values:
+            seed = seed + repetition if spec.seeds == "common" else own_seed(seed, values, repetition)
+        document["run"]["seed"] = seed
+        yield Point(values, repetition, seed, Job.of(spec.kind, document, spec.level))
+
+
+def own_seed(seed: int, values: Mapping[str, Any], repetition: int) -> int:
+    """A seed for one run of many: it depends on nothing else, so that it stays when other points come or go.
+
+    Parameters
+    ----------
+    seed
+        of the experiment
+    values
+        of the swept keys
+    repetition
+        from 0
+
+    Returns
+    -------
+    int
+        below 2**32
+    """
+    text = json.dumps([seed, dict(values), repetition], sort_keys=True)
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big")
+
+
+def label(values: Mapping[str, Any]) -> str:
+    """A point in words: the swept keys and their values."""
+    return ", ".join(f"{key} = {show(value)}" for key, value in values.items())
+
+
+def _grouped(wrong: Mapping[str, Sequence[int]], combinations: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Each complaint once, with the points that it is about."""
+    lines = []
+    for line, numbers in wrong.items():
+        if len(numbers) == len(combinations) > 1:
+            lines.append(f"every point: {line}")
+            continue
+        named = "; ".join(f"point {number + 1} ({label(combinations[number])})" for number in numbers[:_NAMED])
+        more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
+        lines.append(f"{named}{more}: {line}")
+    return lines

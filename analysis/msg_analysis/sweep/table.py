@@ -1,0 +1,124 @@
+"""The results of a sweep as a table: Parquet, CSV and JSON, for other tools."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from msg_analysis.files import write_whole
+from msg_analysis.sweep.conduct import Judgement
+from msg_analysis.sweep.plan import Sweep
+from msg_analysis.sweep.point import Outcome
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+Row = dict[str, Any]
+_LEFT_OUT = {"agents", "stationary", "failure", "bag", "verdict"}
+_ESTIMATE = ("measured", "predicted", "standard_error", "z", "p", "p_holm")
+
+
+def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], judgement: Judgement) -> list[Row]:
+    """One row for each point, by name of the column; a column that a row does not have is empty there.
+
+    Parameters
+    ----------
+    sweep
+        the points
+    outcomes, judgement
+        of each of them
+    """
+    rows = []
+    for number, (point, outcome) in enumerate(zip(sweep.points, outcomes, strict=True)):
+        row: Row = {"point": number + 1, **point.values}
+        if point.repetition is not None:
+            row |= {"repetition": point.repetition + 1, "seed": point.seed}
+        row |= {"status": outcome.status, "reason": outcome.reason}
+        if sweep.kind != "predict":
+            row |= {"verdict": judgement.verdicts[number], "p_holm": judgement.p_holm[number]}
+        for key, value in outcome.result.items():
+            if key not in _LEFT_OUT:
+                row |= _columns(key, value)
+        if sweep.kind == "network":
+            row["bag"] = outcome.result.get("bag")
+        row |= {"seconds": outcome.seconds, "software": outcome.software}
+        rows.append(row)
+    used = {name for row in rows for name, value in row.items() if value is not None} | {"reason", *sweep.keys}
+    return [{name: value for name, value in row.items() if name in used} for row in rows]
+
+
+def _columns(name: str, value: Any) -> Row:
+    """Columns of one key of a result: those of an estimate, or of a law, or of each agent."""
+    if isinstance(value, list):
+        return {
+            column: entry
+            for place, part in enumerate(value, start=1)
+            for column, entry in _columns(f"{name}[{place}]", part).items()
+        }
+    if not isinstance(value, Mapping):
+        return {name: value}
+    if "interval" not in value:
+        return {
+            column: entry for key, part in value.items() for column, entry in _columns(f"{name}.{key}", part).items()
+        }
+    low, high = value["interval"]
+    numbers = {key: value[key] for key in _ESTIMATE if value.get(key) is not None}
+    return {f"{name}.{key}": entry for key, entry in (numbers | {"low": low, "high": high}).items()}
+
+
+def column_names(rows: Sequence[Row]) -> list[str]:
+    """Of all rows, in the order in which they come first."""
+    return list(dict.fromkeys(name for row in rows for name in row))
+
+
+def arrow_table(rows: Sequence[Row]) -> pa.Table:
+    """The table: numbers where all of a column are numbers, else texts; what is no scalar is JSON."""
+    import pyarrow as pa
+
+    columns = {}
+    for name in column_names(rows):
+        values = [row.get(name) for row in rows]
+        given = [value for value in values if value is not None]
+        if given and all(isinstance(value, bool) for value in given):
+            columns[name] = pa.array(values, pa.bool_())
+        elif given and all(isinstance(value, int) and not isinstance(value, bool) for value in given):
+            columns[name] = pa.array(values, pa.int64() if max(map(abs, given)) < 2**63 else pa.float64())
+        elif given and all(isinstance(value, int | float) and not isinstance(value, bool) for value in given):
+            columns[name] = pa.array([None if value is None else float(value) for value in values], pa.float64())
+        else:
+            columns[name] = pa.array([value if value is None else _text(value) for value in values], pa.string())
+    return pa.table(columns)
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def write_tables(rows: Sequence[Row], document: Mapping[str, Any], directory: Path) -> list[Path]:
+    """Write ``results.parquet``, ``results.csv`` and ``results.json``, each whole or not at all.
+
+    Parameters
+    ----------
+    rows
+        of ``rows_of``
+    document
+        the JSON document; its numbers are finite or None
+    directory
+        where
+    """
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    table = arrow_table(rows)
+    parquet, text = io.BytesIO(), io.BytesIO()
+    pyarrow.parquet.write_table(table, parquet)
+    pyarrow.csv.write_csv(table, text, pyarrow.csv.WriteOptions(quoting_style="needed"))
+    content = {
+        "parquet": parquet.getvalue(),
+        "csv": text.getvalue(),
+        "json": json.dumps(document, indent=1, allow_nan=False).encode() + b"\n",
+    }
+    return [write_whole(directory / f"results.{name}", data) for name, data in content.items()]

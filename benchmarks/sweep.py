@@ -1,0 +1,101 @@
+"""How much faster two workers are than one: a sweep of 200 predictions at m = 50, n = 3.
+
+Says both what the predictions take once the workers are there, and the whole command from its start to its end, of
+which some seconds (imports, starting and ending the workers) do not shrink with their number.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import networkx as nx
+import numpy as np
+
+from msg_analysis.sweep.plan import load_sweep
+from msg_analysis.sweep.point import Outcome, evaluate
+from msg_analysis.sweep.workers import Workers
+
+AGENTS, GRAPHS = 50, 3
+
+
+def sweep_file(directory: Path, points: int) -> Path:
+    """A sweep over the rate of switching between three small-world graphs."""
+    graphs: dict[str, Any] = {}
+    for seed in range(GRAPHS):
+        graph = nx.connected_watts_strogatz_graph(AGENTS, 4, 0.3, seed=seed)
+        graphs[f"graph_{seed + 1}"] = {"edges": [[i + 1, j + 1] for i, j in graph.edges]}
+    rates = {name: {other: 1.0 for other in graphs if other != name} for name in graphs}
+    experiment = {"name": "large", "graphs": graphs, "switching": {"rates": rates}, "run": {"dt": 0.01}}
+    over = {"switching.scale": {"from": 0.01, "to": 100, "count": points, "spacing": "log"}}
+    path = directory / "large.yaml"
+    path.write_text(json.dumps({"experiment": experiment, "over": over}), encoding="utf-8")
+    return path
+
+
+def points_seconds(path: Path, workers: int) -> float:
+    """What the predictions take, once the workers are there."""
+    jobs = [point.job for point in load_sweep(path).points]
+    with Workers(workers) as pool:
+        begin = time.perf_counter()
+        with closing(pool.outcomes(evaluate, jobs)) as batches:
+            done = [outcome for batch in batches for _, outcome in batch]
+        seconds = time.perf_counter() - begin
+    assert all(isinstance(outcome, Outcome) and outcome.status == "done" for outcome in done)
+    assert len(done) == len(jobs)
+    return seconds
+
+
+def command_seconds(path: Path, workers: int) -> float:
+    """The whole command."""
+    program = Path(sys.executable).with_name("msg-analysis")
+    with tempfile.TemporaryDirectory() as out:
+        begin = time.perf_counter()
+        subprocess.run(
+            [program, "sweep", path, "--workers", str(workers), "--out", Path(out) / "sweep", "--json"],
+            check=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        return time.perf_counter() - begin
+
+
+def report(name: str, seconds: Mapping[int, Sequence[float]]) -> float:
+    """One line: the least of each, and what two workers gain."""
+    one, two = min(seconds[1]), min(seconds[2])
+    print(f"| {name} | {one:.2f} s | {two:.2f} s | {one / two:.2f} |")
+    return one / two
+
+
+def main() -> None:
+    """Measure in turns, so that what else the machine does falls on both."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--points", type=int, default=200)
+    parser.add_argument("--rounds", type=int, default=3)
+    arguments = parser.parse_args()
+    predictions: dict[int, list[float]] = {1: [], 2: []}
+    commands: dict[int, list[float]] = {1: [], 2: []}
+    with tempfile.TemporaryDirectory() as folder:
+        path = sweep_file(Path(folder), arguments.points)
+        for _ in range(arguments.rounds):
+            for workers in (1, 2):
+                predictions[workers].append(points_seconds(path, workers))
+                commands[workers].append(command_seconds(path, workers))
+    print(f"load {os.getloadavg()[0]:.1f}, {os.cpu_count()} CPUs, numpy {np.__version__}, best of {arguments.rounds}")
+    print(f"\n| {arguments.points} predictions, m = {AGENTS}, n = {GRAPHS} | 1 worker | 2 workers | gain |")
+    print("|---|---:|---:|---:|")
+    report("the predictions", predictions)
+    report("the whole command", commands)
+
+
+if __name__ == "__main__":
+    main()

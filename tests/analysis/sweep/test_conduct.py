@@ -1,0 +1,204 @@
+"""What is done is done once, what fails fails alone, and all runs are judged together."""
+
+from __future__ import annotations
+
+import dataclasses
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msg_analysis.errors import InputError
+from msg_analysis.sweep import conduct as conducting
+from msg_analysis.sweep.conduct import conduct, judge
+from msg_analysis.sweep.point import DONE, FAILED, Job, Outcome, evaluate
+from msg_analysis.sweep.series import picture
+from msg_analysis.sweep.store import Store
+from msg_analysis.sweep.table import arrow_table, rows_of
+from msg_analysis.sweep.workers import Lost, Workers
+from msg_analysis.twin import simulate
+
+
+def document(rate: float = 1.0, **run: Any) -> dict[str, Any]:
+    return {
+        "name": "two",
+        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
+        "switching": {"generator": [[-rate, rate], [rate, -rate]]},
+        "run": {"dt": 0.1, "duration": 100, **run},
+    }
+
+
+def with_p(p: float | None, **result: Any) -> Outcome:
+    kept = {"verdict": "agrees", "p": p, **result}
+    return Outcome(str(p), DONE, None, kept, 1.0, "", "")
+
+
+FAILURE = Outcome("x", FAILED, "broke", {}, 1.0, "", "")
+
+
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
+    """Have jobs done here, without Dask; what was done."""
+    done: list[Job] = []
+
+    class Here:
+        def __init__(self, *_: Any) -> None: ...
+
+        def __enter__(self) -> Here:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+        def outcomes(self, function: Any, items: Any, **_: Any) -> Any:
+            for item in items:
+                done.append(item)
+                yield [(item, function(item, lambda: False))]
+
+    monkeypatch.setattr(conducting, "Workers", Here)
+    return done
+
+
+def test_predictions_are_those_of_the_paper() -> None:
+    """Example 1 of the paper: system certainty .73561 at r12 = r21 = 1 and epsilon = 0.5 [theory, closed form]."""
+    outcome = evaluate(Job.of("predict", document(0.5)))
+    assert outcome.status == DONE
+    assert outcome.result["continuous"]["system_certainty"] == pytest.approx(0.73561, abs=5e-6)
+    certainties = 1 / np.array(outcome.result["continuous"]["node_errors"])
+    np.testing.assert_allclose(certainties, [2.90277, 4.25156, 5, 4.25156, 2.90277], atol=5e-6)
+
+
+def test_simulated_runs_are_those_of_the_twin() -> None:
+    """Mean square of the disagreement, by numpy."""
+    from msg_analysis.model.experiment import Experiment
+
+    what = document(seed=5)
+    outcome = evaluate(Job.of("simulate", what))
+    states = simulate(Experiment.parse(what)).values[:-1]
+    deviations = states - states.mean(axis=1, keepdims=True)
+    assert outcome.result["system_error"]["measured"] == pytest.approx(float((deviations**2).sum(axis=1).mean()))
+    assert outcome.result["steps"] == 1000
+
+
+def test_what_fails_fails_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether steps with delayed values are stable, only the prediction finds out."""
+    done = in_this_process(monkeypatch)
+    bad = document(dt=0.55, duration=55) | {"noise": {"delay": 3}}
+    jobs = [Job.of("predict", document()), Job.of("predict", bad), Job.of("predict", document(2.0))]
+    with Store.open(tmp_path) as store:
+        conducted = conduct(jobs, store)
+    assert [outcome.status for outcome in conducted.outcomes] == [DONE, FAILED, DONE]
+    assert "grow without bound" in (conducted.outcomes[1].reason or "")
+    assert len(done) == 3
+    judgement = judge(conducted.outcomes, 0.01)
+    assert (judgement.verdict, judgement.exit_code) == ("incomplete", 3)
+    # Again: nothing is done, unless what failed is to be tried again.
+    with Store.open(tmp_path) as store:
+        assert conduct(jobs, store).kept == 3
+        assert len(done) == 3
+        conduct(jobs, store, retry=True)
+        assert [job.id for job in done[3:]] == [jobs[1].id]
+
+
+def test_defects_fail_alone_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    outcome = evaluate(Job("x", "predict", "{}", 0.01))
+    assert outcome.status == FAILED
+    outcome = evaluate(Job("x", "predict", "nonsense", 0.01))
+    assert "JSONDecodeError" in (outcome.reason or "")
+
+
+def test_equal_points_are_done_once_and_others_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = in_this_process(monkeypatch)
+    one, two = Job.of("predict", document()), Job.of("predict", document(2.0))
+    with Store.open(tmp_path) as store:
+        conducted = conduct([one, one, two], store)
+        assert len(done) == 2
+        assert conducted.outcomes[0] == conducted.outcomes[1]
+        again = conduct([two], store)
+        assert (again.kept, again.others) == (1, 1)
+
+
+def test_other_software_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = in_this_process(monkeypatch)
+    job = Job.of("predict", document())
+    with Store.open(tmp_path) as store:
+        conduct([job], store)
+        store.add([dataclasses.replace(store.outcomes[job.id], software="msg_analysis 0.0.1")])
+        with pytest.raises(InputError, match=r"1 results are of other software \(msg_analysis 0.0.1\)"):
+            conduct([job], store)
+        assert conduct([job], store, other_software="keep").outcomes[0].software == "msg_analysis 0.0.1"
+        assert len(done) == 1
+        assert conduct([job], store, other_software="redo").outcomes[0].software != "msg_analysis 0.0.1"
+        assert len(done) == 2
+        conduct([job], store)
+        assert len(done) == 2
+
+
+@pytest.mark.parametrize(
+    ("p_values", "p_holm", "verdict", "code"),
+    [
+        ([0.5, 0.02, 0.9], [1.0, 0.06, 1.0], "agrees", 0),  # by itself .02, of three .06
+        ([0.5, 0.003, 0.9], [1.0, 0.009, 1.0], "disagrees", 1),
+        ([0.004, 0.006], [0.008, 0.008], "disagrees", 1),
+        ([None, 0.5], [None, 0.5], "agrees", 0),
+    ],
+)
+def test_all_runs_are_judged_together(p_values: Any, p_holm: Any, verdict: str, code: int) -> None:
+    judgement = judge([with_p(p) for p in p_values], 0.01)
+    assert judgement.p_holm == pytest.approx(p_holm)
+    assert (judgement.verdict, judgement.exit_code) == (verdict, code)
+
+
+def test_a_failure_does_not_hide_a_disagreement() -> None:
+    assert judge([with_p(1e-9), FAILURE], 0.01).exit_code == 1
+    assert judge([with_p(0.5), FAILURE], 0.01).exit_code == 3
+    assert judge([with_p(0.5, unpredicted="a protocol")], 0.01).verdicts == ("unpredicted",)
+
+
+def cubes(number: int, _stopping: Any) -> int:
+    if number == 13:
+        import os
+
+        os.kill(os.getpid(), 9)
+    return number**3
+
+
+def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
+    """Real workers: each death is that of a process, and a new one takes its place."""
+    with Workers(2) as pool, closing(pool.outcomes(cubes, list(range(30)))) as batches:
+        found = dict(pair for batch in batches for pair in batch)
+    lost = found.pop(13)
+    assert isinstance(lost, Lost)
+    assert "killed every worker" in lost.reason
+    assert found == {number: number**3 for number in range(30) if number != 13}
+
+
+def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import yaml
+
+    from msg_analysis.sweep.plan import load_sweep
+
+    in_this_process(monkeypatch)
+    over = {"noise.process": [1.0, [1, 2, 1, 1, 1]], "switching.generator": [[[-1, 1], [1, -1]], [[-9, 9], [9, -9]]]}
+    file = {"experiment": document(), "kind": "simulate", "over": over, "repetitions": 3}
+    (tmp_path / "try.yaml").write_text(yaml.safe_dump(file, sort_keys=False))
+    sweep = load_sweep(tmp_path / "try.yaml")
+    with Store.open(tmp_path) as store:
+        outcomes = conduct([point.job for point in sweep.points], store).outcomes
+    rows = rows_of(sweep, outcomes, judge(outcomes, 0.01))
+    table = arrow_table(rows)
+    assert table.num_rows == 12
+    assert str(table.schema.field("node_errors[2].measured").type) == "double"
+    assert str(table.schema.field("seed").type) == "int64"
+    assert table.column("noise.process").to_pylist()[::6] == ["1.0", "[1, 2, 1, 1, 1]"]
+    shown = picture(sweep, rows, "node_errors[2]")
+    assert [len(series.places) for series in shown.series] == [2, 2]
+    assert shown.x == "noise.process"
+    three = [row for row in rows if row["noise.process"] == 1.0 and row["switching.generator"][0][0] == -1]
+    assert shown.series[0].places[0].value == pytest.approx(np.mean([row["node_errors[2].measured"] for row in three]))
+    error = np.sqrt(np.sum([row["node_errors[2].standard_error"] ** 2 for row in three])) / 3
+    high = shown.series[0].places[0].high
+    assert high is not None
+    assert high - shown.series[0].places[0].value == pytest.approx(1.96 * error, rel=1e-4)
+    with pytest.raises(InputError, match="not a column of numbers: expected one of"):
+        picture(sweep, rows, "nonsense")

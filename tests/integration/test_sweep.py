@@ -1,0 +1,161 @@
+"""Sweeps on a real cluster whose worker is killed, and of real networks."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from msg_analysis.inference.compare import compare
+from msg_analysis.model.experiment import Experiment
+from msg_analysis.report import emulation
+from msg_analysis.twin import simulate
+
+BIN = Path(sys.executable).parent
+
+
+def sweep_file(network: Any, **sweep: Any) -> Path:
+    path = network.directory / "rates.yaml"
+    path.write_text(yaml.safe_dump({"experiment": network.experiment().to_document(), **sweep}, sort_keys=False))
+    return path
+
+
+def start(*arguments: str | Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [BIN / "msg-analysis", "sweep", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def lines(journal: Path) -> int:
+    return journal.read_bytes().count(b"\n") if journal.exists() else 0
+
+
+def check_against_the_twin(network: Any, points: list[dict[str, Any]]) -> None:
+    """A run of the network in lockstep is that of the twin to the last bit, and so is what is measured."""
+    for row in points:
+        switching = {"generator": row["switching.generator"]}
+        what = network.experiment(switching=switching, run={"duration": row["run.duration"], "seed": row["seed"]})
+        expected = compare(simulate(what)).system_error
+        assert row["system_error.measured"] == expected.measured
+        assert row["system_error.standard_error"] == pytest.approx(expected.standard_error, rel=1e-9)
+
+
+def generators(*rates: float) -> list[list[list[float]]]:
+    return [[[-rate, rate], [rate, -rate]] for rate in rates]
+
+
+@pytest.fixture
+def cluster(network: Any) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and two workers, as `dask scheduler` and `dask worker` start them."""
+    where = network.directory / "scheduler.json"
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    started = [
+        subprocess.Popen(
+            [BIN / "dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0",
+             "--scheduler-file", where], **quiet
+        )
+    ]  # fmt: skip
+    network.wait_for(lambda: where.exists() and where.read_text().endswith("}"), 60, "the scheduler")
+    address = json.loads(where.read_text())["address"]
+    worker = [BIN / "dask", "worker", address, "--nthreads", "1", "--no-nanny", "--dashboard-address", "127.0.0.1:0"]
+    started += [subprocess.Popen([*worker, "--local-directory", network.directory], **quiet) for _ in range(2)]
+    yield address, started[1:]
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def test_a_worker_is_killed_in_the_middle(network: Any, cluster: tuple[str, list[subprocess.Popen[bytes]]]) -> None:
+    address, workers = cluster
+    out = network.directory / "out"
+    rates = [0.25 * 1.3**k for k in range(12)]
+    path = sweep_file(network, kind="simulate", over={"switching.generator": generators(*rates), "run.duration": [150]})
+    process = start(path, "--scheduler", address, "--out", out, "--json")
+    network.wait_for(lambda: lines(out / "points.jsonl") >= 2, 60, "results")
+    workers[0].kill()
+    stdout, stderr = process.communicate(timeout=100)
+    assert process.returncode == 0, stderr
+    assert "Traceback" not in stderr
+    result = json.loads(stdout)
+    assert (result["done"], result["failed"], result["verdict"]) == (12, 0, "agrees")
+    assert lines(out / "points.jsonl") == 12
+    places = {json.loads(line)["place"] for line in (out / "points.jsonl").read_text().splitlines()}
+    assert len(places) <= 2
+    check_against_the_twin(network, result["points"][::3])
+
+
+@pytest.mark.timeout(300)  # three waits, on a machine that has much else to do
+def test_networks_interrupted_and_resumed(network: Any) -> None:
+    """Two runs; the false-alarm rate of the verdict is 1 %, with fixed seeds: none."""
+    out = network.directory / "out"
+    over = {"switching.generator": generators(0.5, 2.0), "run.duration": [15, 150]}
+    path = sweep_file(network, kind="network", over=over, combine="zip")
+    process = start(path, "--workers", "2", "--out", out, "--json")
+    network.wait_for(lambda: lines(out / "points.jsonl") == 1, 100, "the shorter run")
+    os.killpg(process.pid, signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=100)
+    assert process.returncode == 130, stderr
+    assert stdout == ""
+    assert "Traceback" not in stderr
+    assert network.processes() == []
+    assert "interrupted: 1 of 2 points are kept" in stderr
+    process = start(path, "--workers", "2", "--out", out, "--json")
+    stdout, stderr = process.communicate(timeout=100)
+    assert process.returncode == 0, stderr
+    result = json.loads(stdout)
+    assert (result["done"], result["kept"], result["verdict"]) == (2, 1, "agrees")
+    assert list((out / "runs").iterdir()) == []  # they agree: their bags are not kept
+    check_against_the_twin(network, result["points"])
+
+
+def test_a_killed_sweep_leaves_no_network(network: Any) -> None:
+    out = network.directory / "out"
+    over = {"switching.generator": generators(0.5), "run.duration": [2000]}
+    process = start(sweep_file(network, kind="network", over=over), "--workers", "2", "--out", out)
+    network.wait_for(lambda: network.processes("recorder"), 60, "a network")
+    process.kill()
+    process.communicate()
+    network.wait_for(lambda: not network.processes(), 60, "the end of all processes")
+    assert lines(out / "points.jsonl") == 0
+
+
+def test_points_on_the_curves_of_the_paper(network: Any) -> None:
+    """Short form: two networks. Level of the family of all points: 1 %, with fixed seeds: no alarm."""
+    runs = [
+        emulation.Run(1, "line_ring", 0.5, 1.0, 1.0, duration=20.0),
+        emulation.Run(3, "smallest", 5.0, 1.0, 1.0, leader=2, duration=20.0),
+    ]
+    figures = network.directory / "figures"
+    code = [
+        "from msg_analysis.cli import main",
+        "from msg_analysis.report import emulation",
+        "from msg_analysis.report.emulation import Run",
+        f"emulation.runs_of = lambda number: [run for run in {runs} if run.example == number]",
+        "if __name__ == '__main__':",
+        f"    main(['figures', '--emulate', '--format', 'svg', '--out', {str(figures)!r}])",
+    ]
+    (network.directory / "short.py").write_text("\n".join(code))
+    for _ in range(2):  # the second time, nothing runs
+        command = [sys.executable, network.directory / "short.py"]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        assert result.returncode == 0, result.stderr
+        assert "7 points of 2 networks: all agree with theory (Holm over all points, level 0.01" in result.stdout
+        assert lines(figures / "emulation/points.jsonl") == 2
+    rows = (figures / "example_1_emulated.csv").read_text().splitlines()
+    assert rows[2].startswith("network,quantity,agent")
+    assert len(rows) == 3 + 6
+    measured = compare(simulate(Experiment.parse(json.loads(runs[0].job().document)))).system_error.measured
+    assert measured is not None
+    assert float(rows[3].split(",")[6]) == 1.0 / measured
