@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R")
 
-BATCH_SECONDS = 0.25
+BATCH_SECONDS = 0.5
 """Work of a task: next to it, the few milliseconds that Dask needs for each count little."""
 
 MOST_IN_BATCH = 500
@@ -38,6 +38,13 @@ NOTICE = 0.5
 """Seconds between two questions of a worker whether the work is being ended."""
 
 _CONNECT = 10.0  # s
+_QUIET = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.admin.tick.interval": "1s",
+}
+"""What Dask does besides the work, which on two cores takes from it."""
+
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _NEEDED = ("msg_analysis.theory.prediction", "msg_analysis.inference.compare", "msg_analysis.twin")
 
@@ -127,7 +134,7 @@ class Workers:
             self._compare_software()
             return self
         method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
-        dask.config.set({"distributed.worker.multiprocessing-method": method})
+        dask.config.set({"distributed.worker.multiprocessing-method": method, **_QUIET})
         try:
             with _deferring_interrupts():
                 self._cluster = distributed.LocalCluster(
