@@ -11,8 +11,9 @@ import re
 import shutil
 import subprocess
 import sys
+import uuid
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import many_commands
 import pytest
@@ -23,11 +24,6 @@ from msg_analysis.api import Experiment
 ROOT = Path(__file__).parents[2]
 LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"
 NETWORK = {"run", "play", "live", "markers", "agent", "switcher", "recorder"}
-SLOW = {"figures"}  # seconds each
-KINDS = {
-    False: ("plain", "json", "full", "closed", "gone", "terminal", "limit"),
-    True: ("json", "limit"),
-}
 OVERVIEWS = [(program, option) for program in ("msg-analysis", "msg-agents") for option in ("--help", "--version")]
 NEW = "NEW"  # a name that is not there yet
 WORDS = {  # what each of the others is given
@@ -46,105 +42,95 @@ WORDS = {  # what each of the others is given
     ("msg-agents", "prepare"): ["EXPERIMENT"],
     ("msg-agents", "host"): ["RECORD", "HOSTS", "--profile"],
 }
-QUICK = [command for command in WORDS if command[1] not in SLOW]
+QUICK = [command for command in WORDS if command[1] != "figures"]  # that takes seconds
 JSON_ANYWAY = {("msg-analysis", "schema"), ("msg-agents", "prepare")}
 COLOUR = re.compile(r"\x1b\[[0-9;]*(?<=[\[;])(3[0-7]|4[0-7]|9[0-7]|10[0-7]|38|48)[;m]")
 
 
 @pytest.fixture(scope="module")
-def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[Any, ...], list[Any]]:
-    """(program, name, "plain", "json", or what stdout is) -> exit code, stdout, stderr."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With a bag, its comparison, its record and a hosts file."""
     folder = tmp_path_factory.mktemp("streams")
-    run = Experiment.load(LINE_RING).simulate(duration=50, seed=3)
+    run = Experiment.load(LINE_RING).with_run(duration=10, replicas=2, seed=3).simulate()
     run.save(folder / "bag")
     (folder / "result.json").write_text(json.dumps(run.compare().to_json()))
     (folder / "run.json").write_text(run.record.to_json())
     (folder / "hosts.yaml").write_text("hosts: {a: {address: 10.0.0.1, agents: [1, 2, 3, 4, 5]}}\nrecorder: a\n")
-    places = {
-        "EXPERIMENT": LINE_RING,
-        "BAG": "bag",
-        "RESULT": "result.json",
-        "RECORD": "run.json",
-        "HOSTS": "hosts.yaml",
-    }
-    jobs, keys = [], []
-    for (program, name), words in WORDS.items():
-        for kind in KINDS[name in SLOW]:
-            given = [str(places.get(word, word)) for word in words]
-            given = [f"new_{len(jobs)}" if word == NEW else word for word in given]
-            if kind == "json":
-                given += ["--json"] * any("--json" in option.opts for option in command_of(program, name).params)
-            jobs.append([program, [name, *given], "pipe" if kind in ("plain", "json") else kind])
-            keys.append((program, name, kind))
-    for program, option in OVERVIEWS:
-        for kind in ("full", "closed", "gone"):
-            jobs.append([program, [option], kind])
-            keys.append((program, option, kind))
+    return folder
+
+
+def outcomes(folder: Path, *jobs: tuple[tuple[str, str], str]) -> Iterator[tuple[tuple[str, str], str, int, str, str]]:
+    """Command, kind, exit code, stdout, stderr; a kind is "plain", "json", or what stdout is (many_commands)."""
+    places = {"EXPERIMENT": LINE_RING, "BAG": "bag", "RESULT": "result.json", "RECORD": "run.json"}
+    places["HOSTS"] = "hosts.yaml"
+    lines = []
+    for (program, name), kind in jobs:
+        words = [str(places.get(word, word)) for word in WORDS.get((program, name), [])]
+        words = [uuid.uuid4().hex if word == NEW else word for word in words]
+        words += ["--json"] * (kind == "json")
+        lines.append([program, [name, *words], "pipe" if kind in ("plain", "json") else kind])
     environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1", "OPENBLAS_NUM_THREADS": "1", "TERM": "xterm-256color"}
     process = subprocess.run(
         [sys.executable, "-W", "ignore", many_commands.__file__],
-        input=json.dumps(jobs),
+        input=json.dumps(lines),
         capture_output=True,
         text=True,
         env=environment,
         cwd=folder,
-        timeout=110,
     )
     assert process.returncode == 0, process.stderr
-    return dict(zip(keys, json.loads(process.stdout), strict=True))
+    for (command, kind), outcome in zip(jobs, json.loads(process.stdout), strict=True):
+        yield (command, kind, *outcome)
 
 
 def test_no_command_is_forgotten() -> None:
     assert {name for _, name in COMMANDS} == {name for _, name in WORDS} | NETWORK
 
 
-@pytest.mark.parametrize(("program", "name"), QUICK)
-def test_results_go_to_stdout(outcomes: Any, program: str, name: str) -> None:
-    code, stdout, stderr = outcomes[program, name, "plain"]
-    assert (code, stderr) == (0, "")
-    assert stdout.endswith("\n")
-    if (program, name) not in JSON_ANYWAY:
-        assert max(map(len, stdout.splitlines())) <= 80
+@pytest.mark.timeout(400)
+def test_results_go_to_stdout(folder: Path) -> None:
+    """In 80 columns; on a terminal without colours, if NO_COLOR says so; nothing on stderr."""
+    jobs = [(command, kind) for command in QUICK for kind in ("plain", "terminal")]
+    for command, kind, code, stdout, stderr in outcomes(folder, *jobs):
+        assert (code, stderr) == (0, ""), (command, kind)
+        assert stdout.endswith("\n"), command
+        assert not COLOUR.search(stdout), command
+        if command not in JSON_ANYWAY:
+            assert max(map(len, re.sub(r"\x1b\[[0-9;]*m", "", stdout).splitlines())) <= 80, command
 
 
-@pytest.mark.parametrize(("program", "name"), [command for command in WORDS if command != ("msg-agents", "host")])
-def test_json_is_one_object_and_nothing_else(outcomes: Any, program: str, name: str) -> None:
-    code, stdout, stderr = outcomes[program, name, "json"]
-    assert (code, stderr) == (0, "")
-    assert isinstance(json.loads(stdout, parse_constant=lambda word: pytest.fail(word)), dict)
-    assert stdout.count("\n") == 1 or name == "schema"
+@pytest.mark.timeout(400)
+def test_json_is_one_object_and_nothing_else(folder: Path) -> None:
+    """Without numbers that JSON does not have."""
+    having = [command for command in WORDS if any("--json" in option.opts for option in command_of(*command).params)]
+    assert {*having, *JSON_ANYWAY, ("msg-agents", "host")} == {*WORDS}
+    jobs = [(command, "json") for command in having if command != ("msg-agents", "host")]
+    for command, _, code, stdout, stderr in outcomes(folder, *jobs, *((command, "plain") for command in JSON_ANYWAY)):
+        assert (code, stderr) == (0, ""), command
+        assert isinstance(json.loads(stdout, parse_constant=lambda word: pytest.fail(word)), dict), command
+        assert stdout.count("\n") == 1 or command[1] == "schema", command
 
 
-@pytest.mark.parametrize(("program", "name"), [*QUICK, *OVERVIEWS])
-@pytest.mark.parametrize(("kind", "reason"), [("full", "No space left on device"), ("closed", "Bad file descriptor")])
-def test_a_result_that_cannot_be_printed(outcomes: Any, program: str, name: str, kind: str, reason: str) -> None:
-    """One line says so, exit code 2: not 1, which would be a disagreement, nor 0."""
-    code, stdout, stderr = outcomes[program, name, kind]
-    assert (code, stdout) == (2, "")
-    assert stderr == f"error: stdout: {reason}: the result could not be written\n"
+@pytest.mark.timeout(400)
+def test_a_result_that_cannot_be_printed(folder: Path) -> None:
+    """One line says so, exit code 2: not 1, a disagreement, nor 0. A reader that goes away is no error."""
+    reasons = {"full": "No space left on device", "closed": "Bad file descriptor"}
+    jobs = [(command, kind) for command in [*QUICK, *OVERVIEWS] for kind in ("full", "closed", "gone")]
+    for command, kind, code, stdout, stderr in outcomes(folder, *jobs):
+        if kind == "gone":
+            assert (code, stdout, stderr) == (141, "", ""), command
+        else:
+            assert (code, stdout) == (2, ""), (command, kind)
+            assert stderr == f"error: stdout: {reasons[kind]}: the result could not be written\n", command
 
 
-@pytest.mark.parametrize(("program", "name"), [*QUICK, *OVERVIEWS])
-def test_a_reader_that_goes_away_is_no_error(outcomes: Any, program: str, name: str) -> None:
-    assert outcomes[program, name, "gone"] == [141, "", ""]
-
-
-@pytest.mark.parametrize(("program", "name"), QUICK)
-def test_no_color(outcomes: Any, program: str, name: str) -> None:
-    """On a terminal, with NO_COLOR."""
-    code, stdout, stderr = outcomes[program, name, "terminal"]
-    assert (code, stderr) == (0, "")
-    assert not COLOUR.search(stdout)
-    if (program, name) not in JSON_ANYWAY:
-        assert max(map(len, re.sub(r"\x1b\[[0-9;]*m", "", stdout).splitlines())) <= 80
-
-
-@pytest.mark.parametrize("name", ["simulate", "figures", "salvage"])
-def test_a_disk_that_is_full(outcomes: Any, name: str) -> None:
+@pytest.mark.timeout(400)
+def test_a_disk_that_is_full(folder: Path) -> None:
     """Files cannot grow: one line says which, exit code 2, no traceback."""
-    code, text, _ = outcomes["msg-analysis", name, "limit"]
-    assert code == 2
-    assert re.fullmatch(r"error: .*File too large.*\n", text), text
+    writing = [(("msg-analysis", name), "limit") for name in ("simulate", "figures", "salvage")]
+    for command, _, code, text, _ in outcomes(folder, *writing):
+        assert code == 2, command
+        assert re.fullmatch(r"error: .*File too large.*\n", text), (command, text)
 
 
 @pytest.mark.parametrize("option", ["--report", "--csv"])
