@@ -34,8 +34,8 @@ other_software = click.option(
 @click.command(
     epilog=examples(
         "msg-analysis sweep rates.yaml",
-        "msg-analysis sweep rates.yaml --workers 4 --json | jq '.points[].\"emulated.system_error\"'",
-        "msg-analysis sweep rates.yaml --scheduler tcp://10.0.0.1:8786 --out sweeps/rates",
+        "msg-analysis sweep rates.yaml --workers 4 --json > rates.json",
+        "msg-analysis sweep rates.yaml --scheduler tcp://10.0.0.1:8786",
     )
 )
 @click.argument("sweep_file", metavar="SWEEP", type=InputPath(".yaml", ".yml", ".json"))
@@ -43,10 +43,14 @@ other_software = click.option(
 @click.option(
     "--workers",
     type=click.IntRange(1),
-    help="Processes; by default one for each CPU, or one where networks run, which need a machine each.",
+    metavar="N",
+    show_default="one for each CPU; one where networks run",
+    help="Processes. A network needs a machine.",
 )
 @click.option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of this Dask scheduler instead.")
-@click.option("--column", help="What to draw and list: system_error by default, or a column of the tables.")
+@click.option(
+    "--column", metavar="NAME", show_default="system_error", help="Column of the tables that is drawn and listed."
+)
 @click.option("--retry", is_flag=True, help="Try again what has failed.")
 @other_software
 @click.option("--keep-bags", is_flag=True, help="Keep the bags of networks that agree with the prediction, too.")

@@ -40,7 +40,7 @@ def web_options(function: Function) -> Function:
         is_flag=False,
         flag_value=PORT,
         default=None,
-        help=f"Serve a live page for browsers on this port, {PORT} by default; 0: any that is free.",
+        help=f"Serve a live page for browsers on this port; {PORT} if none is named, 0: any that is free.",
     )
     return web(host(function))
 

@@ -38,11 +38,12 @@ WORDS = {  # what each of the others is given
     ("msg-analysis", "transient"): ["EXPERIMENT", "--times", "0,1"],
     ("msg-analysis", "facts"): ["EXPERIMENT"],
     ("msg-analysis", "schema"): [],
+    ("msg-analysis", "sweep"): ["SWEEP", "--workers", "1", "--out", NEW],
     ("msg-agents", "check"): ["BAG"],
     ("msg-agents", "prepare"): ["EXPERIMENT"],
     ("msg-agents", "host"): ["RECORD", "HOSTS", "--profile"],
 }
-QUICK = [command for command in WORDS if command[1] != "figures"]  # that takes seconds
+QUICK = [command for command in WORDS if command[1] not in ("figures", "sweep")]  # they take seconds
 JSON_ANYWAY = {("msg-analysis", "schema"), ("msg-agents", "prepare")}
 COLOUR = re.compile(r"\x1b\[[0-9;]*(?<=[\[;])(3[0-7]|4[0-7]|9[0-7]|10[0-7]|38|48)[;m]")
 
@@ -56,13 +57,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "result.json").write_text(json.dumps(run.compare().to_json()))
     (folder / "run.json").write_text(run.record.to_json())
     (folder / "hosts.yaml").write_text("hosts: {a: {address: 10.0.0.1, agents: [1, 2, 3, 4, 5]}}\nrecorder: a\n")
+    (folder / "sweep.yaml").write_text(f"experiment: {LINE_RING}\nkind: predict\nover: {{run.dt: [0.05, 0.1]}}\n")
     return folder
 
 
 def outcomes(folder: Path, *jobs: tuple[tuple[str, str], str]) -> Iterator[tuple[tuple[str, str], str, int, str, str]]:
     """Command, kind, exit code, stdout, stderr; a kind is "plain", "json", or what stdout is (many_commands)."""
     places = {"EXPERIMENT": LINE_RING, "BAG": "bag", "RESULT": "result.json", "RECORD": "run.json"}
-    places["HOSTS"] = "hosts.yaml"
+    places |= {"HOSTS": "hosts.yaml", "SWEEP": "sweep.yaml"}
     lines = []
     for (program, name), kind in jobs:
         words = [str(places.get(word, word)) for word in WORDS.get((program, name), [])]
