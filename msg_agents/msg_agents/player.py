@@ -35,6 +35,7 @@ from msg_analysis.model.steptime import SECOND
 
 POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
 LOOK = 0.05  # s between two looks at the keyboard
+STOPPED = 1.0  # s without a look around, after which the process was stopped, or as good as that
 SHOW = 0.2  # s between two reports of progress
 ACK_SLICE = 0.2  # s
 PATIENCE = 5.0  # s in which readers acknowledge the end; the middleware may ask for that no sooner than after 3 s
@@ -311,7 +312,8 @@ class Player(QuietNode):
             self._interruption.check()
 
     def _look_around(self, now: float, next_time: int) -> None:
-        if self._jobs.continued():  # nothing is hurried through afterwards
+        # Nothing is hurried through after a stop. Of one we may hear late: any thread of the middleware may get the signal.
+        if self._jobs.continued() or now - self._awake > STOPPED:
             now = time.monotonic()
             self._time.hold(now - self._awake)
         self._looked = self._awake = now
