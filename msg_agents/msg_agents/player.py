@@ -312,7 +312,7 @@ class Player(QuietNode):
             self._interruption.check()
 
     def _look_around(self, now: float, next_time: int) -> None:
-        # Nothing is hurried through after a stop. We may hear of it late: a thread of the middleware may get the signal.
+        # Nothing is hurried through after a stop. We may hear of it late: any thread of ours may get the signal.
         if self._jobs.continued() or now - self._awake > STOPPED:
             now = time.monotonic()
             self._time.hold(now - self._awake)
