@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable
 from types import FrameType, TracebackType
@@ -46,7 +45,7 @@ class JobControl:
         self._before()
         signal.signal(signal.SIGTSTP, signal.SIG_DFL)
         self._standing = True
-        os.kill(os.getpid(), signal.SIGTSTP)  # here it stands
+        signal.raise_signal(signal.SIGTSTP)  # here it stands: of one sent by kill, another thread may hear, and later
         self._be_ready()
         if self._standing:  # no shell could make it go on again (setsid), so the system did not stop it
             self._standing = False
