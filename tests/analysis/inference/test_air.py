@@ -184,7 +184,8 @@ def test_blocks_change_nothing(monkeypatch):
     monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 70)
     split = innovation_tests(observation), loss_test(observation), broadcast_p(observation)
     for one, other in zip(whole[:2], split[:2], strict=True):
-        np.testing.assert_allclose(dataclasses.astuple(other), dataclasses.astuple(one), rtol=1e-9)
+        for ours, theirs in zip(dataclasses.astuple(other), dataclasses.astuple(one), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-9)
     assert split[2] == pytest.approx(whole[2])
 
 

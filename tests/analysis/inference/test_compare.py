@@ -242,7 +242,8 @@ def test_too_little_data_get_no_numbers(short_run, step):
     assert document["system_error"]["measured"] is None
     assert document["system_error"]["interval"] == [None, None]
     assert document["system_error"]["predicted"] > 0
-    assert document["innovations"] == dict.fromkeys(("p_covariance", "p_whiteness", "p_gain", "p_common_gain"))
+    tests = ("p_covariance", "p_whiteness", "p_gain", "p_common_gain")
+    assert document["innovations"] == dict.fromkeys((*tests, "ratios", "samples"))
     assert document["switching"] == {"counts": None, "expected": None, "p": None}
     assert document["loss"] == {"lost": None, "expected": None, "p": None}
     assert document["broadcast"] == {"p": None}
