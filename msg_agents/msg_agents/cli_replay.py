@@ -338,13 +338,13 @@ def _watch(
         from msg_agents.jobcontrol import JobControl
 
         screen = Live(console=console, auto_refresh=False)
-        with screen, JobControl(before=screen.stop, after=lambda: screen.start(refresh=True)):
+        with screen, JobControl(before=screen.stop, after=lambda: screen.start(refresh=True)) as jobs:
 
             def draw(watched: Watched, rate: float) -> None:
                 publish(watched, rate)
                 screen.update(live_table(watched.report, watched.record, rate), refresh=True)
 
-            found = watch(reliable=reliable, timeout=timeout, on_report=draw, on_note=note)
+            found = watch(reliable=reliable, timeout=timeout, on_report=draw, on_note=note, on_look=jobs.check)
     return found
 
 

@@ -5,7 +5,6 @@ Each node is the command of that name of ``msg-agents``: ``ros2 run msg_agents a
 
 from __future__ import annotations
 
-import os
 import sys
 
 INTERRUPTED = 130
@@ -49,20 +48,6 @@ def markers() -> None:
 def _run(*command: str) -> None:
     try:
         from msg_agents.cli import main
-
-        main([*command, *sys.argv[1:]], prog_name="msg-agents")
     except KeyboardInterrupt:  # what is being imported cannot be asked to see to it
-        code: object = INTERRUPTED
-    except SystemExit as end:
-        code = end.code
-    else:
-        code = 0
-    if "rclpy" not in sys.modules or not isinstance(code, int):
-        sys.exit(code)  # type: ignore[arg-type]
-    # All has been given to whom it is due. Fast DDS has threads of its own, which may hold up an interpreter that ends.
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except (OSError, ValueError):
-            code = code or 1  # what could not be written was wanted
-    os._exit(code)
+        sys.exit(INTERRUPTED)
+    main([*command, *sys.argv[1:]], prog_name="msg-agents")

@@ -11,6 +11,8 @@ from typing import Any, Self
 class JobControl:
     """Puts things in order before the process is stopped by Ctrl-Z, and after it goes on, as a context.
 
+    It does so when asked to ``check``, not in the handler: that might come in the middle of drawing, of which both are.
+
     Parameters
     ----------
     before
@@ -22,12 +24,12 @@ class JobControl:
     def __init__(self, *, before: Callable[[], None], after: Callable[[], None]) -> None:
         self._before, self._after = before, after
         self._handlers: dict[signal.Signals, Any] = {}
-        self._continued = self._standing = False
+        self._asked = self._resumed = self._continued = False
 
     def __enter__(self) -> Self:
         self._handlers[signal.SIGCONT] = signal.signal(signal.SIGCONT, self._go_on)
         if signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL:  # otherwise somebody wants Ctrl-Z to be ignored
-            self._handlers[signal.SIGTSTP] = signal.signal(signal.SIGTSTP, self._stop)
+            self._handlers[signal.SIGTSTP] = signal.signal(signal.SIGTSTP, self._ask)
         return self
 
     def __exit__(
@@ -36,26 +38,26 @@ class JobControl:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
 
+    def check(self) -> None:
+        """Stop, if that was asked for; put things in order, if the process has gone on. To be called often."""
+        if self._asked:
+            self._asked = False
+            self._before()
+            signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+            signal.raise_signal(signal.SIGTSTP)  # here it stands: of one sent by kill, another thread may hear, later
+            signal.signal(signal.SIGTSTP, self._ask)
+            self._resumed = True  # also where the system did not stop it, since no shell could make it go on (setsid)
+        if self._resumed:
+            self._resumed = False
+            self._after()
+
     def continued(self) -> bool:
         """Whether the process has been stopped, and gone on, since this was asked last."""
         was, self._continued = self._continued, False
         return was
 
-    def _stop(self, *_: int | FrameType | None) -> None:
-        self._before()
-        signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-        self._standing = True
-        signal.raise_signal(signal.SIGTSTP)  # here it stands: of one sent by kill, another thread may hear, and later
-        self._be_ready()
-        if self._standing:  # no shell could make it go on again (setsid), so the system did not stop it
-            self._standing = False
-            self._after()
+    def _ask(self, *_: int | FrameType | None) -> None:
+        self._asked = True
 
     def _go_on(self, *_: int | FrameType | None) -> None:
-        self._continued, self._standing = True, False
-        self._be_ready()  # first: the next Ctrl-Z may come at any time
-        self._after()
-
-    def _be_ready(self) -> None:
-        if signal.SIGTSTP in self._handlers:
-            signal.signal(signal.SIGTSTP, self._stop)
+        self._continued = self._resumed = True

@@ -186,6 +186,7 @@ def watch(
     timeout: float | None = None,
     on_report: Callable[[Watched, float], None] = lambda *_: None,
     on_note: Callable[[str], None] = lambda _: None,
+    on_look: Callable[[], None] = lambda: None,
 ) -> Watched | None:
     """Watch a network in this process until it is over, or until Ctrl-C or another signal.
 
@@ -195,6 +196,8 @@ def watch(
         see ``Live``
     timeout
         s to wait for a network; None: for ever
+    on_look
+        called a few times a second
 
     Returns
     -------
@@ -208,6 +211,9 @@ def watch(
         no network came in time, or there is no prediction for it
     """
     node = run_watcher(
-        lambda: Live(reliable=reliable, on_report=on_report, on_note=on_note), timeout=timeout, on_note=on_note
+        lambda: Live(reliable=reliable, on_report=on_report, on_note=on_note),
+        timeout=timeout,
+        on_note=on_note,
+        on_look=on_look,
     )
     return node and node.outcome

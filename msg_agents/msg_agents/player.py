@@ -234,9 +234,14 @@ class Player(QuietNode):
             self._time.jump(self._first)
         self._wait_until_taken()
 
+    def _heed(self) -> None:
+        """End, or stop, if a signal has asked for it."""
+        self._interruption.check()
+        self._jobs.check()
+
     def _bide(self) -> None:
         """Take some time, before it begins."""
-        self._interruption.check()
+        self._heed()
         self._press(self._keyboard.wait(POLL), self._first)
         self._on_progress(self.played)
 
@@ -248,7 +253,7 @@ class Player(QuietNode):
         count = 0
         if self._latched:
             for message in self._bag.messages(self._latched, self._first):
-                self._interruption.check()
+                self._heed()
                 self._send(message)
                 count += 1
         self.played.messages += count
@@ -257,7 +262,7 @@ class Player(QuietNode):
     def _play_once(self, early: int) -> None:
         """Play the bag, without so many messages of latched topics at the beginning, which have been published."""
         for message in self._bag.messages(self._writers.keys(), self._last):
-            self._interruption.check()
+            self._heed()
             latched = message.topic in self._latched
             if latched and early:
                 early -= 1
@@ -290,7 +295,7 @@ class Player(QuietNode):
                         f"topic {message.topic}: a message of {len(message.data)} bytes is no {kind} "
                         f"({error}): leave the topic out with --exclude"
                     ) from error
-            self._interruption.check()
+            self._heed()
 
     def _wait_for(self, message: Message) -> None:
         """Until it is its turn, see to everything else."""
@@ -309,7 +314,7 @@ class Player(QuietNode):
                 return
             soonest = min(wait, LOOK) if self._ticker is None else min(wait, LOOK, self._next_tick() - now)
             self._press(self._keyboard.wait(soonest), message.time)
-            self._interruption.check()
+            self._heed()
 
     def _look_around(self, now: float, next_time: int) -> None:
         # Nothing is hurried through after a stop. We may hear of it late: any thread of ours may get the signal.
@@ -354,7 +359,7 @@ class Player(QuietNode):
         waiting = list(self._writers.values())
         began, noted = time.monotonic(), False
         while waiting:
-            self._interruption.check()
+            self._heed()
             each_waits = Duration(seconds=ACK_SLICE / len(waiting))
             waiting = [writer for writer in waiting if not writer.wait_for_all_acked(each_waits)]
             if waiting and not noted and time.monotonic() > began + PATIENCE:

@@ -28,6 +28,7 @@ GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a sma
 SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wakes up
 GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collections find nothing
 LEAVE_GRACE = 5  # s
+INTERRUPTED_GRACE = 15  # s; longer, since what ends by it has not ended in order
 LIFELINE_GRACE = 5.0  # s
 USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
 
@@ -187,7 +188,7 @@ def leave(nodes: Sequence[Node], *, complete: bool) -> None:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(LEAVE_GRACE)
     else:
-        faulthandler.dump_traceback_later(LEAVE_GRACE, exit=True)
+        faulthandler.dump_traceback_later(INTERRUPTED_GRACE, exit=True)
     for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()

@@ -105,6 +105,8 @@ class RunView:
         force
             even if it has been shown a moment ago
         """
+        if self._terminal:
+            self._jobs.check()
         self._steps = steps
         if self._observer is not None:
             self._observer.look(min(steps, default=-1))

@@ -112,7 +112,11 @@ Kind = TypeVar("Kind", bound=Watcher)
 
 
 def run_watcher(
-    make_node: Callable[[], Kind], *, timeout: float | None = None, on_note: Callable[[str], None] = lambda _: None
+    make_node: Callable[[], Kind],
+    *,
+    timeout: float | None = None,
+    on_note: Callable[[str], None] = lambda _: None,
+    on_look: Callable[[], None] = lambda: None,
 ) -> Kind | None:
     """Watch a network in this process until it is over, or until Ctrl-C or another signal.
 
@@ -124,6 +128,8 @@ def run_watcher(
         s to wait for a network; None: for ever
     on_note
         told what somebody should know
+    on_look
+        called a few times a second, between two callbacks
 
     Returns
     -------
@@ -147,6 +153,7 @@ def run_watcher(
         executor.add_node(node)
         began, noted = time.monotonic(), False
         while not node.known.done():
+            on_look()
             executor.spin_until_future_complete(node.known, timeout_sec=SPIN_SLICE)
             waited = time.monotonic() - began
             if timeout is not None and waited > timeout and not node.known.done():
@@ -155,7 +162,7 @@ def run_watcher(
                 noted = True
                 on_note(f"{nobody} yet: waiting for one")
         node.follow()
-        _spin(executor, node.done)
+        _spin(executor, node.done, on_look)
         node.farewell()
     except (KeyboardInterrupt, SystemExit):
         pass
@@ -168,7 +175,7 @@ def run_watcher(
     return nodes[0] if nodes else None
 
 
-def _spin(executor: Executor, done: Future) -> None:
+def _spin(executor: Executor, done: Future, on_look: Callable[[], None]) -> None:
     """Spin until something is done.
 
     Raises
@@ -179,6 +186,7 @@ def _spin(executor: Executor, done: Future) -> None:
     with Interruption() as interruption:
         while not done.done():
             interruption.check()
+            on_look()
             executor.spin_until_future_complete(done, timeout_sec=SPIN_SLICE)
 
 

@@ -33,8 +33,8 @@ def terminal(network: Any) -> Iterator[Any]:
 
 
 def _long(network: Any) -> Path:
-    """Paced, so that it takes long enough to be looked at on any machine: 8 s."""
-    return network.file(run={"pace": "realtime", "speed": 5, "duration": 40})  # type: ignore[no-any-return]
+    """Paced, so that it takes long enough to be looked at on any machine: 20 s."""
+    return network.file(run={"pace": "realtime", "speed": 2, "duration": 40})  # type: ignore[no-any-return]
 
 
 def _bottom(screen: Terminal) -> int:

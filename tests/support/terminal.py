@@ -34,9 +34,8 @@ class Terminal:
             stdout=slave,
             stderr=slave,
             preexec_fn=own,
-            env=dict(
-                os.environ
-            ),  # as Python knows it: readline adds a COLUMNS behind its back, which would fix the width
+            # readline adds its own, also to the environment of pytest's workers, and they would fix the size
+            env={name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")},
         )
 
     def type(self, keys: bytes) -> None:
