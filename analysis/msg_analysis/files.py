@@ -52,13 +52,14 @@ def write_whole(path: Path, content: bytes) -> Path:
     """
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
         temporary = Path(stream.name)
-        stream.write(content)
-    try:
-        mask = os.umask(0)
-        os.umask(mask)
-        temporary.chmod(0o666 & ~mask)
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink()
-        raise
+        try:
+            stream.write(content)
+            stream.flush()  # a full disk shows here
+            mask = os.umask(0)
+            os.umask(mask)
+            temporary.chmod(0o666 & ~mask)
+            temporary.replace(path)
+        except OSError:
+            temporary.unlink()
+            raise
     return path

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import datetime
-import os
 import platform
 import shlex
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from bokeh.resources import Resources
 from markupsafe import Markup
 
 from msg_analysis.errors import InputError
+from msg_analysis.files import write_whole
 from msg_analysis.inference.compare import Comparison
 from msg_analysis.inference.observation import bounded
 from msg_analysis.model.trajectory import Trajectory
@@ -70,13 +69,7 @@ def write_report(
     path = Path(path)
     html = render(comparison, trajectory, restarts=restarts, strangers=strangers)
     try:
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=path.absolute().parent, prefix=f".{path.name}.", delete=False
-        ) as stream:
-            temporary = Path(stream.name)
-            stream.write(html)
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
+        write_whole(path, html.encode())
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
 
@@ -259,9 +252,3 @@ def _p_value(p: float | None, equals: str = "") -> str:
 
 def _matrix(rows: list[list[float]] | None) -> Any:
     return None if rows is None else np.array(rows, dtype=float)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
