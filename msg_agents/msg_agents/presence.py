@@ -36,11 +36,10 @@ class Presence:
     def _look(self) -> None:
         there, now = set(self._node.get_node_names()), time.monotonic()
         self._since = {name: self._since.get(name, now) for name in self._node.companions() if name not in there}
-        gone = [name for name, since in self._since.items() if now - since > self._patience]
-        if gone:
+        if now - min(self._since.values(), default=now) > self._patience:
             self._node.fail(
                 LeftAloneError(
-                    f"{', '.join(gone)} left the network more than {self._patience:g} s ago, before the end of the "
-                    "run: see what happened on the host that runs it"
+                    f"{', '.join(self._since)} left the network before the end of the run, and {self._patience:g} s "
+                    "were not enough to come back: see what happened on the host that runs it"
                 )
             )

@@ -18,9 +18,9 @@ from msg_analysis.bags.schemas import Topic
 from msg_analysis.bags.storage import DEFAULT, Compression, Storage
 from msg_analysis.errors import BagError
 
-# Small enough that a killed recorder loses little, large enough that zstd finds what the messages have in
-# common.
-CHUNK_SIZE = 256 * 1024
+# As rosbag2 has it: small enough that a killed recorder loses little, large enough that what readers do once for a
+# chunk does not count. With a third of it, reading takes a fifth longer.
+CHUNK_SIZE = 768 * 1024
 RECORDING_MARKER = ".recording"
 RECORD_NAME = "msg_agents"  # of the MCAP metadata record with the run record
 ROSBAG2_RECORD = "rosbag2"
@@ -100,7 +100,8 @@ class BagWriter:
 
     def _begin_file(self) -> None:
         """All that is needed to read this file without the others."""
-        self._mcap = Writer(self._stream, chunk_size=CHUNK_SIZE, compression=self._compression)
+        chunk_size = min(CHUNK_SIZE, self._split_size or CHUNK_SIZE)
+        self._mcap = Writer(self._stream, chunk_size=chunk_size, compression=self._compression)
         self._mcap.start(profile="ros2", library="mcap")
         self._add_information()
         if self._record is not None:
