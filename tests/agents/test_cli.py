@@ -1,7 +1,8 @@
-"""The command line in processes of its own: what goes to stdout, what to stderr, and the exit codes."""
+"""The command line: what goes to stdout, what to stderr, and the exit codes; the same in a process of its own."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -14,9 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from click.testing import CliRunner
 
 pytest.importorskip("rclpy")
 
+from msg_agents.cli import main
 from msg_analysis.bags.store import write_trajectory
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.twin import new_record, simulate
@@ -37,6 +40,15 @@ def document(**run: Any) -> dict[str, Any]:
 
 
 def call(*arguments: str | Path, directory: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The command in this process, which takes a hundredth of the time."""
+    words = [str(argument) for argument in arguments]
+    with contextlib.chdir(directory or Path.cwd()):
+        result = CliRunner(env={"NO_COLOR": "1"}).invoke(main, words, prog_name="msg-agents", catch_exceptions=False)
+    return subprocess.CompletedProcess(words, result.exit_code, result.stdout, result.stderr)
+
+
+def execute(*arguments: str | Path, directory: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """As a user does."""
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1"}
     command = [str(PROGRAM), *(str(argument) for argument in arguments)]
     return subprocess.run(command, env=environment, cwd=directory, capture_output=True, text=True, timeout=60)
@@ -109,7 +121,7 @@ def test_experiments_that_cannot_be_run(
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    refused(call("run", tmp_path / "nowhere.yaml"), "nowhere.yaml")
+    refused(execute("run", tmp_path / "nowhere.yaml"), "nowhere.yaml")
     refused(call("run", tmp_path), str(tmp_path))
     (tmp_path / "binary").write_bytes(bytes(range(256)))
     refused(call("run", tmp_path / "binary"), "binary")
@@ -192,7 +204,7 @@ def test_unknown_agents(run_file: Path, numbers: list[str], words: list[str]) ->
 def test_the_recorder_never_overwrites(tmp_path: Path, run_file: Path) -> None:
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "mine").write_text("mine")
-    refused(call("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
+    refused(execute("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
     assert [file.name for file in (tmp_path / "bag").iterdir()] == ["mine"]
 
 
@@ -209,7 +221,7 @@ def test_check(tmp_path: Path) -> None:
     process = call("check", tmp_path / "bad")
     assert process.returncode == 1
     assert "first: agent 2 at step 40" in process.stdout
-    process = call("check", tmp_path / "bad", "--json")
+    process = execute("check", tmp_path / "bad", "--json")
     assert process.returncode == 1
     found = json.loads(process.stdout)
     assert (found["equal"], found["compared"], found["missing"]) == (False, 303, 0)
@@ -242,18 +254,18 @@ def test_prepare(experiment: Path) -> None:
 
 
 def test_help_and_version() -> None:
-    process = call("--help")
+    process = execute("--help")
     assert process.returncode == 0
     for command in COMMANDS:
         assert command in process.stdout
-    assert "Examples:" in call("run", "--help").stdout
-    assert call("--version").stdout.startswith("msg-agents, version ")
-    refused(call("fly"), "fly")
+    assert "Examples:" in execute("run", "--help").stdout
+    assert execute("--version").stdout.startswith("msg-agents, version ")
+    refused(execute("fly"), "fly")
 
 
 @pytest.mark.integration
 def test_json_is_one_object_and_nothing_else(experiment: Path, tmp_path: Path) -> None:
-    process = call("run", experiment, "--out", tmp_path / "runs", "--processes", "1", "--json")
+    process = execute("run", experiment, "--out", tmp_path / "runs", "--processes", "1", "--json")
     assert process.returncode == 0, process.stderr
     result = json.loads(process.stdout)
     assert process.stdout.count("\n") == 1
@@ -264,7 +276,7 @@ def test_json_is_one_object_and_nothing_else(experiment: Path, tmp_path: Path) -
 
 @pytest.mark.integration
 def test_run_without_recording(experiment: Path, tmp_path: Path) -> None:
-    process = call("run", experiment, "--no-record", "--processes", "1", "--json", directory=tmp_path)
+    process = execute("run", experiment, "--no-record", "--processes", "1", "--json", directory=tmp_path)
     assert process.returncode == 0, process.stderr
     result = json.loads(process.stdout)
     assert result["bag"] is None

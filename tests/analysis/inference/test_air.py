@@ -19,7 +19,7 @@ from msg_analysis.twin import simulate
 
 AIR = {"broadcast": 0.3, "link": 0.2, "loss": 0.2}
 CORRELATED = [[1.0, 0.3, 0.0], [0.0, 0.5, 0.2], [0.0, 0.0, 2.0]]
-SEEDS = range(60)
+SEEDS = range(40)
 
 
 def experiment(noise=AIR, **changes):
@@ -45,7 +45,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_calibration(case):
-    """p-values of 60 true runs of 400 steps are even, intervals cover, verdicts agree.
+    """p-values of 40 true runs of 400 steps are even, intervals cover, verdicts agree.
 
     Kolmogorov-Smirnov at 2e-4 for each of at most 11 tests, coverage and verdicts at 1e-4 by the binomial law: a right
     program fails a case with probability below 0.3 %.

@@ -17,7 +17,7 @@ from msg_analysis.theory.prediction import predict
 from msg_analysis.twin import simulate
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
-SEEDS = range(100, 160)
+SEEDS = range(100, 140)
 
 
 def golden(name, **run):
@@ -65,7 +65,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_calibration(case):
-    """p-values of 60 true runs are uniform, intervals cover, verdicts agree.
+    """p-values of 40 true runs are uniform, intervals cover, verdicts agree.
 
     Kolmogorov-Smirnov at 2e-4 for each of at most 12 tests, coverage and verdicts at 1e-4 by the binomial
     law: a right program fails a case with probability below 0.3 %.
@@ -112,7 +112,7 @@ def simulate_air(experiment, seed):
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_calibration_with_noise_that_depends_on_the_graph(loss):
-    """60 runs; levels as in test_calibration, 11 or 12 tests."""
+    """40 runs; levels as in test_calibration, 11 or 12 tests."""
     noise = {"process": 0.2, "broadcast": 0.3, "link": 0.2, "loss": loss}
     air = changed(golden("air", duration=50, replicas=3, start="zero"), noise=noise)
     results = [compare(simulate_air(air, seed)) for seed in SEEDS]
@@ -124,7 +124,7 @@ def test_calibration_with_noise_that_depends_on_the_graph(loss):
 
 
 def test_standard_errors_hold_when_the_graph_hardly_ever_switches():
-    """Rate 0.01 over 200 time units: two switches a run. 95 % intervals of 60 runs, binomial at 1e-4."""
+    """Rate 0.01 over 200 time units: two switches a run. 95 % intervals of 40 runs, binomial at 1e-4."""
     slow = changed(
         golden("line_ring", duration=200, replicas=2, dt=0.2),
         switching={"generator": [[-0.01, 0.01], [0.01, -0.01]]},
