@@ -24,7 +24,8 @@ import numpy as np
 from scipy import stats
 
 import msg_analysis
-from msg_analysis.inference.compare import Comparison, compare
+from msg_analysis.inference.compare import compare
+from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord

@@ -17,7 +17,8 @@ import numpy as np
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.inference.compare import Comparison, compare
+from msg_analysis.inference.compare import compare
+from msg_analysis.inference.comparison import Comparison
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord
 from msg_analysis.twin import simulate

@@ -31,7 +31,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import InputError
 from msg_analysis.inference.compare import compare
-from msg_analysis.model import validation
+from msg_analysis.model import memory
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.report.info import describe_bag, describe_experiment
 
@@ -127,7 +127,7 @@ def work(task: tuple[str, int, int, list[Path], Path]) -> tuple[Counter[str], li
     """A stretch of seeds in a process of its own: outcomes, findings, the longest case [s], most memory [kB]."""
     kind, first, last, sources, findings = task
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
-    validation.available_memory = lambda: MEMORY
+    memory.available_memory = lambda: MEMORY
     signal.signal(signal.SIGPROF, _too_slow)
     outcomes: Counter[str] = Counter()
     found, longest = [], 0.0

@@ -19,8 +19,8 @@ from msg_analysis.bags.storage import DEFAULT, Storage
 from msg_analysis.bags.store import write_trajectory
 from msg_analysis.errors import BagError, InputError, NotAvailableError
 from msg_analysis.files import require_place
-from msg_analysis.inference.compare import Comparison
 from msg_analysis.inference.compare import compare as compare_trajectory
+from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.model import experiment as model
 from msg_analysis.model.problems import ExperimentError

@@ -34,7 +34,7 @@ from msg_analysis.twin import new_record
 
 if TYPE_CHECKING:
     from msg_agents.view import RunView
-    from msg_analysis.inference.compare import Comparison
+    from msg_analysis.inference.comparison import Comparison
 
 POLL = 0.05  # s
 REPORT_FILE, RESULT_FILE = "report.html", "result.json"

@@ -15,9 +15,9 @@ from msg_analysis.bags.mcapfile import Batch
 from msg_analysis.bags.states import States, decode_states, run_number
 from msg_analysis.errors import BagError
 from msg_analysis.model.air import LOST
+from msg_analysis.model.memory import amount, available_memory
 from msg_analysis.model.record import RunRecord
 from msg_analysis.model.step import Wiring, build_model
-from msg_analysis.model.validation import amount, available_memory
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
 _NEVER = np.zeros(1, dtype=np.bool_)

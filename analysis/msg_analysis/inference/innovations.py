@@ -13,11 +13,11 @@ import numpy as np
 from scipy import stats
 
 from msg_analysis.inference.gaussian import covariance_statistic
+from msg_analysis.inference.heard_regression import HeardRegression
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.reception import (
     NO_NOISE,
     Equalizer,
-    HeardRegression,
     Reception,
     full_reception_noise,
 )

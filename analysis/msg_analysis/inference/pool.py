@@ -12,6 +12,7 @@ from scipy import stats
 
 from msg_analysis.errors import InputError
 from msg_analysis.inference import compare
+from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.identity import first_difference
@@ -88,7 +89,7 @@ class Pool:
         return [member.to_json() for member in self.members]
 
 
-def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.01) -> compare.Comparison:
+def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.01) -> Comparison:
     """Compare several runs of one experiment with its prediction, to one verdict.
 
     All that is tested is added up over the runs, so that every step of every run counts the same, and long runs count

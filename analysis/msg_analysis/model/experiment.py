@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from msg_analysis.errors import NotAvailableError
 from msg_analysis.markdown import markdown_table, number_text
-from msg_analysis.model import protocols, validation
+from msg_analysis.model import memory, protocols, validation
 from msg_analysis.model.chain import MarkovChain, Time
 from msg_analysis.model.document import read_yaml
 from msg_analysis.model.graphs import Graph
@@ -154,7 +154,7 @@ class Experiment:
         bound, found = protocols.bind(protocol, self, recorded)
         experiment = replace(self, protocol=bound)
         size = experiment.agents, len(self.graph_list), experiment.steps, experiment.width
-        found += validation.memory_problems(*size, 0, experiment.truth)
+        found += memory.memory_problems(*size, 0, experiment.truth)
         if found:
             raise ExperimentError(self.source, found)
         return experiment

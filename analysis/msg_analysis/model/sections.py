@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from msg_analysis.model import protocols, topology, validation
+from msg_analysis.model import memory, protocols, topology, validation
 from msg_analysis.model.chain import MarkovChain
 from msg_analysis.model.graphs import Graph
 from msg_analysis.model.problems import problem, translate
@@ -167,7 +167,7 @@ class Sections:
         noise = self.values["noise"]
         delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)
         modes = len(self.values["graphs"])
-        found = validation.memory_problems(self.agents, modes, steps, replicas, delay, truth)
+        found = memory.memory_problems(self.agents, modes, steps, replicas, delay, truth)
         self.problems += found
         return not found
 

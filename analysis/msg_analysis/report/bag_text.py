@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.model.validation import amount
+from msg_analysis.model.memory import amount
 from msg_analysis.model.words import counted
 from msg_analysis.report.tables import fact_table, number_text
 from msg_analysis.report.text import add_protocol, gaps

@@ -20,10 +20,10 @@ from markupsafe import Markup
 
 from msg_analysis.errors import InputError
 from msg_analysis.files import write_whole
-from msg_analysis.inference.compare import Comparison
+from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.observation import bounded
 from msg_analysis.model.trajectory import Trajectory
-from msg_analysis.report import drawings, plots
+from msg_analysis.report import drawings, plots, switching_plots
 from msg_analysis.report.explained import explain, graph_facts
 from msg_analysis.report.text import LAWS, QUANTILES, SUPPORT, TIMES, timing_facts, verdict_line
 from msg_analysis.report.verdict_text import order_statements, sentence
@@ -129,7 +129,7 @@ def render(
         first_agents=_furthest(document),
         sojourns=sojourns[1],
         shown_sojourns=sojourns[0],
-        at_once=plots.FIRST_SOJOURNS,
+        at_once=switching_plots.FIRST_SOJOURNS,
         explained=explain(experiment),
         drawings=drawings.graph_drawings(experiment),
         graph_facts=graph_facts(experiment),
@@ -161,9 +161,9 @@ def _models(
     known, sojourns = trajectory.modes[:steps], (0, 0)
     if len(known):
         names = [graph.name for graph in experiment.graph_list]
-        models["modes"], *counts = plots.active_graph(known, names, experiment.step_length)
+        models["modes"], *counts = switching_plots.active_graph(known, names, experiment.step_length)
         sojourns = counts[0], counts[1]
-        models["occupancy"] = plots.occupancy(known, names, experiment.chain.stationary)
+        models["occupancy"] = switching_plots.occupancy(known, names, experiment.chain.stationary)
         if not document["unpredicted"]:
             reference = None if experiment.problem == "consensus" else experiment.reference
             states = bounded(trajectory.values[:steps])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from msg_analysis.errors import InputError
-from msg_analysis.model import validation
+from msg_analysis.model import memory, validation
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.graphs import Graph
 from msg_analysis.theory.prediction import predict
@@ -40,7 +40,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     """
     document = experiment.to_document()
     chain = experiment.chain
-    states, matrices = validation.memory_needed(
+    states, matrices = memory.memory_needed(
         experiment.agents,
         chain.modes,
         experiment.steps,

@@ -16,69 +16,29 @@ from bokeh.models import (
     Legend,
     LegendItem,
     LinearColorMapper,
-    PlainText,
     Range1d,
     Span,
     UIElement,
     Whisker,
 )
 from bokeh.palettes import PuOr, interp_palette
-from bokeh.plotting import figure
 
 from msg_analysis.report.palette import (
     BLACK,
     BLUE,
     GREY,
     INK,
-    PALE,
     SKY,
     VERMILLION,
-    mode_colour,
-    shorten,
 )
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.report.plot_style import SANS, new_figure, place_legend, plain_legend
+from msg_analysis.types import FloatArray
 
 HALF = 1.959963984540054  # standard errors to either side of a 95 % interval
 MOST_LINES = 8
 """Agents whose convergence is drawn at once."""
 _NUMBERED = 8  # agents up to which heat maps show their numbers
-FIRST_SOJOURNS, _MOST_SOJOURNS = 120, 4000  # shown at first; kept
 _POINTS = 200  # of the convergence of an agent
-_SANS = "system-ui, -apple-system, 'Segoe UI', 'Noto Sans', 'DejaVu Sans', sans-serif"
-
-
-def _figure(height: int, tools: str = "box_zoom,pan,wheel_zoom,reset,save", **options: Any) -> Any:
-    """An empty figure in the report's style. It does not take the wheel from who scrolls the page."""
-    settings = {"sizing_mode": "stretch_width", "active_scroll": None} | options
-    plot = figure(height=height, tools=tools, **settings)
-    plot.toolbar.logo = None
-    plot.toolbar.autohide = True
-    plot.outline_line_color = None
-    plot.grid.grid_line_color = PALE
-    plot.background_fill_color = plot.border_fill_color = "white"
-    for axis in plot.axis:
-        axis.axis_label_text_font = axis.major_label_text_font = _SANS
-        axis.axis_label_text_font_style = "normal"
-        axis.axis_label_text_color = INK
-        axis.axis_line_color = axis.major_tick_line_color = GREY
-        axis.minor_tick_line_color = None
-    return plot
-
-
-def _legend(plot: Any) -> None:
-    """Above the figure, in one row."""
-    if plot.legend:
-        legend = plot.legend[0]
-        plot.add_layout(legend, "above")
-        legend.orientation = "horizontal"
-        _plain(legend)
-
-
-def _plain(legend: Any) -> None:
-    legend.border_line_color = legend.background_fill_color = None
-    legend.label_text_font, legend.label_text_font_size, legend.label_text_color = _SANS, "12px", INK
-    legend.margin = legend.padding = 0
-    legend.spacing = 16
 
 
 def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> UIElement:
@@ -94,7 +54,7 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
     time, mean, error = running["time"], running["system_error"], running["standard_error"]
     centre = predicted if predicted is not None else mean[-1]
     low, high = centre - HALF * error, centre + HALF * error
-    plot = _figure(270, x_axis_label="simulated time", y_axis_label="system error", x_range=(0.0, float(time[-1])))
+    plot = new_figure(270, x_axis_label="simulated time", y_axis_label="system error", x_range=(0.0, float(time[-1])))
     data = {"time": time, "mean": mean, "low": low, "high": high, "z": (mean - centre) / np.where(error > 0, error, 1)}
     source = ColumnDataSource(data)
     rows = [("time", "@time{0.[00]}"), ("measured up to then", "@mean{0.0000}")]
@@ -109,7 +69,7 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
     bottom, top = min(mean[late].min(), low[late].min()), max(mean[late].max(), high[late].max())
     margin = 0.08 * (top - bottom) or 1.0
     plot.y_range = Range1d(max(bottom - margin, 0.0), top + margin)  # an error is never negative
-    _legend(plot)
+    place_legend(plot)
     return plot
 
 
@@ -141,7 +101,7 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
         "marker": np.where(apart, "square", "circle"),
     }
     source = ColumnDataSource(data, name="nodes")
-    plot = _figure(
+    plot = new_figure(
         270,
         "box_zoom,tap,box_select,pan,wheel_zoom,reset,save",
         x_axis_label="agent",
@@ -180,7 +140,7 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
             legend.items.append(LegendItem(label=label, renderers=[points], index=int(there[0])))
     if not plot.legend:
         plot.add_layout(legend)
-    _legend(plot)
+    place_legend(plot)
     return plot
 
 
@@ -222,7 +182,7 @@ def agent_convergence(
     widths = ColumnDataSource({"width": HALF * error / scale}, name="all_widths")
     lines = ColumnDataSource({key: [] for key in ("xs", "ys", "agent", "colour", "dash")}, name="lines")
     bands = ColumnDataSource({key: [] for key in ("xs", "ys", "colour")}, name="bands")
-    plot = _figure(270, x_axis_label="simulated time", y_axis_label="measured / predicted")
+    plot = new_figure(270, x_axis_label="simulated time", y_axis_label="measured / predicted")
     plot.x_range = Range1d(0.0, float(len(states) * dt))
     settled = parts[:, ends >= len(states) / 20]
     reach = min(1.2 * float(np.nanmax(np.abs(settled - 1))), 1.0)
@@ -233,7 +193,7 @@ def agent_convergence(
     plot.add_layout(
         Legend(items=[LegendItem(label={"field": "agent"}, renderers=[drawn])], orientation="horizontal"), "above"
     )
-    _plain(plot.legend[0])
+    plain_legend(plot.legend[0])
     rows = [("", "@agent"), ("time", "$data_x{0.[00]}"), ("measured / predicted", "$data_y{0.000}")]
     plot.add_tools(HoverTool(renderers=[drawn], tooltips=rows, line_policy="nearest"))
     # Sources that no glyph uses travel as tags.
@@ -268,7 +228,7 @@ def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> UI
     across, down = Range1d(0.5, agents + 0.5), Range1d(agents + 0.5, 0.5)
     panels = []
     for key, matrix in known.items():
-        panel = _figure(
+        panel = new_figure(
             290,
             "box_zoom,wheel_zoom,pan,reset,save",
             title=titles[key],
@@ -278,7 +238,7 @@ def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> UI
             min_border_right=8,
         )
         panel.grid.grid_line_color = None
-        panel.title.text_font, panel.title.text_color = _SANS, INK
+        panel.title.text_font, panel.title.text_color = SANS, INK
         panel.axis.ticker = BasicTicker(desired_num_ticks=8, min_interval=1, num_minor_ticks=0)
         image = panel.image(key, x=0.5, y=0.5, dw=agents, dh=agents, color_mapper=mapper, source=source)
         panel.add_tools(HoverTool(renderers=[image], tooltips=rows))
@@ -287,7 +247,7 @@ def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> UI
         panels.append(panel)
     panels[0].yaxis.axis_label = "agent"
     bar = ColorBar(color_mapper=mapper, width=10, label_standoff=6, border_line_color=None, padding=4)
-    bar.major_label_text_font = _SANS
+    bar.major_label_text_font = SANS
     panels[-1].add_layout(bar, "right")
     return gridplot([panels], sizing_mode="stretch_width", toolbar_options={"logo": None, "autohide": True})
 
@@ -302,118 +262,9 @@ def _write_numbers(panel: Any, matrix: FloatArray, limit: float) -> None:
         text_color=np.where(np.abs(matrix.ravel()) > 0.6 * limit, "white", BLACK).tolist(),
         text_align="center",
         text_baseline="middle",
-        text_font={"value": _SANS},
+        text_font={"value": SANS},
         text_font_size=f"{int(np.clip(60 / len(matrix), 7, 11))}px",
     )
-
-
-def active_graph(modes: IntArray, names: Sequence[str], dt: float) -> tuple[UIElement, int, int]:
-    """Which graph was active when.
-
-    Parameters
-    ----------
-    modes
-        (steps,) index of the graph; -1 where not known
-    names
-        Sequence[str] of the graphs
-    dt
-        length of a step [units of simulated time]
-
-    Returns
-    -------
-    tuple[UIElement, int, int]
-        the figure, the number of sojourns in it, and that of the run
-    """
-    starts = np.flatnonzero(np.diff(modes, prepend=-2))
-    ends = np.append(starts[1:], len(modes))
-    kept = min(len(starts), _MOST_SOJOURNS)
-    mode = modes[starts[:kept]]
-    known = mode >= 0
-    data = {
-        "left": starts[:kept][known] * dt,
-        "right": ends[:kept][known] * dt,
-        "mode": mode[known],
-        "name": [names[g] for g in mode[known].tolist()],
-        "colour": [mode_colour(g) for g in mode[known].tolist()],
-        "held": (ends - starts)[:kept][known] * dt,
-    }
-    first = ends[min(kept, FIRST_SOJOURNS) - 1] * dt
-    path = _figure(
-        _height(names),
-        "xpan,xbox_zoom,xwheel_zoom,reset,save",
-        title="active graph",
-        x_range=Range1d(0.0, float(first), bounds=(0.0, float(ends[kept - 1] * dt))),
-        y_range=Range1d(len(names) - 0.4, -0.6),
-        x_axis_label="simulated time",
-        min_border_right=12,
-    )
-    bars = path.hbar("mode", left="left", right="right", height=0.72, color="colour", line_alpha=0, source=data)
-    rows = [("graph", "@name"), ("from", "@left{0.[00]} to @right{0.[00]}"), ("held for", "@held{0.[00]}")]
-    path.add_tools(HoverTool(renderers=[bars], tooltips=rows))
-    _name_graphs(path, names)
-    # Names are texts, not mathematics, for which the page would ask the network.
-    path.yaxis.major_label_overrides = {g: PlainText(text=shorten(name)) for g, name in enumerate(names)}
-    return path, kept, len(starts)
-
-
-def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> UIElement:
-    """The share of the time of every graph, beside the stationary law; in the order of ``active_graph``.
-
-    Parameters
-    ----------
-    modes
-        (steps,) index of the graph; -1 where not known
-    names
-        Sequence[str] of the graphs
-    stationary
-        (n,) predicted shares
-    """
-    present = modes[modes >= 0]
-    share = np.bincount(present, minlength=len(names)) / max(len(present), 1)
-    places = np.arange(len(names))
-    shares = _figure(
-        _height(names),
-        "save",
-        title="share of the time",
-        y_range=Range1d(len(names) - 0.4, -0.6),
-        toolbar_location=None,
-        x_axis_label="line: predicted",
-    )
-    most = 1.12 * max(share.max(), stationary.max())
-    shares.x_range = Range1d(0.0, float(most))
-    table = {
-        "mode": places,
-        "share": share,
-        "predicted": stationary,
-        "name": list(names),
-        "colour": [mode_colour(g) for g in range(len(names))],
-        "low": places - 0.45,
-        "high": places + 0.45,
-    }
-    source = ColumnDataSource(table)
-    drawn = shares.hbar(
-        "mode", left=0, right="share", height=0.72, fill_color="colour", line_alpha=0, alpha=0.85, source=source
-    )
-    shares.segment("predicted", "low", "predicted", "high", source=source, color=BLACK, line_width=2.5)
-    shares.add_tools(
-        HoverTool(
-            renderers=[drawn],
-            tooltips=[("graph", "@name"), ("measured", "@share{0.0 %}"), ("predicted", "@predicted{0.0 %}")],
-        )
-    )
-    _name_graphs(shares, names)
-    shares.yaxis.major_label_text_font_size = "0px"
-    return shares
-
-
-def _height(names: Sequence[str]) -> int:
-    return int(min(110 + 30 * len(names), 520))
-
-
-def _name_graphs(plot: Any, names: Sequence[str]) -> None:
-    plot.title.text_font, plot.title.text_color = _SANS, INK
-    plot.ygrid.grid_line_color = None
-    plot.yaxis.ticker = FixedTicker(ticks=list(range(len(names))))
 
 
 def innovation_sizes(ratios: FloatArray, samples: int) -> UIElement:
@@ -435,7 +286,7 @@ def innovation_sizes(ratios: FloatArray, samples: int) -> UIElement:
         "colour": np.where(inside, BLUE, VERMILLION),
         "marker": np.where(inside, "circle", "square"),
     }
-    plot = _figure(200, x_axis_label="agent", y_axis_label="variance / predicted", x_range=(0.3, len(ratios) + 0.7))
+    plot = new_figure(200, x_axis_label="agent", y_axis_label="variance / predicted", x_range=(0.3, len(ratios) + 0.7))
     plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
     plot.xgrid.grid_line_color = None
     ends = np.array([0.3, len(ratios) + 0.7])
@@ -451,7 +302,7 @@ def innovation_sizes(ratios: FloatArray, samples: int) -> UIElement:
     )
     reach = 1.25 * max(float(np.nanmax(np.abs(ratios - 1.0), initial=0.0)), half)
     plot.y_range = Range1d(max(1 - reach, 0.0), 1 + reach)
-    _legend(plot)
+    place_legend(plot)
     return plot
 
 
@@ -484,7 +335,7 @@ def _histogram(
 ) -> Any:
     left, right, count = np.array(edges[:-1]), np.array(edges[1:]), np.array(counts)
     beyond = (left >= period) & (what == "steps")
-    plot = _figure(250, x_axis_label=label, y_axis_label=what, min_border_right=12)
+    plot = new_figure(250, x_axis_label=label, y_axis_label=what, min_border_right=12)
     # A logarithm has no place for none: bars are one and a bit at least, or not there.
     data = {
         "left": left,
@@ -507,7 +358,7 @@ def _histogram(
         name = "deadline" if what == "steps" else "one period"
         top = float(np.log10(most + 1.0))
         plot.line([period] * 2, [0.0, top], color=BLACK, line_width=1.5, line_dash="dashed", legend_label=name)
-        _legend(plot)
+        place_legend(plot)
     return plot
 
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.model.validation import amount
+from msg_analysis.model.memory import amount
 from msg_analysis.model.words import percent
 from msg_analysis.report.tables import (
     ROWS,

@@ -9,9 +9,10 @@ from scipy import stats
 
 from msg_analysis.inference.air import broadcast_p, loss_test
 from msg_analysis.inference.compare import compare
+from msg_analysis.inference.heard_regression import HeardRegression
 from msg_analysis.inference.innovations import innovation_tests, innovations
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.reception import HeardRegression, Reception
+from msg_analysis.inference.reception import Reception
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.record import RunRecord
 from msg_analysis.theory.prediction import predict

@@ -10,9 +10,10 @@ from scipy import stats
 from msg_analysis.errors import InputError
 from msg_analysis.inference.compare import compare
 from msg_analysis.inference.events import order_events
+from msg_analysis.inference.heard_regression import HeardRegression
 from msg_analysis.inference.innovations import innovation_tests, innovations
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.reception import HeardRegression, Reception, process_noise
+from msg_analysis.inference.reception import Reception, process_noise
 from msg_analysis.inference.timing import measure_timing
 from msg_analysis.model.experiment import Experiment
 from msg_analysis.model.realtime import phases

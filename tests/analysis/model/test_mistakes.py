@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from msg_analysis.model import validation
+from msg_analysis.model import memory
 from msg_analysis.model.experiment import Experiment, ExperimentError
 
 GOOD: dict[str, Any] = {
@@ -371,12 +371,12 @@ def test_graphml_weights_must_be_positive(tmp_path: Path) -> None:
 
 
 def test_memory_is_compared_with_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
-    needed = sum(validation.memory_needed(agents=5, modes=2, steps=8000, replicas=1))
-    monkeypatch.setattr(validation, "available_memory", lambda: needed)
+    needed = sum(memory.memory_needed(agents=5, modes=2, steps=8000, replicas=1))
+    monkeypatch.setattr(memory, "available_memory", lambda: needed)
     Experiment.parse(GOOD)
-    monkeypatch.setattr(validation, "available_memory", lambda: needed - 1)
+    monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
     assert "need 320 kB: expected at most 323 kB, the memory available" in problems_of({})[0]
 
 
 def test_available_memory_is_a_plausible_number_of_bytes() -> None:
-    assert 2**20 < validation.available_memory() < 2**60
+    assert 2**20 < memory.available_memory() < 2**60

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.inference.compare import Comparison, compare
-from msg_analysis.inference.compare import Test as FamilyTest
+from msg_analysis.inference.compare import compare
+from msg_analysis.inference.comparison import Comparison
+from msg_analysis.inference.comparison import Test as FamilyTest
 from msg_analysis.inference.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.innovations import InnovationTests
 from msg_analysis.inference.switching import SwitchingTest
