@@ -127,14 +127,32 @@ def sweep(
     context.exit(judgement.exit_code)
 
 
+class _EndedBySignal(KeyboardInterrupt):
+    """As by Ctrl-C, with another exit code."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+def _end(number: int, _: object) -> None:
+    from msg_analysis.sweep.workers import ENDING
+
+    for each in ENDING:
+        signal.signal(each, signal.SIG_IGN)
+    raise _EndedBySignal(number)
+
+
 def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Store, **how: Any) -> Conducted:
     """Do all jobs, with progress on stderr; if that is interrupted, say what is kept."""
     from msg_analysis.progress import SweepProgress
     from msg_analysis.sweep.conduct import conduct
-    from msg_analysis.sweep.workers import WorkersLostError
+    from msg_analysis.sweep.workers import ENDING, WorkersLostError
 
     if store.damaged:
         click.echo(f"note: {store.directory}: {store.damaged} lines cannot be read: done again", err=True)
+    for number in ENDING:
+        if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+            signal.signal(number, _end)
     try:
         with SweepProgress(title) as progress:
             return conduct(jobs, store, watch=progress.done, **how)
@@ -144,6 +162,8 @@ def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Sto
         if isinstance(error, KeyboardInterrupt):
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # we are leaving
             click.echo(f"\ninterrupted: {kept}", err=True)
+            if isinstance(error, _EndedBySignal):
+                context.exit(128 + error.number)
             raise
         complain(f"{error}: {kept}")
         context.exit(INCOMPLETE)

@@ -19,7 +19,8 @@ class Interruption:
 
     Attributes
     ----------
-    caught : number of the first signal that came; None: none
+    caught
+        number of the first signal that came; None: none
     """
 
     def __init__(self) -> None:
@@ -43,8 +44,10 @@ class Interruption:
 
         Raises
         ------
-        KeyboardInterrupt : by Ctrl-C
-        SystemExit : by another signal
+        KeyboardInterrupt
+            by Ctrl-C
+        SystemExit
+            by another signal
         """
         if self.caught == signal.SIGINT:
             raise KeyboardInterrupt

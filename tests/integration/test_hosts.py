@@ -162,7 +162,7 @@ def test_three_hosts(lan: Lan) -> None:
 
 def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: random.Random) -> None:
     """Its cable is pulled, or its interface goes down: everybody waits, then all goes on, and nothing is lost."""
-    prepare(lan, 600)
+    prepare(lan, 400)
     host, cable = rng.choice(NAMES), rng.random() < 0.5
     hosts = lan.start_all()
     lan.network.wait_until_moving("base")

@@ -76,11 +76,11 @@ def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> N
     """It comes before the run. Whatever it missed, it says so; the run itself is as ever."""
     live = network.start("live", "--reliable")
     assert "waiting for one" in live.stderr.readline()
-    result = network.run(network.experiment(run={"processes": 2, "duration": 1000}), domain=domain)
+    result = network.run(network.experiment(run={"processes": 2, "duration": 500}), domain=domain)
     assert result.failures == []
     assert result.trajectory.completeness.complete
     last = ended(live)[0].splitlines()[-1]
-    assert last.startswith("step 20000 of 20000, system error ")
+    assert last.startswith("step 10000 of 10000, system error ")
     assert re.search(r", \d+ steps( since step \d+)?, \d+ missing, ", last)
     measured = float(last.split("system error ")[1].split()[0])
     assert measured == pytest.approx(compare(result.trajectory).system_error.measured, rel=0.5)

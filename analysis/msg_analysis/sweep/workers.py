@@ -37,6 +37,8 @@ QUEUED = 2
 NOTICE = 0.5
 """Seconds between two questions of a worker whether the work is being ended."""
 
+ENDING = (signal.SIGTERM, signal.SIGHUP)
+"""Signals that end a sweep as Ctrl-C does: of a cluster's queue, and of a terminal that goes."""
 _CONNECT = 10.0  # s
 _QUIET = {
     "distributed.worker.profile.enabled": False,
@@ -346,18 +348,20 @@ def _ignoring(*numbers: signal.Signals) -> Iterator[None]:
 
 @contextmanager
 def _deferring_interrupts() -> Iterator[None]:
-    """What is done in here is done as a whole: Ctrl-C counts when it is over."""
+    """What is done in here is done as a whole: signals that end a program count when it is over."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     received: list[int] = []
-    previous = signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    numbers = [signal.SIGINT, *(number for number in ENDING if callable(signal.getsignal(number)))]
+    previous = {number: signal.signal(number, lambda number, _: received.append(number)) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
     if received:
-        raise KeyboardInterrupt
+        signal.raise_signal(received[0])
 
 
 @contextmanager
