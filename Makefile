@@ -36,11 +36,11 @@ $(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
 	$(BIN)/msg-agents run $(EXPERIMENTS)/line_ring.yaml --out $(RUNS)
 
-# Networks wait a good part of their time, for discovery for example: two at once, each in a domain of its own.
-TWO_AT_ONCE := --numprocesses 2 --dist worksteal
+# Networks wait a good part of their time, for discovery for example: three at once, each in a domain of its own.
+SEVERAL_AT_ONCE := --numprocesses 3 --dist worksteal
 
 test: test-fast ## Run all tests
-	$(BIN)/python -m pytest $(TWO_AT_ONCE) -m integration
+	$(BIN)/python -m pytest $(SEVERAL_AT_ONCE) -m integration
 
 test-fast: setup ## Run the tests that start no network
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto -m "not integration"
@@ -48,7 +48,7 @@ test-fast: setup ## Run the tests that start no network
 STRESS ?= 20
 
 stress: setup ## Repeat every random fault 20 times (STRESS=N: N times): half an hour or more
-	STRESS=$(STRESS) $(BIN)/python -m pytest $(TWO_AT_ONCE) --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py realtime.py hosts.py)
+	STRESS=$(STRESS) $(BIN)/python -m pytest $(SEVERAL_AT_ONCE) --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py realtime.py hosts.py)
 
 fuzz: setup ## Damage 20,000 bags and 20,000 experiment files: only clean errors
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py

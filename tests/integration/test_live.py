@@ -54,7 +54,7 @@ def test_a_replay_gives_the_numbers_of_the_comparison(network: Any, domain: int)
     assert listener.stdout.readline() == "ready\n"
     live = network.start("live", "--reliable", "--json", "--timeout", "60")
     # Slow enough for the middleware, which may need some seconds, to bring listener and watcher together.
-    ended(network.start("play", bag, "--rate", "1.5", "--await", "live"))
+    ended(network.start("play", bag, "--rate", "2.5", "--await", "live"))
     stdout, _ = ended(live)
     found, wanted = json.loads(stdout), compare(read_bag(bag)).to_json()
     heard = json.loads(listener.communicate(timeout=60)[0])

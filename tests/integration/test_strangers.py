@@ -361,7 +361,7 @@ def test_second_processes_of_agents(network: Any) -> None:
     other = network.directory / "other.json"
     other.write_text(new_record(network.experiment(run={"duration": 900, "seed": 8})).to_json())
     with free_domain() as domain:
-        file = network.file(run={"duration": 1800, "processes": 3})
+        file = network.file(run={"duration": 1300, "processes": 3})
         run = network.start("run", file, "--out", network.directory / "runs", "--domain", str(domain), "--json")
         network.wait_until_moving()
         environment = node_environment(domain)

@@ -94,7 +94,7 @@ def kronecker_error(experiment: Experiment, leaders: tuple[int, ...], law: str, 
     return error + (held if law == "discrete" and math.isinf(gain) else 0.0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.booleans(), st.sampled_from([math.inf, 0.01, 3.0]))
 def test_system_error_against_kronecker_algebra(seed: int, directed: bool, gain: float) -> None:
     leaders = [(0,), (1, 3), (0, 2, 4)][seed % 3]
@@ -186,7 +186,7 @@ def test_optimal_leaders_of_a_longer_path() -> None:
     assert 0.4 * best < selection.bound <= best
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10**6), st.booleans(), st.sampled_from(["continuous", "emulated", "discrete"]), st.booleans())
 def test_monotone_and_supermodular(seed: int, directed: bool, law: str, finite: bool) -> None:
     """Directed and weighted graphs, uneven noise, every law, any gain."""
