@@ -126,8 +126,8 @@ def prepare(lan: Lan, duration: float) -> None:
     lan.run_file.write_text(done.stdout)
 
 
-def ended(processes: dict[str, subprocess.Popen[str]], code: int) -> dict[str, tuple[str, str]]:
-    texts = {name: process.communicate(timeout=90) for name, process in processes.items()}
+def ended(processes: dict[str, subprocess.Popen[str]], code: int, timeout: float = 90) -> dict[str, tuple[str, str]]:
+    texts = {name: process.communicate(timeout=timeout) for name, process in processes.items()}
     assert {name: process.returncode for name, process in processes.items()} == dict.fromkeys(NAMES, code), texts
     assert not any("Traceback" in text for pair in texts.values() for text in pair), texts
     return texts
@@ -175,14 +175,19 @@ def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: rand
     whole(lan, ended(hosts, 0))
 
 
+@pytest.mark.timeout(300)
 def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
-    """Ctrl-C on one of them: they say who has gone. Exit code 3 everywhere."""
+    """Ctrl-C on one of them: they say who has gone. Exit code 3 everywhere.
+
+    RTPS says once, best effort, that a participant has gone. Who misses that finds out when its lease ends, after a
+    minute; mostly another one of the same host was not missed.
+    """
     prepare(lan, 20000)
     hosts = lan.start_all("--patience", "2")
     lan.network.wait_until_moving("base")
     hosts["left"].send_signal(signal.SIGINT)
-    texts = ended(hosts, 3)
+    texts = ended(hosts, 3, timeout=200)
     assert "ended by SIGINT" in texts["left"][1]
-    assert re.search(r"switcher: exit code 2: error: agent_1, agent_4 left the network", texts["base"][1])
+    assert re.search(r"switcher: exit code 2: error: agent_[14](, agent_4)? left the network", texts["base"][1])
     assert re.search(r"agent_[235]: exit code 2: error: switcher left the network", texts["right"][1])
     assert read_bag(json.loads(texts["base"][0])["bag"]).completeness.missing > 0
