@@ -26,8 +26,8 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
-    """Of all processes of the test, on this machine only."""
+def domain(network: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """Of all processes of the test, on this machine only; after ``network``, which clears the environment of ROS."""
     with free_domain() as number:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
