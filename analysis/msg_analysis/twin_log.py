@@ -6,7 +6,6 @@ import numpy as np
 
 from msg_analysis.model.agent import agent_law
 from msg_analysis.model.payload import from_payload, to_payload
-from msg_analysis.model.step import build_step_model
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.types import FloatArray
 
@@ -36,7 +35,7 @@ def replay(trajectory: Trajectory) -> FloatArray:
     if used is None or modes is None:
         raise ValueError("a run in lockstep: its twin is `simulate`")
     record, states = trajectory.record, trajectory.states
-    model = build_step_model(record.experiment)
+    model = record.step_model
     there = np.asarray(~np.isnan(states).any(axis=2))
     law_gives = np.full_like(states, np.nan)
     law_gives[0] = record.start

@@ -9,7 +9,6 @@ import numpy as np
 
 from msg_analysis.inference.reception import neighbour_tables
 from msg_analysis.model.path import mode_path
-from msg_analysis.model.step import build_model, build_step_model
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.twin import simulate
 from msg_analysis.twin_log import replay
@@ -67,7 +66,7 @@ def check(trajectory: Trajectory) -> Check:
 def _check_realtime(trajectory: Trajectory) -> Check:
     experiment = trajectory.record.experiment
     law = replay(trajectory)
-    path = mode_path(experiment, build_step_model(experiment).initial)
+    path = mode_path(experiment, trajectory.record.step_model.initial)
     found = [
         _first_state(trajectory, trajectory.states, law, "logged"),
         _first_early_use(trajectory),
@@ -99,7 +98,7 @@ def _first_early_use(trajectory: Trajectory) -> tuple[float, str] | None:
     assert used is not None
     assert made is not None
     assert modes is not None
-    model = build_step_model(trajectory.record.experiment)
+    model = trajectory.record.step_model
     # Where a state is missing, and with it its graph, these are those of some graph: nothing was used there.
     sender = neighbour_tables(model).senders[modes[1:], np.arange(model.agents)]
     early = (used >= 0) & (made[1:] >= 0)[:, :, None] & (made[used, sender] >= made[1:, :, None])
@@ -146,7 +145,7 @@ def _first_state(
 def _first_loss(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] | None:
     if trajectory.lost is None or twin.lost is None or trajectory.agent_modes is None:
         return None
-    model = build_model(trajectory.record.experiment)
+    model = trajectory.record.model
     # Of states that are there, and came out of the right graph: without it the neighbours are others.
     comparable = trajectory.agent_modes[1:] == twin.modes[:, None]
     logged, law = trajectory.lost, twin.lost

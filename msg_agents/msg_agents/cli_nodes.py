@@ -117,7 +117,6 @@ def agent(
 ) -> None:
     """Run one or more agents of the run in RUN_RECORD in one process."""
     from msg_analysis.errors import InputError
-    from msg_analysis.model.step import build_model
 
     record = load_record(run_record)
     record.experiment.require_available()
@@ -134,7 +133,7 @@ def agent(
         from msg_agents.succession import enter, succeed
 
         indices = [number - 1 for number in agents]
-        model, directory = build_model(record.experiment), _make(checkpoint)
+        model, directory = record.model, _make(checkpoint)
         successions = succeed(directory, map(agent_name, indices))
         group = AgentGroup(record=record, model=model, agents=indices, readers=readers, checkpoints=directory)
         enter(successions, group.nodes[0])
@@ -159,8 +158,6 @@ def switcher(
     **options: Any,
 ) -> None:
     """Run the switcher of the run in RUN_RECORD: it publishes the experiment and the active graph."""
-    from msg_analysis.model.step import build_model
-
     record = load_record(run_record)
 
     def report(steps: Any) -> None:
@@ -172,7 +169,7 @@ def switcher(
         from msg_agents.succession import enter, succeed
         from msg_agents.switcher import SWITCHERS
 
-        model, directory = build_model(record.experiment), _make(checkpoint)
+        model, directory = record.model, _make(checkpoint)
         successions = succeed(directory, ["switcher"])
         kind = SWITCHERS[record.experiment.run.pace]
         node = kind(

@@ -127,7 +127,10 @@ def test_mean_square_error_is_the_predicted_one(case: str) -> None:
 
 
 def test_stationary_start_has_the_covariance_of_its_graph() -> None:
-    """Chi-square on the half-vectorised covariance of 20,000 replicas, p > 1e-4: the false-alarm rate."""
+    """Chi-square on the half-vectorised covariance of 20,000 replicas, p > 1e-4: the false-alarm rate.
+
+    So many replicas have no past: their start is normal. tests/analysis/theory/test_sequential.py has those with one.
+    """
     setup = experiment("tracking", replicas=20_000)
     prediction = predict(setup)
     record = new_record(setup)

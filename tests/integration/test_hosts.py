@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 import yaml
+from processors import another_processor
 
 from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
@@ -56,22 +57,22 @@ class Lan:
     hosts_file: Path
     run_file: Path
 
-    def start(self, host: str, *arguments: str | Path) -> subprocess.Popen[str]:
+    def start(self, host: str, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
         """Start ``msg-agents`` on a host."""
         return subprocess.Popen(
             ["ip", "netns", "exec", self.prefix + host, str(PROGRAM), *(str(argument) for argument in arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=os.environ | {"NO_COLOR": "1"},
+            env=os.environ | {"NO_COLOR": "1"} | environment,
         )
 
-    def start_all(self, *options: str) -> dict[str, subprocess.Popen[str]]:
-        """Every host's share; what they leave is in a directory of each."""
+    def start_all(self, *options: str, **environments: dict[str, str]) -> dict[str, subprocess.Popen[str]]:
+        """Every host's share, with additions to its environment; what they leave is in a directory of each."""
         return {
             name: self.start(
                 name, "host", self.run_file, self.hosts_file, "--name", name, "--json", *options,
-                "--out", self.network.directory / name,
+                "--out", self.network.directory / name, **environments.get(name, {}),
             )
             for name in NAMES
         }  # fmt: skip
@@ -119,9 +120,10 @@ def lan(network: Any) -> Iterator[Lan]:
         clear(prefix)
 
 
-def prepare(lan: Lan, duration: float) -> None:
+def prepare(lan: Lan, duration: float, **changes: Any) -> None:
     """The run record, made once for all hosts."""
-    file = lan.network.file(run={"duration": duration})
+    run = {"duration": duration, **changes.pop("run", {})}
+    file = lan.network.file(**changes, run=run)
     done = subprocess.run([str(PROGRAM), "prepare", file], capture_output=True, text=True, check=True)
     lan.run_file.write_text(done.stdout)
 
@@ -158,6 +160,13 @@ def test_three_hosts(lan: Lan) -> None:
     texts = ended(lan.start_all(), 0)
     whole(lan, texts)
     assert json.loads(texts["base"][0])["verdict"] == "agrees"
+
+
+def test_hosts_of_unlike_processors(lan: Lan) -> None:
+    """In discrete time, where W is an exponential, and with a start that is drawn."""
+    switching = {"transition": [[0.9, 0.1], [0.4, 0.6]]}
+    prepare(lan, 500, time="discrete", switching=switching, run={"dt": 1})
+    whole(lan, ended(lan.start_all(left=another_processor()), 0))
 
 
 def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: random.Random) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from processors import another_processor
 
 from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
@@ -58,6 +59,14 @@ def test_equals_the_twin(network: Any, case: str, processes: Any) -> None:
     assert np.array_equal(again.modes, result.trajectory.modes)
     assert result.trajectory.agent_modes is not None
     assert np.array_equal(result.trajectory.agent_modes[1:], np.repeat(again.modes[:, None], 5, axis=1))
+
+
+def test_a_network_on_another_processor(network: Any) -> None:
+    """What it records is what the twin of this processor gives, from the experiment alone."""
+    file = network.file(**CASES["discrete"])
+    result = network.completed(network.start("run", file, "--out", network.directory, "--json", **another_processor()))
+    states = read_bag(result["bag"]).states
+    assert np.array_equal(simulate(network.experiment(**CASES["discrete"])).states, states)
 
 
 def test_progress_and_rate(network: Any) -> None:

@@ -58,8 +58,11 @@ def test_keys_pause_and_step(network: Any, twin_bag: Path, plain: Any, terminal:
 
 
 def test_the_terminal_is_left_as_it_was(twin_bag: Path, terminal: Any) -> None:
-    """Whatever ends the player."""
-    screens = {number: terminal(PROGRAM, "play", twin_bag) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    """Whatever ends the player; the bag alone never does."""
+    screens = {
+        number: terminal(PROGRAM, "play", "--loop", twin_bag)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
     for number, screen in screens.items():
         screen.wait_for("x 1")
         assert screen.mode() != screen.before

@@ -17,7 +17,7 @@ from msg_analysis.errors import BagError
 from msg_analysis.model.air import LOST
 from msg_analysis.model.memory import amount, available_memory
 from msg_analysis.model.record import RunRecord
-from msg_analysis.model.step import Wiring, build_model
+from msg_analysis.model.step import Wiring
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
 _NEVER = np.zeros(1, dtype=np.bool_)
@@ -162,7 +162,7 @@ class Collected:
         self._width = width
         self._graphs = len(experiment.graph_list)
         self._realtime = experiment.run.pace == "realtime"
-        self._experiment = experiment
+        self._record, self._experiment = record, experiment
         self._lossy = bool(experiment.noise.loss) or self._realtime
         most = self._links.most if self._lossy else 0
         cells = self._shape[0] * self._shape[1]
@@ -223,7 +223,7 @@ class Collected:
     @cached_property
     def _links(self) -> _Links:
         """Made when the first ``heard`` has to be understood: most runs have none."""
-        return _Links(build_model(self._experiment), self._experiment.steps)
+        return _Links(self._record.model, self._experiment.steps)
 
     def _good(self, states: States) -> tuple[States, FloatArray]:
         """Those that can be states of this run, and their values; the others are counted."""

@@ -15,7 +15,6 @@ from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
 from msg_analysis.model.air import LOST
 from msg_analysis.model.payload import to_payload
-from msg_analysis.model.step import build_model
 from msg_analysis.model.steptime import StepClock
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.types import IntArray
@@ -107,7 +106,7 @@ def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[
     lost, values = trajectory.lost, trajectory.used
     if lost is None and values is None:
         return lambda _k, _i: []
-    model = build_model(trajectory.record.experiment)
+    model = trajectory.record.model
     modes, agents = range(model.modes), range(model.agents)
     counts = [[len(model.neighbours(mode, i)) for i in agents] for mode in modes]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msg_analysis.inference.observation import BLOCK_NUMBERS
-from msg_analysis.model.step import Wiring, build_model
+from msg_analysis.model.step import Wiring
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
@@ -57,7 +57,7 @@ class Measurement:
         lost = trajectory.lost
         return cls(
             first=first,
-            step=build_model(experiment),
+            step=trajectory.record.model,
             deviations=deviations[first:],
             modes=trajectory.modes[:steps],
             lost=None if lost is None else lost[:steps],

@@ -38,7 +38,7 @@ def stationary_law(matrix: FloatArray) -> FloatArray:
         rates[:k, :k] += np.outer(rates[:k, k], rates[k, :k])
     law = np.ones(n)
     for k in range(1, n):
-        law[k] = law[:k] @ rates[:k, k]
+        law[k] = (law[:k] * rates[:k, k]).sum()  # not @: the order of a sum in BLAS depends on the processor
     return np.asarray(law / law.sum())
 
 
@@ -85,6 +85,12 @@ class MarkovChain:
     def stationary(self) -> FloatArray:
         """(n,) stationary law pi."""
         return stationary_law(self.matrix)
+
+    @property
+    def reversed(self) -> MarkovChain:
+        """The stationary chain backwards in time: its rates are pi_j Gamma_ji / pi_i, or pi_j P_ji / pi_i."""
+        law = self.stationary
+        return MarkovChain(self.time, self.matrix.T * law / law[:, None])
 
     def transition(self, dt: float) -> FloatArray:
         """(n, n) law of the graph one step later: expm(Gamma dt), or P itself in discrete time.

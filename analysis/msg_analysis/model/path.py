@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from msg_analysis.model.chain import MarkovChain
 from msg_analysis.model.streams import Stream, generator
 from msg_analysis.types import FloatArray, IntArray
 
@@ -49,13 +50,20 @@ def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
     initial
         (n,) law of g(0)
     """
-    steps = experiment.steps
+    random = generator(experiment.run.seed, Stream.SWITCHING)
+    return _sampled(experiment.chain, initial, random, experiment.steps, experiment.step_length)
+
+
+def _sampled(
+    chain: MarkovChain, initial: FloatArray, random: np.random.Generator, steps: int, dt: float
+) -> Iterator[Sojourn]:
+    """The chain at the times 0, dt, ..., (steps - 1) dt."""
     time = 0.0
     first = 0
     sequence = 0
-    for mode, held in experiment.chain.sojourns(initial, generator(experiment.run.seed, Stream.SWITCHING)):
+    for mode, held in chain.sojourns(initial, random):
         time += held
-        end = steps if math.isinf(time) else min(steps, math.ceil(time / experiment.step_length))
+        end = steps if math.isinf(time) else min(steps, math.ceil(time / dt))
         if end > first:
             yield Sojourn(sequence, mode, first, end - 1)
             sequence += 1
@@ -74,7 +82,33 @@ def mode_path(experiment: Experiment, initial: FloatArray) -> IntArray:
     initial
         (n,) law of g(0)
     """
-    modes = np.empty(experiment.steps, dtype=np.int64)
-    for sojourn in sojourns(experiment, initial):
+    return _modes(sojourns(experiment, initial), experiment.steps)
+
+
+def past_modes(experiment: Experiment, first_mode: int, steps: int) -> IntArray:
+    """(steps,) g(-steps), ..., g(-1): the graphs before a run, given that it begins with g(0).
+
+    Drawn backwards from g(0) by the reversed chain, so that the graphs before and after time 0 are one stationary path.
+    A longer past ends with the same graphs as a shorter one.
+
+    Parameters
+    ----------
+    experiment
+        whose chain and seed
+    first_mode
+        index of g(0) from 0
+    steps
+        how far back [steps]
+    """
+    chain = experiment.chain.reversed
+    start = np.eye(chain.modes)[first_mode]
+    random = generator(experiment.run.seed, Stream.PAST)
+    backwards = _modes(_sampled(chain, start, random, steps + 1, experiment.step_length), steps + 1)
+    return backwards[:0:-1]
+
+
+def _modes(path: Iterator[Sojourn], steps: int) -> IntArray:
+    modes = np.empty(steps, dtype=np.int64)
+    for sojourn in path:
         modes[sojourn.first_step : sojourn.last_step + 1] = sojourn.mode
     return modes

@@ -48,7 +48,7 @@ class Reception:
         self._links = np.argwhere(model.listens())  # (links, 2): receiver, sender
         self._padded = [padded_inputs(model, mode) for mode in range(model.modes)]
         self._used = [self._link_numbers(*padded) for padded in self._padded]
-        self._block = -1
+        self._block: int | None = None
 
     def values(self, k: int, mode: int, state: FloatArray) -> list[FloatArray]:
         """The d-th entry: what every agent uses for its d-th input in the step from x(k); see ``padded_inputs``.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from msg_analysis.model.chain import MarkovChain
+from msg_analysis.model.exponential import exponential
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -153,6 +155,25 @@ class StepModel(Wiring):
     reference: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class StepMatrices:
+    """The numbers of a linear step.
+
+    In discrete time and with a protocol they come out of linear algebra, whose last bits may depend on processor and
+    libraries. So a run computes them once, and its record carries them.
+
+    Attributes
+    ----------
+    weights
+        (n, m, m) W_g when nothing is lost: ``StepModel.nominal``
+    noise_gain
+        (n, m, m) B_g
+    """
+
+    weights: FloatArray
+    noise_gain: FloatArray
+
+
 @lru_cache(maxsize=16)
 def _transition(chain: MarkovChain, dt: float) -> FloatArray:
     with threadpool_limits(1):
@@ -161,16 +182,18 @@ def _transition(chain: MarkovChain, dt: float) -> FloatArray:
     return transition
 
 
-def build_model(experiment: Experiment) -> Wiring:
+def build_model(experiment: Experiment, matrices: StepMatrices | None = None) -> Wiring:
     """What a run needs to know of its network: a ``StepModel`` where the law is linear, else its wiring alone.
 
     Parameters
     ----------
     experiment
         with a protocol or without
+    matrices
+        of the run record, if they are known
     """
     if experiment.protocol is None or experiment.protocol.linear:
-        return build_step_model(experiment)
+        return build_step_model(experiment, matrices)
     return Wiring(
         links=_arcs(experiment),
         chain=experiment.chain,
@@ -180,16 +203,15 @@ def build_model(experiment: Experiment) -> Wiring:
     )
 
 
-def build_step_model(experiment: Experiment) -> StepModel:
-    """Compile an experiment to what one of its steps does.
-
-    One thread of linear algebra: the matrix exponential of a discrete-time experiment must come out the same, to the
-    last bit, in every process of a run, whatever number of threads it was given.
+def step_matrices(experiment: Experiment, expm: Callable[[FloatArray], FloatArray] = exponential) -> StepMatrices:
+    """Compute the matrices of an experiment's step.
 
     Parameters
     ----------
     experiment
         whose law is linear
+    expm
+        the exponential of a matrix (m, m)
 
     Raises
     ------
@@ -202,12 +224,39 @@ def build_step_model(experiment: Experiment) -> StepModel:
         weights, gain = experiment.protocol.matrices()
         weights[:, range(agents), range(agents)] -= dt * np.where(grounded, 0.0, experiment.leader_gains)
         weights[:, grounded] = 0.0
-        links = _arcs(experiment) & ~grounded[:, None]
     else:
-        weights, gain = _built_in(experiment), np.sqrt(dt) * experiment.noise_gain
-        links = weights != 0.0
+        weights, gain = _built_in(experiment, expm), built_in_noise_gain(experiment)
     if experiment.time == "continuous":
         gain[:, grounded] = 0.0  # a leader held at the reference has no noise either
+    return StepMatrices(weights, gain)
+
+
+def built_in_noise_gain(experiment: Experiment) -> FloatArray:
+    """(n, m, m) B_g of the built-in law, grounded leaders aside: sqrt(dt) F."""
+    return np.asarray(np.sqrt(experiment.step_length) * experiment.noise_gain)
+
+
+def build_step_model(experiment: Experiment, matrices: StepMatrices | None = None) -> StepModel:
+    """Compile an experiment to what one of its steps does.
+
+    Parameters
+    ----------
+    experiment
+        whose law is linear
+    matrices
+        of the run record; computed if not given
+
+    Raises
+    ------
+    InputError
+        the experiment has a protocol that is not linear, not here, or fails
+    """
+    if matrices is None:
+        matrices = step_matrices(experiment)
+    weights, gain = matrices.weights, matrices.noise_gain
+    agents, dt = experiment.agents, experiment.step_length
+    grounded = np.isinf(experiment.leader_gains)
+    links = _arcs(experiment) & ~grounded[:, None] if experiment.protocol else weights != 0.0
     reference = experiment.reference
     offsets = reference * (1.0 - weights.sum(axis=2)) if reference else np.zeros(weights.shape[:2])
 
@@ -239,24 +288,21 @@ def build_step_model(experiment: Experiment) -> StepModel:
     )
 
 
-def _built_in(experiment: Experiment) -> FloatArray:
+def _built_in(experiment: Experiment, expm: Callable[[FloatArray], FloatArray]) -> FloatArray:
     """(n, m, m): W_g of the law that the agents have by themselves, with its leaders."""
     gains, agents = experiment.leader_gains, experiment.agents
     grounded = np.isinf(gains)
     follows = ~grounded
     weights = np.zeros((len(experiment.graph_list), agents, agents))
-    with threadpool_limits(1):
-        for mode, graph in enumerate(experiment.graph_list):
-            z = graph.laplacian + np.diag(np.where(grounded, 0.0, gains))
-            if experiment.time == "continuous":
-                weights[mode] = np.eye(agents) - experiment.step_length * z
-                weights[mode, grounded] = 0.0
-            else:
-                # The limit of exp(-(L + K)) for gains to infinity: leaders forget, followers no longer hear them.
-                import scipy.linalg  # here, since every agent's process would wait for it
-
-                block = np.ix_(follows, follows)
-                weights[mode][block] = scipy.linalg.expm(-z[block])
+    for mode, graph in enumerate(experiment.graph_list):
+        z = graph.laplacian + np.diag(np.where(grounded, 0.0, gains))
+        if experiment.time == "continuous":
+            weights[mode] = np.eye(agents) - experiment.step_length * z
+            weights[mode, grounded] = 0.0
+        else:
+            # The limit of exp(-(L + K)) for gains to infinity: leaders forget, followers no longer hear them.
+            block = np.ix_(follows, follows)
+            weights[mode][block] = expm(-z[block])
     return weights
 
 

@@ -27,6 +27,7 @@ class Stream(IntEnum):
     LINK = 5
     LOSS = 6
     PHASE = 7
+    PAST = 8
 
 
 def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.random.Generator:
@@ -41,10 +42,11 @@ def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.r
     agent
         index of the agent from 0 (0 where the stream belongs to nobody), or number of the link
     block
-        number of the block of steps, step // STEPS_PER_BLOCK
+        number of the block of steps, step // STEPS_PER_BLOCK; negative for the steps before the start
     """
     key = np.random.SeedSequence(seed).generate_state(2, np.uint64)
-    return np.random.Generator(np.random.Philox(key=key, counter=[0, block, agent, int(stream)]))
+    counter = np.array([0, block % 2**64, agent, int(stream)], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=key, counter=counter))
 
 
 def link_number(receiver: int, sender: int) -> int:
