@@ -1,19 +1,8 @@
-"""A cheaper preconditioner for symmetric graphs that do not switch slowly: every graph replaced by their average.
+"""The "averaged" preconditioner of the coupled equations: every graph is replaced by the average of all graphs.
 
-In the eigenvectors of the average the coupled equations of equal graphs fall apart into one small system for each
-entry, of the n graphs, which the eigenvectors of the chain (made reversible) solve: all that is left of the
-preconditioner M is a division. Applied from both sides it turns the equations into I + S, where S is what distinguishes
-the graphs from their average: one product of matrices per graph, in single precision. In discrete time the equations
-are first multiplied by the inverse of the transition matrix: T^-1 X - K[X] = T^-1 B has the form of continuous time,
-and with a reversible chain it is self-adjoint. With d_i = D_i - L, L the eigenvalues of the average, S stands for
-
-    continuous: d_i X + X d_i
-    discrete:   G + G^T,  G = d_i X (I - L - d_i / 2)
-
-It takes more iterations than the two-level preconditioner, at a fifth of the work each or less, and no eigenvectors of
-single graphs.
-
-docs/accuracy.md says when it is used.
+For symmetric graphs that do not switch slowly. It needs more iterations than the two-level preconditioner of
+``equations``, but each costs a quarter as much or less, and it needs no eigenvectors of single graphs.
+docs/accuracy.md, "How the equations are solved", says when it is used.
 """
 
 from __future__ import annotations
@@ -29,24 +18,13 @@ from msg_analysis.types import FloatArray
 if TYPE_CHECKING:
     from msg_analysis.theory.equations import CoupledEquations
 
-SLOWEST = 0.1
-"""Leaving of a graph for which this pays, relative to the mean decay."""
-
-LARGEST_INVERSE = 100.0
-"""Of the transition matrix: what single precision can bear."""
-
-NEGLIGIBLE = 3.0
-"""Accuracy asked of S, in units of what d_i X d_i usually contributes, from which that is left out."""
+SLOWEST = 0.1  # least rate of leaving a graph, relative to the mean decay, from which this pays
+LARGEST_INVERSE = 100.0  # largest norm of the inverse of the transition matrix that single precision allows
+NEGLIGIBLE = 3.0  # d_i X d_i is left out where the error allowed is this many times its usual contribution
 
 
 def suitable(equations: CoupledEquations) -> bool:
-    """Whether M is positive, single precision will do, and the graphs do not switch too slowly for this to pay.
-
-    Parameters
-    ----------
-    equations
-        in continuous time or not
-    """
+    """Whether M is positive, single precision suffices, and every graph is left fast enough for this to pay."""
     whole = equations.whole
     if not (equations.symmetric and whole.mild and equations.leaving.min() >= SLOWEST * equations.decay.mean()):
         return False
@@ -60,23 +38,24 @@ def suitable(equations: CoupledEquations) -> bool:
 
 
 class AveragedEquations:
-    """I + S. Its unknowns are U = M^1/2 X, its right-hand sides M^-1/2 B, in the eigenvectors of average and chain.
+    """The preconditioned equations I + S. Unknowns: U = M^1/2 X; right-hand sides: M^-1/2 B. All in single precision.
 
-    Parameters
-    ----------
-    equations
-        ``suitable`` ones
+    For equal graphs, the eigenvectors of the average and of the chain (its reversible part) make the equations
+    diagonal: this diagonal is the preconditioner M. S is what distinguishes the graphs from their average: in the
+    eigenvectors of the average, L its eigenvalues and d_i = D_i - L, the map X -> G + G^T with
 
-    Attributes
-    ----------
-    definite
-        whether it is known to be symmetric and positive definite
+        continuous: G = d_i X
+        discrete:   G = d_i X (I - L - d_i / 2)
+
+    In discrete time the equations are first multiplied by the inverse of the transition matrix T: T^-1 X - K[X] =
+    T^-1 B has the form of continuous time, and is self-adjoint if the chain is reversible. What of the chain is not
+    reversible is a part of S, too.
     """
 
     def __init__(self, equations: CoupledEquations) -> None:
         whole = equations.whole
         assert whole.eigenvectors is not None
-        self.definite = equations.reversible
+        self.definite = equations.reversible  # I + S is symmetric then, and positive definite if moments stay bounded
         self._discrete = whole.time == "discrete"
         values, vectors = whole.eigenvectors.values[0], whole.eigenvectors.vectors[0]
         n, d = len(equations.weights), len(values)
@@ -112,15 +91,7 @@ class AveragedEquations:
             self._lower[:, diagonal, diagonal] += self._kept
 
     def enter(self, matrices: FloatArray, scale: FloatArray) -> FloatArray:
-        """M^-1/2 B / scale, from (q, n, d, d) right-hand sides of the equations and (q,) scales.
-
-        Parameters
-        ----------
-        matrices
-            (q, n, d, d) B
-        scale
-            (q,) by which they are divided
-        """
+        """M^-1/2 B / scale, (q, n, d, d), from right-hand sides B (q, n, d, d) of the equations and scales (q,)."""
         given = matrices[:, :1] if (matrices == matrices[:, :1]).all() else matrices
         factors = self._enter if given is matrices else self._enter.sum(axis=1, keepdims=True)
         inside = self._workspace(matrices.shape)[0][:, : given.shape[1]]
@@ -132,55 +103,21 @@ class AveragedEquations:
         return right
 
     def solution(self, scaled: FloatArray) -> FloatArray:
-        """X = M^-1/2 U, in the eigenvectors of the average; the next call of any method overwrites it.
-
-        Parameters
-        ----------
-        scaled
-            (q, n, d, d) U
-
-        Returns
-        -------
-        FloatArray
-            (q, n, d, d)
-        """
+        """X = M^-1/2 U, (q, n, d, d), in the eigenvectors of the average; the next call of any method overwrites it."""
         x = self._workspace(scaled.shape)[0]
         for part in self._strips:
             np.matmul(self._back, self._scale[:, part] * flat(scaled)[..., part], out=flat(x)[..., part])
         return x
 
     def leave(self, scaled: FloatArray, scale: FloatArray, total: FloatArray) -> None:
-        """Add X times the scale to solutions of the equations.
-
-        Parameters
-        ----------
-        scaled
-            (q, n, d, d) U
-        scale
-            (q,) by which X is multiplied
-        total
-            (q, n, d, d), is changed
-        """
+        """Add scale * X, symmetrised and in the coordinates of the equations, to ``total`` (q, n, d, d), in place."""
         solution = self.solution(scaled)
         for place in np.ndindex(solution.shape[:2]):
             moved = self._vectors @ solution[place] @ self._vectors.T
             total[place] += 0.5 * scale[place[0]] * (moved + moved.T).astype(float)
 
     def apply(self, x: FloatArray, accuracy: float = 0.0) -> FloatArray:
-        """(I + S) X, about as accurate as asked for, relative to X; the next call of any method overwrites it.
-
-        Parameters
-        ----------
-        x
-            (q, n, d, d)
-        accuracy
-            relative error that is let through
-
-        Returns
-        -------
-        FloatArray
-            (q, n, d, d)
-        """
+        """(I + S) X, (q, n, d, d), to about the relative error ``accuracy``; the next call overwrites it."""
         z, half = self.solution(x), self._workspace(x.shape)[1]
         np.matmul(self._distance, z, out=half)
         if self._discrete:
@@ -195,24 +132,13 @@ class AveragedEquations:
         return half
 
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(R, (I + S) R): nothing is left to precondition.
-
-        Parameters
-        ----------
-        right
-            (q, n, d, d) R
-
-        Returns
-        -------
-        tuple[FloatArray, FloatArray]
-            two of the same shape
-        """
+        """(R, (I + S) R): the equations are preconditioned already."""
         return right, self.apply(right)
 
     def _second(self, half: FloatArray, out: FloatArray, accuracy: float) -> FloatArray:
-        """G from d_i X, but for an antisymmetric part. Discrete time.
+        """G from ``half`` = d_i X, up to an antisymmetric part. Discrete time.
 
-        d_i X d_i is symmetric: its lower left block stands for the upper right one, too.
+        d_i X d_i is symmetric, so its upper right block is not computed: the lower left one counts twice.
         """
         if accuracy > NEGLIGIBLE * self._usual:
             return np.multiply(half, self._kept, out=out)
@@ -223,11 +149,11 @@ class AveragedEquations:
         return out
 
     def _inside(self, matrix: FloatArray) -> FloatArray:
-        """In the eigenvectors of the average."""
+        """The matrix in the eigenvectors of the average."""
         return np.asarray(self._vectors.T @ single(matrix) @ self._vectors)
 
     def _workspace(self, shape: tuple[int, ...]) -> list[FloatArray]:
-        """Two stacks, kept: fresh memory costs as much as a product."""
+        """Two stacks that are kept between calls: fresh memory costs as much as a product."""
         if not self._buffers or self._buffers[0].shape != shape:
             self._buffers = [np.empty(shape, np.float32) for _ in range(2)]
         return self._buffers
@@ -239,7 +165,7 @@ def _transition(equations: CoupledEquations) -> FloatArray:
 
 
 def _flow(equations: CoupledEquations) -> tuple[FloatArray, FloatArray]:
-    """(n, n) -T (continuous time) or T^-1 - I, symmetrised by the weights: its symmetric part, and the rest."""
+    """(n, n) symmetric part and antisymmetric part of -T (continuous time) or T^-1 - I, symmetrised by the weights."""
     flow = np.diag(equations.leaving) - equations.rates
     if equations.system.time == "discrete":
         flow = np.linalg.inv(_transition(equations)) - np.eye(len(flow))

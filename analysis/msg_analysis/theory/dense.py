@@ -1,8 +1,7 @@
 """The coupled equations as one dense matrix on the half-vectorised unknowns: the reference for small systems.
 
-One LU factorisation serves the steady moments and every dual. The cost is that of (n d (d + 1) / 2)^3 operations.
-
-The equations are those of Propositions 3 to 5 of the paper; docs/accuracy.md says when they are solved so.
+One LU factorisation serves the steady moments and every dual; the cost grows as (n d (d + 1) / 2)^3.
+The equations are those of Propositions 2 and 3 of the paper (7 and 8 in discrete time).
 """
 
 from __future__ import annotations
@@ -20,28 +19,14 @@ from msg_analysis.theory.report import MAX_RELATIVE_ERROR, SolverReport, singula
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
 
-MAX_UNKNOWNS = 10_000
-"""Largest dense system that is tried: 2.4 GB and about a minute."""
+MAX_UNKNOWNS = 10_000  # largest system that is tried: 2.4 GB and about a minute
 
 
 class DenseSolver:
-    """The coupled equations of one system, factorised.
+    """The coupled equations of ``MomentSolver``, factorised. InputError: too large, singular or too ill-conditioned.
 
-        continuous: Z_i C_i + C_i Z_i^T - sum_j Gamma_ji C_j = pi_i Q_i
-        discrete:   C_i - sum_j P_ji K_j[C_j] = sum_j P_ji pi_j N_j
-
-    The last block row is replaced by the sum of all of them, in which the chain cancels exactly, and rows are
-    scaled to largest entry 1: so the equations stay well conditioned however fast the graphs switch.
-
-    Parameters
-    ----------
-    system
-        what to solve for
-
-    Raises
-    ------
-    InputError
-        too large for a dense solve, no steady second moments, or too ill-conditioned to be trusted
+    The last block row is replaced by the sum of all of them, in which the chain cancels exactly, and rows are scaled
+    to largest entry 1: so the equations stay well conditioned however fast the graphs switch.
     """
 
     def __init__(self, system: JumpSystem) -> None:
@@ -86,13 +71,7 @@ class DenseSolver:
         return symmetric.unpack(solution.reshape(self._shape), system.dimension)
 
     def dual(self, forms: FloatArray) -> FloatArray:
-        """See ``MomentSolver.dual``.
-
-        Parameters
-        ----------
-        forms
-            (q, d, d) symmetric H
-        """
+        """See ``MomentSolver.dual``."""
         n, p = self._shape
         right = np.tile(symmetric.pack(forms), (1, n)).T
         solution, _ = self._solve(right, trans=1)
@@ -114,8 +93,8 @@ class DenseSolver:
         return np.asarray(solution), SolverReport("dense", "none", 1, relative, backward, backward / self._condition)
 
     def _check(self, backward: float) -> None:
-        """Refuse what is too ill-conditioned for a backward error."""
-        # Not ">": a number that is not finite must not pass.
+        """Refuse equations that are too ill-conditioned for this backward error."""
+        # Not ">": NaN must be refused, too.
         if self._matrix.size and not backward <= MAX_RELATIVE_ERROR * self._condition:
             raise InputError(singular_message(f" (reciprocal condition {self._condition:.1e})"))
 

@@ -1,18 +1,6 @@
-"""The coupled equations of second moments, matrix-free: the operator, and a two-level preconditioner for it.
+"""The coupled equations of second moments, matrix-free: the operator, and the "two-level" preconditioner for it.
 
-Per unit of probability, X_i = C_i / pi_i, steady moments and adjoints obey the same equations, for the chain run
-backwards and forwards:
-
-    continuous: A X_i = D_i X_i + X_i D_i^T - sum_j T_ij X_j,       D = Z,      T a generator
-    discrete:   A X_i = X_i - sum_j T_ij K_j[X_j],                  D = I - W,  T a transition matrix
-
-Both are local[X]_i - sum_j T_ij (Y_j - Y_i) over j != i, with Y_j = X_j or K_j[X_j] and local[X] = D X + X D^T or
-X - K[X]. Differences are what is evaluated: fast switching makes them small, and they lose nothing.
-
-The preconditioner first solves every graph alone, left at its rate, and then one averaged equation for what is common
-to all graphs, on the residual that is left (two-level, "A-DEF2" of Tang, Nabben, Vuik, Erlangga 2009). Alone, the
-first fails for fast switching and the second for slow. Groups of graphs that switch among themselves much faster than
-they are left get averaged equations of their own, smaller groups first.
+docs/accuracy.md, "How the equations are solved", says when which preconditioner is used.
 """
 
 from __future__ import annotations
@@ -33,85 +21,52 @@ from msg_analysis.theory.report import MAX_RELATIVE_ERROR, singular_message
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import BoolArray, FloatArray
 
+# Amplification of relative errors of the averaged matrix from which rounding alone makes its inverse worthless.
 MAX_AMPLIFICATION = MAX_RELATIVE_ERROR / float(np.finfo(float).eps)
-"""Of relative errors of the averaged matrix: beyond, rounding alone makes its inverse worthless."""
-
-FAST = 10.0
-"""Leaving relative to the mean decay from which differences are taken before they are multiplied by rates."""
-
-SINGLE_FROM = 80
-"""Smallest dimension at which single precision is faster."""
-
-SEPARATION = 10.0
-"""A group is left at most at this fraction of the rate that holds it together."""
+FAST = 10.0  # above this rate of leaving, relative to the mean decay, differences are taken before rates multiply them
+SINGLE_FROM = 80  # smallest dimension at which single precision is faster
+SEPARATION = 10.0  # least ratio of the rate that holds a group together to the rate at which it is left
 
 
 class Level(NamedTuple):
-    """Groups of graphs that are averaged, disjoint.
+    """Disjoint groups of graphs that are averaged."""
 
-    Attributes
-    ----------
-    average
-        (g, n) law of the graph in each group
-    members
-        (g, n) 1.0 where a graph belongs to the group
-    solves
-        of the averaged equations
-    """
-
-    average: FloatArray
-    members: FloatArray
-    solves: LocalSolves
+    average: FloatArray  # (g, n) law of the graph, given the group
+    members: FloatArray  # (g, n) 1.0 where a graph belongs to the group
+    solves: LocalSolves  # of the averaged equations, one for each group
 
 
 class CoupledEquations:
-    """A X = B of one system, or of its adjoint.
+    """A X = B for the steady moments of one system, or its adjoint; stacks (q, n, d, d) hold q right-hand sides.
 
-    Stacks of matrices are (q, n, d, d): q right-hand sides at once.
+    Per unit of probability, X_i = C_i / pi_i, steady moments and adjoints obey the same equations, for the chain run
+    backwards and forwards (Propositions 2 and 3 of the paper; 7 and 8 in discrete time):
 
-    Parameters
-    ----------
-    forward
-        equations that these are the adjoint of; None: these are not
+        continuous: A X_i = D_i X_i + X_i D_i^T - sum_j T_ij X_j,       D = Z,      T a generator
+        discrete:   A X_i = X_i - sum_j T_ij K_j[X_j],                  D = I - W,  T a transition matrix
 
-    Attributes
-    ----------
-    system
-        what they belong to
-    weights
-        (n,) pi, with respect to which A is self-adjoint if ``definite``
-    definite
-        whether A is known to be self-adjoint and positive definite
-    direct
-        whether the preconditioner is A^-1: one graph, no lost messages
-    drift
-        (n, d, d) D
-    symmetric
-        whether every D is, to the last bit
-    rates
-        (n, n) T off the diagonal
-    leaving
-        (n,) its sums
-    reversible
-        whether the chain is
-    whole
-        solves of the average of all graphs
+    Both are local[X]_i - sum_j T_ij (Y_j - Y_i) over j != i, with Y_j = X_j or K_j[X_j] and local[X] = D X + X D^T or
+    X - K[X]. With fast switching it is these differences that are evaluated: they are small and lose no digits.
 
-    Raises
-    ------
-    InputError
-        a graph's own equations are singular
+    The preconditioner first solves every graph alone, left at its rate, and then, on the residual of that, one averaged
+    equation for what is common to all graphs (two-level, "A-DEF2" of Tang, Nabben, Vuik, Erlangga 2009). The first
+    alone fails for fast switching, the second alone for slow. Groups of graphs that switch among themselves much
+    faster than they are left get averaged equations of their own, smaller groups first.
+
+    ``forward``: the equations of C_i / pi_i, to get their adjoint; None to get these themselves. InputError: D,
+    averaged over all graphs, is singular up to rounding.
     """
 
     def __init__(self, system: JumpSystem, forward: CoupledEquations | None = None) -> None:
-        """The equations of C_i / pi_i; of the adjoint, if those of C_i / pi_i are given."""
-        self.system, self.weights, self._forward = system, system.stationary, forward
+        self.system, self.weights, self._forward = system, system.stationary, forward  # weights: (n,) pi
         flow = system.stationary[:, None] * system.chain  # of probability, between graphs
+        # drift: (n, d, d) D; rates: (n, n) T off the diagonal, 0 on it; leaving: (n,) its row sums
         if forward is None:
             self.drift, self.rates = _drift(system), _off_diagonal(flow.T / system.stationary[:, None])
         else:
             self.drift, self.rates = forward.drift.transpose(0, 2, 1), _off_diagonal(system.chain)
         self.leaving = self.rates.sum(axis=1)
+        # Whether the preconditioner is A^-1.
         self.direct = system.modes == 1 and system.loss_variance is None
         self.symmetric = np.array_equal(self.drift, self.drift.transpose(0, 2, 1))
         self._levels = self._averages() if system.modes > 1 else []
@@ -120,12 +75,13 @@ class CoupledEquations:
             raise InputError(singular_message())
         flow = flow - np.diag(np.diag(flow))
         self.reversible = bool((np.abs(flow - flow.T) <= 1e-13 * (flow + flow.T)).all())
+        # In the inner product with the weights; ``inner.definite`` checks that every graph is symmetric, too.
         self.definite = (
             system.time == "continuous" and self.reversible and len(self._levels) == 1 and self.whole.definite
         )
 
     def adjoint(self) -> CoupledEquations:
-        """The equations of Y_i (continuous time), or of sum_j P_ij Y_j (discrete time)."""
+        """The equations of Y_i (continuous time), or of sum_j P_ij Y_j (discrete time); see ``MomentSolver.dual``."""
         return CoupledEquations(self.system, self)
 
     @cached_property
@@ -137,7 +93,7 @@ class CoupledEquations:
 
     @cached_property
     def inner(self) -> CoupledEquations:
-        """The same, in single precision where that does: to iterate with, between residuals in double precision."""
+        """These equations to iterate with, in single precision if that suffices (residuals are taken in double)."""
         mild = self.modes.mild and all(level.solves.mild for level in self._levels)
         other = copy.copy(self)
         other.definite = self.definite and self.modes.definite
@@ -152,7 +108,7 @@ class CoupledEquations:
 
     @cached_property
     def averaged(self) -> AveragedEquations | None:
-        """The cheaper preconditioner, where it promises to be better."""
+        """The averaged preconditioner, or None where the two-level one is likely to be better."""
         if len(self._levels) != 1 or self.system.loss_variance is not None or self.system.dimension < SINGLE_FROM:
             return None
         return AveragedEquations(self) if suitable(self) else None
@@ -163,13 +119,7 @@ class CoupledEquations:
         return np.asarray(np.abs(np.diagonal(self.whole.drift[0])))
 
     def apply(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(A X, size): as accurately as rounding lets it be, and (q, n) norms of what was added up.
-
-        Parameters
-        ----------
-        x
-            (q, n, d, d) X
-        """
+        """(A X, (q, n) sums of the norms of the terms), as accurate as rounding allows."""
         total, moved = self._local(x)
         if self.leaving.max() <= FAST * self.decay.mean():
             _subtract_combined(total, self.rates - np.diag(self.leaving), moved)
@@ -182,13 +132,7 @@ class CoupledEquations:
         return total, size * given + given @ self.rates.T
 
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(Z, A Z) for Z near A^-1 R.
-
-        Parameters
-        ----------
-        right
-            (q, n, d, d) R
-        """
+        """(Z, A Z) for Z near A^-1 R."""
         z, moved = self.modes(right)
         rest = self._mixed(moved)  # R - A Z
         if self.system.loss_variance is not None:
@@ -196,13 +140,7 @@ class CoupledEquations:
         return self._averaged(z, rest, right)
 
     def average(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(Z, A Z) for the Z common to all graphs that leaves a residual of mean zero.
-
-        Parameters
-        ----------
-        right
-            (q, n, d, d) R
-        """
+        """(Z, A Z) for the Z common to all graphs that leaves a residual of mean zero."""
         return self._averaged(np.zeros_like(right), right.copy(), right)
 
     def _averaged(self, z: FloatArray, rest: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -217,7 +155,7 @@ class CoupledEquations:
         return z, right - rest
 
     def _averages(self) -> list[Level]:
-        """Small groups first; the last level is that of all graphs."""
+        """Small groups first; the last level is the average of all graphs."""
         levels = []
         for groups in [*_groups(self.rates, self.weights), [np.ones(len(self.weights), dtype=bool)]]:
             members = np.array(groups, dtype=float)
@@ -248,33 +186,11 @@ class CoupledEquations:
         return local, np.subtract(x, local, out=half)
 
     def moved(self, x: FloatArray) -> FloatArray:
-        """K[X], or its adjoint. Discrete time.
-
-        Parameters
-        ----------
-        x
-            (q, n, d, d) X
-
-        Returns
-        -------
-        FloatArray
-            (q, n, d, d)
-        """
+        """(q, n, d, d) K[X], or its adjoint. Discrete time."""
         return self._local(x)[1]
 
     def after_jump(self, y: FloatArray) -> FloatArray:
-        """sum_j T_ij Y_j. Discrete time.
-
-        Parameters
-        ----------
-        y
-            (q, n, d, d) Y
-
-        Returns
-        -------
-        FloatArray
-            (q, n, d, d)
-        """
+        """(q, n, d, d) sum_j T_ij Y_j. Discrete time."""
         if (y == y[:, :1]).all():
             return y
         return np.asarray(self._mixed(y) + (1.0 - self.leaving)[:, None, None] * y)
@@ -284,7 +200,7 @@ class CoupledEquations:
         return _combined(self.rates, y)
 
     def _lost(self, x: FloatArray) -> FloatArray:
-        """What lost messages add to K[X]."""
+        """What lost messages add to K[X], or to its adjoint."""
         variance = self.system.loss_variance
         assert variance is not None
         if self._forward is None:
@@ -299,7 +215,7 @@ def _combined(factors: FloatArray, stack: FloatArray) -> FloatArray:
 
 
 def _plus_transposes(stack: FloatArray) -> FloatArray:
-    """X + X^T of every matrix; large ones in place and one after the other, to stay in the caches."""
+    """X + X^T of every matrix; large ones in place, one after the other, to stay in the caches."""
     if stack[0, 0].size <= STRIP:
         return stack + stack.swapaxes(-1, -2)
     for place in np.ndindex(stack.shape[:2]):
@@ -308,7 +224,7 @@ def _plus_transposes(stack: FloatArray) -> FloatArray:
 
 
 def _subtract_combined(total: FloatArray, factors: FloatArray, stack: FloatArray) -> None:
-    """Subtract sum_j factors[i, j] stack[:, j]; piece by piece, since fresh memory costs as much as a product."""
+    """Subtract sum_j factors[i, j] stack[:, j], in place and in strips: fresh memory costs as much as a product."""
     total, stack = flat(total), flat(stack)
     for part in strips(total.shape[-1]):
         total[..., part] -= factors @ stack[..., part]
@@ -321,7 +237,7 @@ def _off_diagonal(chain: FloatArray) -> FloatArray:
 
 
 def _drift(system: JumpSystem) -> FloatArray:
-    """(n, d, d): Z or I - W; symmetric to the last bit if it is but for rounding."""
+    """(n, d, d) Z or I - W, made symmetric to the last bit if only rounding keeps it from being so."""
     matrices = system.matrices
     d = system.dimension
     drift = matrices.copy() if system.time == "continuous" else np.eye(d) - matrices
@@ -334,7 +250,7 @@ def _drift(system: JumpSystem) -> FloatArray:
 
 
 def _groups(rates: FloatArray, stationary: FloatArray) -> list[list[BoolArray]]:
-    """Disjoint groups at every level: strongly connected by rates far above that at which they are left."""
+    """Disjoint groups at every level, each strongly connected by rates far above the rate at which it is left."""
     positive = rates[rates > 0.0]
     levels: list[list[BoolArray]] = []
     if len(rates) < 3 or positive.max() < SEPARATION * positive.min():

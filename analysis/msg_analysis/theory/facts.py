@@ -1,12 +1,7 @@
-"""The paper's lemmas on eigenvalues, as checks of one network: how many at 0 (or 1), where the others, null vectors.
+"""The paper's lemmas on eigenvalues, checked for one network: how many are at 0 (or 1), and where the others are.
 
-The matrices are those of the paper in full Kronecker form, unreduced and n m^2 on a side, because the lemmas
-speak of these. Nothing else uses them. The nullities of the projected matrices are the corrected ones:
-
-    Nbar_c    n                     vectors e_i (x) 1, not pi (x) 1 alone
-    Mbar_c    n + 2 sum (z_i - 1)   vectors e_i (x) 1 (x) 1; and e_i (x) 1 (x) w, e_i (x) w (x) 1 with L_i w = 0
-
-where z_i is the number of zero eigenvalues of L_i: 1 if graph i is connected, so that n remains.
+The matrices are those of the paper in full Kronecker form, unreduced, n m^2 rows, because the lemmas are about these.
+They are used for nothing else.
 """
 
 from __future__ import annotations
@@ -24,11 +19,10 @@ from msg_analysis.types import FloatArray
 if TYPE_CHECKING:
     from msg_analysis.model.experiment import Experiment
 
-MAX_UNKNOWNS = 1500
-"""Largest n m^2: all eigenvalues of a matrix of this size take a few seconds."""
+MAX_UNKNOWNS = 1500  # largest n m^2: all eigenvalues of a matrix of this size take a few seconds
 
+# In units of rows times largest entry: what is smaller is 0, what is larger is not, between them it is unknown.
 _BLURRED = 1e-13, 1e-10
-"""Relative to the largest entry: what is smaller is 0, what is larger is not, and between them nobody can tell."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,20 +32,20 @@ class Fact:
     Attributes
     ----------
     name
-        the matrix
+        the matrix, as in the paper
     statement
-        what the lemma says, corrected where the paper errs
+        what the lemma says, corrected where the paper is wrong (docs/errata.md)
     holds
-        whether it is so here
+        whether it is true of this network
     target
         the special eigenvalue: 0 in continuous time, 1 in discrete time
     expected, multiplicity, nullity
-        eigenvalues at the target: by the lemma, counted, and counted as null vectors
+        number of eigenvalues at the target: by the lemma, counted, and counted as null vectors
     others
         least real part of the other eigenvalues (continuous time, must be > 0), or largest modulus (discrete time, must
         be < 1)
     residual
-        largest entry of (matrix - target) @ v over the null vectors v that the lemma names, relative
+        largest entry of (matrix - target) @ v over the null vectors v of the lemma, relative to that of the matrix
     """
 
     name: str
@@ -80,12 +74,16 @@ class Fact:
 
 
 def check_facts(experiment: Experiment) -> list[Fact]:
-    """Check every lemma on eigenvalues that speaks of this experiment's time and problem.
+    """Check every lemma on eigenvalues that applies to this experiment's time and problem (Lemmas 1 to 4 of the paper).
 
-    Continuous time: N_c, M_c and their projections (consensus), or N_k, M_k (tracking). Discrete time: H_c, A_c
-    and their projections, or H_k, A_k. Graphs may be directed, weighted and disconnected, if their union connects
-    everybody. Leaders of infinite gain are deleted. Of a linear protocol, what holds of W = exp(-Z) in discrete time is
-    checked of its steps.
+    Continuous time: N_c, M_c and their projections (consensus), or N_k, M_k (tracking). Discrete time: H_c, A_c and
+    their projections, or H_k, A_k. Graphs may be directed, weighted and disconnected, if their union connects all
+    agents. Leaders of infinite gain are deleted. With a linear protocol, its steps take the place of W = exp(-Z) in
+    discrete time. With z_i zero eigenvalues of L_i (1 if graph i is connected), the nullities of the projected matrices
+    in continuous time are (docs/errata.md, 1):
+
+        Nbar_c    n                     vectors e_i (x) 1, not pi (x) 1 alone
+        Mbar_c    n + 2 sum (z_i - 1)   vectors e_i (x) 1 (x) 1; and e_i (x) 1 (x) w, e_i (x) w (x) 1 with L_i w = 0
 
     Parameters
     ----------
@@ -173,7 +171,7 @@ def _kronecker_sum(z: FloatArray) -> FloatArray:
 
 
 def _fact(name: str, matrix: FloatArray, target: float, null_vectors: list[FloatArray]) -> Fact:
-    """Count the eigenvalues at the target in two ways, and see where the others are."""
+    """Count the eigenvalues at the target in two ways, and locate the others."""
     shifted = matrix - target * np.eye(len(matrix))
     scale = float(np.abs(matrix).max(initial=0.0)) or 1.0
     values = np.linalg.eigvals(matrix)

@@ -1,8 +1,6 @@
-"""Indices of the single graphs, for comparison, and bounds between which switching can move the system error.
+"""Indices of single graphs, for comparison, and bounds of the system error that hold for all switching rates.
 
 The errors and certainties themselves are properties of ``prediction.Moments``.
-
-Kirchhoff index: Klein and Randić (1993); information centrality: Stephenson and Zelen (1989); bounds: docs/theory.md.
 """
 
 from __future__ import annotations
@@ -27,20 +25,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphIndices:
-    """What resistances say about one undirected connected graph; edge weights are conductances.
-
-    Attributes
-    ----------
-    name
-        name of the graph
-    kirchhoff_index
-        sum of r_uv over pairs = m tr(L^+); the system error of the graph with F = I times 2 m
-    information_centrality
-        (m,) 1 / sum_v r_uv, the convention of networkx (Stephenson and Zelen: times m)
-    """
+    """Indices of one undirected connected graph from its effective resistances r_uv; edge weights are conductances."""
 
     name: str
+    # Sum of r_uv over pairs, m tr(L^+) (Klein and Randić 1993): 2 m times the system error of the graph with F = I.
     kirchhoff_index: float
+    # (m,) 1 / sum_v r_uv, the convention of networkx; Stephenson and Zelen (1989) have m times that.
     information_centrality: FloatArray
 
     def to_json(self) -> dict[str, Any]:
@@ -55,12 +45,7 @@ class GraphIndices:
 def graph_indices(graph: Graph) -> GraphIndices | None:
     """Kirchhoff index and information centrality; None for a directed or disconnected graph.
 
-    From r_uv = L^+_uu + L^+_vv - 2 L^+_uv: sum_v r_uv = m L^+_uu + tr(L^+).
-
-    Parameters
-    ----------
-    graph
-        weighted or not
+    From r_uv = L^+_uu + L^+_vv - 2 L^+_uv (Klein and Randić 1993): sum_v r_uv = m L^+_uu + tr(L^+).
     """
     if not graph.symmetric or not nx.is_connected(nx.from_numpy_array(graph.adjacency)):
         return None
@@ -73,14 +58,14 @@ def graph_indices(graph: Graph) -> GraphIndices | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bounds:
-    """Bounds of the system error that hold whatever the rates, the stationary law being given.
+    """Bounds of the system error for a given stationary law, whatever the rates.
 
     Attributes
     ----------
     lower
-        error of the averaged graph; None where it bounds nothing
+        error of the averaged graph; None where it is not a bound
     upper
-        error of the graphs held for ever (static baseline); None where it bounds nothing, or is infinite
+        static baseline: mean error of the graphs held fixed; None where it is not a bound, or is infinite
     note
         why there are these bounds and no others
     """
@@ -100,19 +85,19 @@ _NO_BOUNDS = "the averaged graph and the graphs held for ever bound nothing here
 def error_bounds(prediction: Prediction) -> Bounds:
     """Bounds of the system error of the paper's law: continuous time, or discrete time with W = exp(-Z).
 
-    For undirected graphs and noise of equal variance q for every agent and graph (F = sqrt(q) I), in consensus and in
-    tracking, whatever the ergodic chain (reversible or not), and Zbar = sum pi_i Z_i:
+    For undirected graphs and independent noise of equal variance q for every agent and graph (F = sqrt(q) I), in
+    consensus and tracking, and any ergodic chain, with Zbar = sum pi_i Z_i (proof: docs/theory.md, "Bounds"):
 
         continuous time    q tr(Zbar^-1) / 2 <= E <= E_static         (pseudo-inverse in consensus)
         discrete time                           E <= E_static
 
-    In discrete time the averaged graph is no lower bound: graphs that alternate can do better than independent draws.
-    With unequal or correlated noise, or directed graphs, E can lie outside on both sides.
+    In discrete time the averaged graph gives no lower bound: graphs that alternate can be better than independent
+    draws. With unequal or correlated noise, or directed graphs, E can lie outside on both sides.
 
     Parameters
     ----------
     prediction
-        of an experiment
+        of the experiment
     """
     experiment = prediction.experiment
     if experiment.protocol:
@@ -139,13 +124,7 @@ def error_bounds(prediction: Prediction) -> Bounds:
 
 
 def averaged(system: JumpSystem) -> JumpSystem:
-    """The limit of infinitely fast switching in continuous time: one graph, with Z and Q averaged over pi.
-
-    Parameters
-    ----------
-    system
-        in continuous time
-    """
+    """The limit of infinitely fast switching in continuous time: one graph, with Z and Q averaged over pi."""
     weights = system.stationary[:, None, None]
     return JumpSystem(
         time=system.time,
@@ -158,7 +137,7 @@ def averaged(system: JumpSystem) -> JumpSystem:
 
 
 def _equal_noise(system: JumpSystem) -> bool:
-    """Whether the noise is equal and independent on all coordinates that are not pinned, in every mode."""
+    """Whether the noise is equal and independent, in every mode, in all coordinates not held at the reference."""
     scale = float(np.abs(system.noise).max(initial=0.0))
     pinned = (system.matrices == 0.0).all(axis=(0, 1)) & (system.matrices == 0.0).all(axis=(0, 2))
     pinned &= (system.noise == 0.0).all(axis=(0, 1))

@@ -1,10 +1,8 @@
 """The coupled equations solved matrix-free, by preconditioned Krylov iterations and refinement.
 
-Every cycle ends with the residual of the equations as they were given; so neither the Krylov recurrences nor the
-eigenvectors limit the accuracy. A solution is good when the correction that one more preconditioned step would make is
-small in every graph: unlike the residual this does not drown in the rounding of large rates.
-
-docs/accuracy.md has what comes of it.
+Every cycle starts from the residual of the equations as given, in double precision: so neither the Krylov recurrences
+nor the eigenvectors limit the accuracy. A solution is accepted when the correction by one more preconditioned step is
+small in every graph: unlike the residual, this is not hidden by the rounding of large rates. See docs/accuracy.md.
 """
 
 from __future__ import annotations
@@ -26,39 +24,16 @@ from msg_analysis.theory.report import MAX_RELATIVE_ERROR, Method, Preconditione
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
 
-TOLERANCE = 1e-12
-"""Estimated relative error at which a solve stops."""
-
+TOLERANCE = 1e-12  # estimated relative error at which a solve stops
 MAX_ITERATIONS = 600
-
-MAX_CHEAP = 30
-"""Iterations in which the cheaper preconditioner must gain six digits, or be given up."""
-
-FINEST = 5e-7
-"""Residual to which single precision is driven there, relative: two cycles of it do."""
-
-MAX_AMPLIFICATION = 1e14
-"""Of the right-hand side by the solution, in units of the averaged decay: the condition, from below."""
-
-CHUNK = 1_000_000
-"""Numbers in a stack of right-hand sides that are solved together: small enough for the caches."""
+MAX_CHEAP = 30  # most iterations of one cycle with the averaged preconditioner
+FINEST = 5e-7  # least relative residual asked of such a cycle, in single precision: two cycles suffice
+MAX_AMPLIFICATION = 1e14  # largest ratio of (averaged decay * solution) to right-hand side: a condition number
+CHUNK = 1_000_000  # numbers in a stack of right-hand sides that are solved together: small enough for the caches
 
 
 class IterativeSolver:
-    """Steady moments and duals of one system.
-
-    Parameters
-    ----------
-    system
-        what to solve for
-    guess
-        (n, d, d) steady moments of a similar system, or None
-
-    Raises
-    ------
-    InputError
-        no steady second moments
-    """
+    """Steady moments and duals of one system; starts from ``guess`` (n, d, d), steady moments of a similar one."""
 
     def __init__(self, system: JumpSystem, guess: FloatArray | None = None) -> None:
         self._equations = CoupledEquations(system)
@@ -77,13 +52,7 @@ class IterativeSolver:
         return np.asarray(np.multiply(weights, x[0], out=x[0]))
 
     def dual(self, forms: FloatArray) -> FloatArray:
-        """See ``MomentSolver.dual``.
-
-        Parameters
-        ----------
-        forms
-            (q, d, d) symmetric H
-        """
+        """See ``MomentSolver.dual``."""
         system = self._equations.system
         if self._adjoint is None:
             self._adjoint = self._equations.adjoint()
@@ -108,7 +77,7 @@ def _solve(equations: CoupledEquations, right: FloatArray, guess: FloatArray | N
             x, report = _by_graphs(equations, right, x if np.isfinite(x).all() else None, report.iterations)
     else:
         x, report = _by_graphs(equations, right, x, 0)
-    # Not ">": a number that is not finite must not pass.
+    # Not ">": NaN must be refused, too.
     if not report.error <= MAX_RELATIVE_ERROR:
         raise InputError(singular_message(f", or too ill-conditioned ({report.iterations} iterations do not converge)"))
     size = (equations.decay * np.abs(np.diagonal(x, axis1=2, axis2=3))).max(initial=0.0)
@@ -122,14 +91,14 @@ def _solve(equations: CoupledEquations, right: FloatArray, guess: FloatArray | N
 def _by_average(
     equations: CoupledEquations, averaged: AveragedEquations, right: FloatArray, guess: FloatArray | None
 ) -> tuple[FloatArray, SolverReport]:
-    """With the cheaper preconditioner, until it is done or does not keep its promise."""
+    """With the averaged preconditioner, until the error is small or a cycle gains less than three digits."""
     method, iterations, before = _method(definite=averaged.definite), 0, np.inf
     x, known = np.zeros_like(right) if guess is None else guess, guess is not None
     while True:
         residual, left, backward = _residual(equations, right, x) if known else (right, 1.0, 1.0)
         scale = _scale(residual)
         inside, error = averaged.enter(residual, scale), np.ones(len(x))
-        del residual  # memory that is used again need not be cleared
+        del residual  # its memory is used again, and fresh memory would have to be cleared
         if known:
             error = _error(averaged.solution(inside), x, scale)
             iterations += 1
@@ -148,7 +117,7 @@ def _by_average(
 def _by_graphs(
     equations: CoupledEquations, right: FloatArray, x: FloatArray | None, iterations: int
 ) -> tuple[FloatArray, SolverReport]:
-    """With the two-level preconditioner, until nothing gets better."""
+    """With the two-level preconditioner, until the error is small, a cycle hardly reduces it, or iterations run out."""
     inner = equations.inner
     method: Method = "direct" if equations.direct else _method(definite=inner.definite)
     preconditioner: Preconditioner = "none" if equations.direct else "two-level"
@@ -181,7 +150,7 @@ def _by_graphs(
 def _improved(
     equations: Equations, right: FloatArray, size: FloatArray, error: FloatArray, most: int
 ) -> tuple[FloatArray, int]:
-    """(X, iterations) for A X = B, as well as the precision allows and the error needs."""
+    """(X, iterations) for A X = B, as accurate as the precision allows and the error requires."""
     finest = 1e-6 if right.dtype == np.float32 else 1e-14
     if equations.definite:
         small = 0.3 * TOLERANCE
@@ -190,7 +159,7 @@ def _improved(
 
 
 def _residual(equations: CoupledEquations, right: FloatArray, x: FloatArray) -> tuple[FloatArray, float, float]:
-    """B - A X, in double precision; its norm relative to B, and to all that was added up."""
+    """B - A X, in double precision; its norm relative to B, and to the sum of the norms of all terms."""
     residual, terms = equations.apply(x)
     np.subtract(right, residual, out=residual)
     given, left = norms(right), norms(residual)
@@ -209,7 +178,7 @@ def _method(*, definite: bool) -> Method:
 
 
 def _scale(residual: FloatArray) -> FloatArray:
-    """(q,): largest entries; 1 where there is nothing."""
+    """(q,): largest absolute entries; 1 where all are 0."""
     axes = (1, 2, 3)
     scale = np.maximum(residual.max(axis=axes, initial=0.0), -residual.min(axis=axes, initial=0.0))
     scale[scale == 0.0] = 1.0
@@ -217,7 +186,7 @@ def _scale(residual: FloatArray) -> FloatArray:
 
 
 def _scaled(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Largest entry 1 for every right-hand side, and the factors."""
+    """Right-hand sides with largest entry 1, and their (q, 1, 1, 1) scales."""
     scale = _scale(residual)[:, None, None, None]
     return residual / scale, scale
 

@@ -1,7 +1,6 @@
-"""Krylov methods for stacks of equations: every right-hand side has its own, and all take their steps together.
+"""Krylov methods for stacks of equations: each of the q right-hand sides has its own iteration, all step together.
 
-Conjugate gradients after Hestenes and Stiefel (1952), GMRES after Saad and Schultz (1986); docs/accuracy.md has what
-they are used for.
+Conjugate gradients after Hestenes and Stiefel (1952), GMRES after Saad and Schultz (1986).
 """
 
 from __future__ import annotations
@@ -14,26 +13,16 @@ import scipy.linalg
 
 from msg_analysis.types import FloatArray
 
-MAX_BASIS = 150
-"""Vectors that GMRES keeps before it restarts, if they fit."""
-
-MAX_BASIS_BYTES = 1.2e9
-
-STRIP = 8192
-"""Entries of every graph that are worked on together, to stay in the caches."""
+MAX_BASIS = 150  # most iterations of GMRES, which keeps a vector of each
+MAX_BASIS_BYTES = 1.2e9  # of these vectors together
+STRIP = 8192  # entries of every graph that are worked on together, to stay in the caches
 
 
 class Preconditioned(Protocol):
     """A X = B with a preconditioner; stacks are (q, n, d, d)."""
 
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(Z, A Z) for Z near A^-1 R.
-
-        Parameters
-        ----------
-        right
-            (q, n, d, d) R
-        """
+        """(Z, A Z) for Z near A^-1 R."""
 
 
 class Equations(Preconditioned, Protocol):
@@ -43,32 +32,16 @@ class Equations(Preconditioned, Protocol):
     definite: bool
 
     def average(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(Z, A Z) for a start Z from which the preconditioner acts as a symmetric one.
-
-        Parameters
-        ----------
-        right
-            (q, n, d, d) R
-        """
+        """(Z, A Z) for a start Z from which the preconditioner acts as a symmetric one."""
 
 
 def conjugate_gradients(
     equations: Equations, right: FloatArray, goal: FloatArray, tolerance: float, most: int
 ) -> tuple[FloatArray, int]:
-    """(X, iterations) for A X = B with ``definite`` equations, in the inner product of their weights.
+    """(X, iterations) for A X = B (q, n, d, d), ``definite``, with preconditioned conjugate gradients.
 
-    Parameters
-    ----------
-    equations
-        A and its preconditioner
-    right
-        (q, n, d, d) B
-    goal
-        (q,) norms of the preconditioned residual that are small enough
-    tolerance
-        the same, relative to X
-    most
-        iterations
+    In the inner product with the weights. It ends when, for every right-hand side, the norm of the preconditioned
+    residual is at most ``goal`` (q,), or at most ``tolerance`` relative to X.
     """
     weights = equations.weights
     x, moved = equations.average(right)  # the preconditioner is symmetric where the residual has mean zero
@@ -95,21 +68,11 @@ def conjugate_gradients(
 def plain_conjugate_gradients(
     apply: Callable[[FloatArray, float], FloatArray], right: FloatArray, tolerance: FloatArray, most: int
 ) -> tuple[FloatArray, int]:
-    """(X, iterations) for A X = B without a preconditioner, in the usual inner product.
+    """(X, iterations) for A X = B (q, n, d, d) with conjugate gradients, without preconditioner or weights.
 
-    Later products may be less accurate, as the residual gets smaller (inexact Krylov methods: van den Eshof and
-    Sleijpen 2004).
-
-    Parameters
-    ----------
-    apply
-        (X, relative accuracy that will do) -> A X, symmetric and positive definite
-    right
-        (q, n, d, d) B; overwritten
-    tolerance
-        (q,) residuals that are small enough, relative to B
-    most
-        iterations
+    ``apply`` maps X and the relative error that is allowed to A X, for a symmetric and positive definite A: products
+    may become less accurate as the residual gets smaller (inexact Krylov methods: van den Eshof and Sleijpen 2004).
+    ``right`` is overwritten; ``tolerance``: (q,) norms of the residual, relative to B.
     """
     x, residual, p = np.zeros_like(right), right, right.copy()
     axpy = scipy.linalg.blas.get_blas_funcs("axpy", (right,))  # in place, in one pass
@@ -132,18 +95,10 @@ def plain_conjugate_gradients(
 
 
 def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, most: int) -> tuple[FloatArray, int]:
-    """(X, iterations) for A X = B, preconditioned from the right, without restart.
+    """(X, iterations) for A X = B (q, n, d, d) with GMRES, preconditioned from the right, without restart.
 
-    Parameters
-    ----------
-    equations
-        A and its preconditioner
-    right
-        (q, n, d, d) B
-    tolerance
-        (q,) residuals that are small enough, relative to B
-    most
-        iterations, bounded by ``MAX_BASIS`` too
+    ``tolerance``: (q,) norms of the residual, relative to B. There are fewer than ``most`` iterations (but no less than
+    5) where ``MAX_BASIS`` or ``MAX_BASIS_BYTES`` requires it.
     """
     q, shape = len(right), right.shape
     length = right[0].size
@@ -156,7 +111,7 @@ def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, m
     target[:, 0] = norm
     used = 0
     while used < most:
-        if used + 1 == basis.shape[1]:  # memory that is not needed is not asked for: clearing it takes time
+        if used + 1 == basis.shape[1]:  # allocated as needed: clearing memory takes time
             more = np.empty((q, min(used, most - used), length), dtype=right.dtype)
             basis = np.concatenate([basis, more], axis=1)
         _, moved = equations.precondition(basis[:, used].reshape(shape))
@@ -191,35 +146,17 @@ def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, m
 
 
 def flat(stack: FloatArray) -> FloatArray:
-    """(q, n, d^2).
-
-    Parameters
-    ----------
-    stack
-        (q, n, d, d)
-    """
+    """The (q, n, d^2) view of a stack (q, n, d, d)."""
     return stack.reshape(*stack.shape[:2], -1)
 
 
 def strips(length: int) -> list[slice]:
-    """Pieces of flat stacks that stay in the caches while they are worked on.
-
-    Parameters
-    ----------
-    length
-        numbers of a row of a flat stack
-    """
+    """Slices of the rows of a flat stack, each of which stays in the caches while it is worked on."""
     return [slice(first, first + STRIP) for first in range(0, length, STRIP)]
 
 
 def norms(a: FloatArray) -> FloatArray:
-    """(q, n): of every matrix.
-
-    Parameters
-    ----------
-    a
-        (q, n, d, d) matrices A
-    """
+    """(q, n) Frobenius norms of (q, n, d, d) matrices."""
     return np.asarray(np.sqrt(np.einsum("qnab,qnab->qn", a, a)))
 
 
@@ -231,15 +168,7 @@ def _product(a: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def weighted_norm(a: FloatArray, weights: FloatArray) -> FloatArray:
-    """(q,): sqrt(sum_i pi_i |A_i|^2).
-
-    Parameters
-    ----------
-    a
-        (q, n, d, d) matrices A
-    weights
-        (n,) pi
-    """
+    """(q,): sqrt(sum_i pi_i |A_i|^2), from (q, n, d, d) matrices A and the weights pi (n,)."""
     return np.asarray(np.sqrt(_product(a, a, weights)))
 
 

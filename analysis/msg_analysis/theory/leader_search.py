@@ -1,12 +1,8 @@
-"""Search for the best set of leaders: enumeration, greedy choice, exchange of single leaders, and what bounds the gap.
+"""Search for the best set of leaders: enumeration, greedy choice, exchange of single leaders, and a bound of the gap.
 
-Everything here knows only E(S), the system error of a set S. Where E is supermodular, that is where a leader is worth
-no more beside more leaders,
-
-    E(A) - E(A + v) >= E(B) - E(B + v)    for A inside B, v outside B,
-
-gains that are known for a smaller set bound those of a larger one. Evaluation is then lazy (Minoux 1978; "CELF",
-Leskovec et al. 2007) and gives the same sets as plain evaluation. Elsewhere everything is evaluated.
+Only E(S), the system error of a set S, is known here. Where E is supermodular, gains for a smaller set bound those for
+a larger one: evaluation is then lazy (Minoux 1978; "CELF", Leskovec et al. 2007), with the result of evaluating every
+candidate. Where E is not supermodular, every candidate is evaluated.
 """
 
 from __future__ import annotations
@@ -18,21 +14,19 @@ from itertools import combinations
 from typing import Protocol
 
 Leaders = frozenset[int]
-Watch = Callable[[str, int, int, float], None]
-"""Told of progress: stage, how much of it is done, of how much, least system error so far."""
+Watch = Callable[[str, int, int, float], None]  # (stage, done, of how many, least E among the sets just tried)
 
-TIE = 1e-9
-"""Relative difference of two system errors below which they count as equal: the lower agents win."""
-
-STARTS = 3
-"""Number of greedy sets from which exchanges start."""
-
-_ROUNDING = 1e-10
-"""Relative to E: slack of every bound, well above the error of a solve and well below ``TIE``."""
+TIE = 1e-9  # relative difference below which two system errors count as equal: the lower agents are preferred
+STARTS = 3  # number of greedy sets from which exchanges start
+_ROUNDING = 1e-10  # slack of every bound, relative to E: well above the error of a solve and well below TIE
 
 
 class SetFunction(Protocol):
-    """What is minimised over sets of leaders."""
+    """The function of a set of leaders that is minimised.
+
+    It is supermodular if a leader is worth no more beside more leaders: E(A) - E(A + v) >= E(B) - E(B + v) for every A
+    inside B and every v outside B.
+    """
 
     @property
     def agents(self) -> int:
@@ -45,45 +39,20 @@ class SetFunction(Protocol):
         ...
 
     def unreached(self, leaders: Leaders) -> int:
-        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0.
-
-        Parameters
-        ----------
-        leaders
-            set S of agents, from 0
-        """
+        """Number of agents that no leader reaches in the union of all graphs; E is finite only if it is 0."""
         ...
 
     def system_error(self, leaders: Leaders) -> float:
-        """E(S) of a set that reaches everybody.
-
-        Parameters
-        ----------
-        leaders
-            set S of agents, from 0
-        """
+        """E(S) of a set that reaches all agents."""
         ...
 
 
 def ignore(_stage: str, _done: int, _total: int, _best: float) -> None:
-    """A ``Watch`` for those who do not watch."""
+    """A ``Watch`` that does nothing."""
 
 
 class LeaderSearch:
-    """One search; remembers every set that it has evaluated.
-
-    Parameters
-    ----------
-    function
-        what is minimised
-    watch
-        told of progress
-
-    Attributes
-    ----------
-    evaluations
-        number of solves so far
-    """
+    """One search, which keeps the value of every set that it has evaluated; agents count from 0."""
 
     def __init__(self, function: SetFunction, watch: Watch = ignore) -> None:
         self._function = function
@@ -91,23 +60,10 @@ class LeaderSearch:
         self._known: dict[Leaders, float] = {}
         self._bases: list[Leaders] = []
         self._stage, self._done, self._total = "", 0, 0
-        self.evaluations = 0
+        self.evaluations = 0  # number of solves so far
 
     def exhaustive(self, count: int, top: int) -> list[tuple[float, Leaders]]:
-        """The best sets of all.
-
-        Parameters
-        ----------
-        count
-            agents in a set
-        top
-            how many sets
-
-        Returns
-        -------
-        list[tuple[float, Leaders]]
-            (E, set), best first; infinite ones are left out
-        """
+        """The ``top`` best (E, set) of all sets of ``count`` agents with finite E, best first."""
         self._begin("all sets", math.comb(self._function.agents, count))
         least = math.inf
 
@@ -120,22 +76,15 @@ class LeaderSearch:
                 if math.isfinite(value):
                     yield value, members
 
-        # To 9 digits: rounding must not decide which of equal sets are among the first.
+        # Compared to 9 digits: rounding must not decide which of equal sets are among the first.
         best = heapq.nsmallest(top, values(), key=lambda entry: (float(f"{entry[0]:.8e}"), entry[1]))
         return _ranked([(value, frozenset(members)) for value, members in best])[:top]
 
     def greedy(self, count: int, first: int | None = None) -> list[int]:
-        """Agents in the order in which they are chosen: each the best beside those before it.
+        """Agents in the order in which they are chosen: each is the best one beside those before it.
 
-        As long as no agent makes E finite, the one is chosen that leaves the fewest agents unreached: this finds a
-        set that reaches everybody if there is one.
-
-        Parameters
-        ----------
-        count
-            how many
-        first
-            agent to begin with; by default the best one
+        ``first`` is the agent to begin with, by default the best one. As long as no agent makes E finite, the one that
+        leaves the fewest agents unreached is chosen: this finds a set that reaches all agents if there is one.
         """
         self._begin("greedy" if first is None else f"greedy after agent {first + 1}", count * self._function.agents)
         chosen = [] if first is None else [first]
@@ -147,20 +96,10 @@ class LeaderSearch:
         return chosen
 
     def swap(self, count: int) -> list[int]:
-        """The best of some sets that no exchange of one leader improves.
+        """The best of a few sets that no exchange of one leader improves, or one that reaches as many agents as it can.
 
-        The searches start at greedy sets, begun with the best single leader and with the ``STARTS`` - 1 next ones:
-        an agent that is best alone often stands in the way of a good set.
-
-        Parameters
-        ----------
-        count
-            how many
-
-        Returns
-        -------
-        list[int]
-            agents; if no set of this size reaches everybody, one that reaches as many as possible
+        Exchanges start from greedy sets, begun with each of the ``STARTS`` best single leaders: the agent that is best
+        alone is often not in a good set.
         """
         best = self.greedy(count)
         if self._function.unreached(frozenset(best)):
@@ -173,18 +112,7 @@ class LeaderSearch:
         return best
 
     def exchange(self, chosen: list[int]) -> list[int]:
-        """Replace single leaders by better ones until no replacement helps.
-
-        Parameters
-        ----------
-        chosen
-            a set that reaches everybody
-
-        Returns
-        -------
-        list[int]
-            as many agents, each the best beside the others
-        """
+        """Replace single leaders by better ones until none helps; the set must reach all agents."""
         count = len(chosen)
         current = list(chosen)
         settled = position = 0
@@ -204,21 +132,16 @@ class LeaderSearch:
         return current
 
     def bound(self, leaders: Leaders) -> float:
-        """Lower bound of E over all sets of as many leaders. Needs supermodularity.
+        """Lower bound of E over all sets of as many leaders as in the given result; valid only where E is supermodular.
 
-        For any set A, the best set T and the set V of all agents,
+        For any set A, the best set T and the set V of all agents (+ joins sets; docs/leaders.md has the proof):
 
             E(A + T) >= E(A) - sum over v in T, not in A, of (E(A) - E(A + v))
             E(T) >= E(A + T) + sum over a in A, not in T, of (E(V - a) - E(V))
 
-        The worst case over T is a matter of the largest terms of the first sum and the smallest of the second. The
-        result is the best bound over all A that the search went through, and over the given set, whose largest
-        gains are evaluated here. It is at least as good as what the guarantee of the greedy choice says.
-
-        Parameters
-        ----------
-        leaders
-            the result of the search
+        The worst T has the largest terms of the first sum and the smallest of the second. The result is the best bound
+        over all A that the search visited and over the given set, whose largest gains are evaluated here. It is at
+        least as good as the guarantee of the greedy choice.
         """
         count = len(leaders)
         self._begin("bound", self._function.agents)
@@ -244,15 +167,7 @@ class LeaderSearch:
         )
 
     def evaluated(self, count: int, top: int) -> list[tuple[float, Leaders]]:
-        """The best of the sets of one size that were evaluated; infinite ones are left out.
-
-        Parameters
-        ----------
-        count
-            agents in a set
-        top
-            how many sets
-        """
+        """The ``top`` best (E, set) of the sets of ``count`` agents that were evaluated and have finite E."""
         sets = [(value, key) for key, value in self._known.items() if len(key) == count and math.isfinite(value)]
         return _ranked(sets)[:top]
 
@@ -277,7 +192,7 @@ class LeaderSearch:
         return [(value, next(iter(key))) for value, key in _ranked([(e, frozenset({v})) for e, v in exact])][:count]
 
     def _least(self, base: Leaders, agent: int) -> float:
-        """Lower bound of E(base + agent) from what is known; exact, if that set is known."""
+        """Lower bound of E(base + agent) from what is known; exact if that set was evaluated."""
         joined = base | {agent}
         if joined in self._known:
             return self._known[joined]
@@ -308,7 +223,7 @@ class LeaderSearch:
 
 
 def _ranked(sets: list[tuple[float, Leaders]]) -> list[tuple[float, Leaders]]:
-    """Best first; among those that are equal up to ``TIE``, the lower agents first."""
+    """Best first; among sets that are equal up to ``TIE``, the lower agents first."""
     ordered = sorted(sets, key=lambda entry: (entry[0], sorted(entry[1])))
     groups: list[int] = []
     first = math.nan

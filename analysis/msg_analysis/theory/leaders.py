@@ -1,6 +1,6 @@
 """Leaders: what a set of them is worth (joint robustness centrality), and which set is best.
 
-After the paper's section on robustness and leadership indices; docs/leaders.md has the bounds.
+After Section 4 of the paper, "Robustness and leadership indices"; docs/leaders.md has the proofs and bounds.
 """
 
 from __future__ import annotations
@@ -28,32 +28,17 @@ from msg_analysis.types import BoolArray
 Law = Literal["continuous", "emulated", "discrete"]
 Method = Literal["auto", "exhaustive", "greedy", "swap"]
 
-AUTO_SETS = 1000
-"""Number of sets up to which ``auto`` evaluates them all."""
-
-MOST_SETS = 1_000_000
-"""Number of sets beyond which enumeration is refused."""
+AUTO_SETS = 1000  # number of sets up to which "auto" evaluates them all
+MOST_SETS = 1_000_000  # number of sets beyond which enumeration is refused
 
 
 @dataclass(frozen=True, eq=False)
 class LeaderProblem:
-    """System error as a function of the set of leaders, everything else being that of an experiment.
-
-    Leaders that the experiment has, if any, are left out: the set is what is asked.
-
-    Attributes
-    ----------
-    experiment
-        consensus or tracking
-    law
-        "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
-    gain
-        kappa of the leaders [1 / unit of time]; inf holds them at the reference
-    """
+    """System error as a function of the set of leaders of an experiment, whose own leaders are ignored."""
 
     experiment: Experiment
-    law: Law
-    gain: float = math.inf
+    law: Law  # "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
+    gain: float = math.inf  # kappa of the leaders [1 / unit of time]; inf holds them at the reference
 
     @property
     def agents(self) -> int:
@@ -67,11 +52,11 @@ class LeaderProblem:
 
     @cached_property
     def doubt(self) -> str | None:
-        """Why supermodularity is not known; None where it is.
+        """Why supermodularity is not known; None where it is (docs/leaders.md, "Why greedy choice works").
 
         E(S) sums, over pairs of walkers that start at one agent and see the same graphs, the noise covariance between
-        the agents where they are, as long as a leader has not killed either of them. With entries >= 0 in every
-        factor this is a mixture, with weights >= 0, of products over the leaders of numbers in [0, 1].
+        the agents where they are, until a leader absorbs one of them. With entries >= 0 in every factor this is a
+        mixture, with weights >= 0, of products over the leaders of numbers in [0, 1], and so supermodular.
         """
         step = self._system(frozenset({0}), 1.0)
         if step.noise.min() < -1e-12 * np.abs(step.noise).max():
@@ -95,38 +80,17 @@ class LeaderProblem:
         return np.asarray(np.isfinite(distances))
 
     def unreached(self, leaders: Leaders) -> int:
-        """Number of agents that no leader reaches in the union of all graphs; E is infinite unless it is 0.
-
-        Parameters
-        ----------
-        leaders
-            set S of agents, from 0
-        """
+        """Number of agents that no leader (from 0) reaches in the union of all graphs; E is finite only if it is 0."""
         return int((~self._reach[sorted(leaders)].any(axis=0)).sum())
 
     def system(self, leaders: Leaders) -> JumpSystem:
-        """The reduced system with these leaders: for infinite gain their rows and columns are deleted.
-
-        Parameters
-        ----------
-        leaders
-            set S of agents, from 0
-        """
+        """The reduced system with these leaders; infinite gain deletes them (continuous time) or zeroes their rows."""
         return self._system(leaders, self.gain)
 
     def system_error(self, leaders: Leaders) -> float:
-        """E(S), the sum of the mean-square deviations from the reference; 1/E(S) at infinite gain is the joint
-        robustness centrality of S (the paper's section on robustness and leadership indices).
+        """E(S), the sum of the mean-square deviations from the reference; inf where S does not reach all agents.
 
-        Parameters
-        ----------
-        leaders
-            agents from 0
-
-        Raises
-        ------
-        InputError
-            no steady state, or too large
+        1/E(S) at infinite gain is the joint robustness centrality of S (Section 4 of the paper).
         """
         if not leaders or self.unreached(leaders):
             return math.inf
@@ -147,22 +111,22 @@ class LeaderProblem:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Selection:
-    """Result of a leader selection.
+    """Result of a leader selection; agents count from 0.
 
     Attributes
     ----------
     problem
-        what was asked
+        experiment, law and gain
     method
         "exhaustive", "greedy" or "swap"
     sets
-        (E, agents from 0), best first; of greedy and swap, the best of those that were evaluated
+        (E, agents), best first; for greedy and swap, the best of those that were evaluated
     order
-        agents in the order of the greedy choice, each replaced in its place by exchanges; () for enumeration
+        agents in the order of the greedy choice, with exchanged ones in place of the replaced; () if exhaustive
     evaluations
         number of system errors that were solved for
     bound
-        no set of this size has a smaller system error; None where that is not known
+        no set of this size has a smaller system error; None where no bound is known
     """
 
     problem: LeaderProblem
@@ -182,7 +146,7 @@ class Selection:
         return markdown_table(("leaders", "system error"), rows)
 
     def to_json(self) -> dict[str, Any]:
-        """The document of ``msg-analysis leaders --json``."""
+        """The document of ``msg-analysis leaders --json``; agents count from 1."""
         best = self.sets[0][0]
         gap = best / self.bound - 1.0 if self.bound else None
         return {
@@ -208,20 +172,7 @@ class Selection:
 
 
 def resolve_law(experiment: Experiment, law: Law | None = None) -> Law:
-    """The law that an experiment is looked at in.
-
-    Parameters
-    ----------
-    experiment
-        in continuous or discrete time
-    law
-        None for the paper's where the experiment has it, else that of the run's steps
-
-    Raises
-    ------
-    InputError
-        the experiment does not have this law
-    """
+    """``law`` if the experiment has it, else InputError; None stands for the paper's law, or else that of the steps."""
     if experiment.time == "discrete":
         possible: list[Law] = ["discrete"]
     elif experiment.steps_only:
@@ -239,29 +190,29 @@ def resolve_law(experiment: Experiment, law: Law | None = None) -> Law:
 
 
 def system_error(experiment: Experiment, agents: list[int], *, law: Law | None = None, gain: float = math.inf) -> float:
-    """E(S) with the given agents as leaders; see ``LeaderProblem.system_error``.
+    """E(S) with the given agents as leaders; inf where S does not reach all agents.
 
     Parameters
     ----------
     experiment
-        consensus or tracking; its own leaders do not count
+        consensus or tracking; its own leaders are ignored
     agents
         the leaders S, from 0
     law
-        see ``resolve_law``
+        "continuous", "emulated" or "discrete"; None for the paper's where the experiment has it, else that of its steps
     gain
         kappa [1 / unit of time]
 
-    Returns
-    -------
-    float
-        inf where S does not reach everybody
+    Raises
+    ------
+    InputError
+        the experiment does not have this law, or E(S) cannot be computed
     """
     return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(frozenset(agents))
 
 
 def joint_robustness_centrality(experiment: Experiment, agents: list[int], *, law: Law | None = None) -> float:
-    """1/E(S) in the limit of infinite gain, exactly, by deleting rows and columns (the paper's definition).
+    """1/E(S) in the exact limit of infinite gain (the paper's definition, Section 4); inf where E(S) is 0.
 
     Parameters
     ----------
@@ -282,31 +233,29 @@ def select_leaders(
     top: int = 10,
     watch: Watch = ignore,
 ) -> Selection:
-    """The set of leaders with the least system error, or a good one.
+    """The set of leaders with the least system error, or a good one (docs/leaders.md, "How it searches").
 
     Parameters
     ----------
     experiment
-        consensus or tracking; its own leaders do not count
+        consensus or tracking; its own leaders are ignored
     count
         number of leaders
     method
-        "exhaustive" evaluates every set; "greedy" takes the best agent beside those taken before; "swap" exchanges
-        single leaders, from three starts, until that helps no more; "auto" is exhaustive up to ``AUTO_SETS`` sets, else
+        "exhaustive" evaluates every set; "greedy" adds the best agent beside those chosen before; "swap" exchanges
+        single leaders, from three starts, until that does not help; "auto" is exhaustive up to ``AUTO_SETS`` sets, else
         swap
-    law
-        see ``resolve_law``
-    gain
-        kappa of the leaders [1 / unit of time]; inf holds them at the reference
+    law, gain
+        see ``system_error``
     top
         most sets in the result
     watch
-        told of progress
+        called with the progress
 
     Raises
     ------
     InputError
-        impossible count, gain or law; no set of this size reaches everybody; too many sets
+        impossible count, gain or law; no set of this size reaches all agents; too many sets
     """
     _check(method in get_args(Method), f"method {method}: expected one of {', '.join(get_args(Method))}")
     _check(gain > 0.0, f"--gain {gain}: expected a number > 0, or inf for leaders held at the reference")

@@ -1,14 +1,7 @@
 """Lyapunov and Stein solves of uncoupled systems: one in every graph, and one on the average of the graphs.
 
-For each of k systems with the matrix D (Z in continuous time, I - W in discrete time) that is left at the rate a,
-
-    continuous: D X + X D^T + a X = F
-    discrete:   X - W X W^T + a W X W^T = F
-
-With the eigenvectors of D this is a division, entry by entry, between products of matrices. Symmetric matrices
-always have them; others use them if they are well conditioned, and the complex Schur form if they are not.
-
-The Schur form is that of Bartels and Stewart (1972).
+With the eigenvectors of D a solve is a division, entry by entry, between products of matrices. Symmetric matrices use
+them always, others if they are well conditioned, else the complex Schur form (Bartels and Stewart 1972).
 """
 
 from __future__ import annotations
@@ -22,14 +15,10 @@ import scipy.linalg
 from msg_analysis.model.chain import Time
 from msg_analysis.types import AnyArray, ComplexArray, FloatArray
 
+# Largest condition of eigenvectors that are used: a solve has errors of its square times 1e-16, before refinement.
 MAX_CONDITION = 1e4
-"""Of eigenvectors that are used: a solve is as accurate as the square of it times 1e-16, before refinement."""
-
-MILD = 1e-4
-"""Slowest decay, relative to the fastest, for which single precision will do in a preconditioner."""
-
-ROUNDING = 8.0 * float(np.finfo(float).eps)
-"""Times the dimension and the largest eigenvalue: eigenvalues below are zero but for rounding."""
+MILD = 1e-4  # slowest decay, relative to the fastest, for which single precision suffices in a preconditioner
+ROUNDING = 8.0 * float(np.finfo(float).eps)  # eigenvalues below this * dimension * the largest one count as 0
 
 
 class Eigenvectors(NamedTuple):
@@ -41,21 +30,14 @@ class Eigenvectors(NamedTuple):
 
 
 class LocalSolves:
-    """k uncoupled solves, factorised.
+    """k uncoupled solves, factorised: with the matrix D (Z, or I - W in discrete time) of a system left at the rate a,
 
-    Eigenvalues that are zero but for rounding (in a disconnected graph) count as zero: such directions are left
-    at the rate a and no other, however slow that is.
+        continuous: D X + X D^T + a X = F
+        discrete:   X - W X W^T + a W X W^T = F
 
-    Parameters
-    ----------
-    time
-        "continuous" (Lyapunov) or "discrete" (Stein)
-    drift
-        (k, d, d) D; symmetric to the last bit if at all
-    leaving
-        (k,) a
-    eigenvectors
-        of ``drift``, if they are known
+    D: ``drift`` (k, d, d), treated as symmetric only if symmetric to the last bit; a: ``leaving`` (k,). Eigenvalues
+    that are zero but for rounding (in a disconnected graph) count as zero: such directions are left at the rate a only,
+    however slow that is.
     """
 
     def __init__(
@@ -79,11 +61,11 @@ class LocalSolves:
         else:
             self._numerator = (1.0 - row) * (1.0 - column)
             divisor = row + column - row * column + rate * self._numerator
+        # Whether every X -> F is symmetric and positive definite.
         self.definite = self.symmetric and bool((divisor > 0.0).all())
-        """Whether every X -> F is symmetric and positive definite."""
-        self._divisor = np.where(divisor == 0.0, 1.0, divisor)  # such a solve fails, and that is found out
+        self._divisor = np.where(divisor == 0.0, 1.0, divisor)  # such a solve is wrong, which the residual shows
+        # Whether single precision gives useful solutions.
         self.mild = self.symmetric and bool((np.abs(divisor).min(axis=(1, 2)) >= MILD * size[:, 0]).all())
-        """Whether single precision gives useful solutions."""
 
     def transposed(self) -> LocalSolves:
         """The same for D^T."""
@@ -104,12 +86,8 @@ class LocalSolves:
         return other
 
     def __call__(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(X, Y): the solution and what the coupling sees of it: Y = X in continuous time, W X W^T in discrete time.
-
-        Parameters
-        ----------
-        right
-            (..., k, d, d) F, symmetric
+        """(X, Y) for symmetric F (..., k, d, d), with Y = X in continuous and W X W^T in discrete time, for the
+        coupling.
         """
         if self.eigenvectors is None:
             return self._by_schur(right)
@@ -137,7 +115,7 @@ class LocalSolves:
 
     @property
     def amplification(self) -> float:
-        """By how much the inverses of D magnify relative errors of D, rows and columns scaled; inf if singular."""
+        """How much inverting D, scaled, magnifies relative errors, from the diagonal of D^-1; inf if singular."""
         size = np.abs(np.diagonal(self.drift, axis1=1, axis2=2)) if self.time == "continuous" else 1.0
         if self._null.any():
             return np.inf
@@ -149,18 +127,7 @@ class LocalSolves:
         return found if np.isfinite(found) else np.inf
 
     def without_null(self, matrices: FloatArray) -> FloatArray:
-        """(..., k, d, d) with the directions removed in which D is zero but for rounding.
-
-        Parameters
-        ----------
-        matrices
-            (..., k, d, d)
-
-        Returns
-        -------
-        FloatArray
-            of the same shape
-        """
+        """(..., k, d, d) without the directions in which D is zero but for rounding."""
         if self.eigenvectors is None or not self._null.any():
             return matrices
         _, vectors, inverse = self.eigenvectors
@@ -190,23 +157,12 @@ def _eigenvectors(drift: FloatArray, *, symmetric: bool) -> Eigenvectors | None:
 
 
 def single(array: AnyArray) -> AnyArray:
-    """The same in single precision.
-
-    Parameters
-    ----------
-    array
-        of any shape
-
-    Returns
-    -------
-    AnyArray
-        of the same shape
-    """
+    """The array in single precision, real or complex."""
     return array.astype(np.complex64 if np.iscomplexobj(array) else np.float32)
 
 
 def _symmetric(matrices: FloatArray) -> FloatArray:
-    """To the last bit: the equations hold for symmetric matrices only, and rounding must not leave these."""
+    """Symmetric to the last bit: the equations hold for symmetric matrices only."""
     total = matrices + matrices.swapaxes(-1, -2)
     total *= 0.5
     return total

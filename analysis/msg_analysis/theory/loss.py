@@ -1,8 +1,7 @@
 """What lost messages add to a step's map of second moments, and the adjoint of that, matrix-free.
 
-A message from j to i that may be lost adds variance_ij E[(x_i - x_j)^2] to the second moment of agent i.
-
-The map is that of docs/theory.md, "Beyond the paper".
+A message from j to i that may be lost adds variance_ij E[(x_i - x_j)^2] to the second moment of agent i
+(docs/theory.md, "Beyond the paper").
 """
 
 from __future__ import annotations
@@ -18,16 +17,11 @@ def lost(lift: FloatArray, variance: FloatArray, moments: FloatArray) -> FloatAr
     Parameters
     ----------
     lift
-        (m, d)
+        (k, d), see ``JumpSystem``; k = m without delay
     variance
-        (n, m, m), or (m, m) for one graph; see ``StepModel.loss_variance``
+        (n, k, k), or (k, k) for one graph; see ``StepModel.loss_variance``
     moments
         (..., n, d, d) symmetric C
-
-    Returns
-    -------
-    FloatArray
-        of the same shape
     """
     full = lift @ moments @ lift.T
     own = np.diagonal(full, axis1=-2, axis2=-1)
@@ -39,19 +33,7 @@ def lost(lift: FloatArray, variance: FloatArray, moments: FloatArray) -> FloatAr
 def lost_adjoint(lift: FloatArray, variance: FloatArray, forms: FloatArray) -> FloatArray:
     """(..., n, d, d): sum_ij variance_ij <e_i e_i^T, Y> (e_i - e_j)(e_i - e_j)^T in reduced coordinates.
 
-    Parameters
-    ----------
-    lift
-        (m, d)
-    variance
-        (n, m, m), or (m, m) for one graph
-    forms
-        (..., n, d, d) symmetric Y
-
-    Returns
-    -------
-    FloatArray
-        of the same shape
+    The adjoint of ``lost``, with the same arguments; ``forms``: (..., n, d, d) symmetric Y.
     """
     seen = variance * ((lift @ forms) * lift).sum(axis=-1)[..., None]
     laplacian = -(seen + seen.swapaxes(-1, -2))

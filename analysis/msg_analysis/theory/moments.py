@@ -1,7 +1,7 @@
 """Second moments of jump linear systems: steady, dual (adjoint) and transient.
 
-Propositions 3 to 5 of the paper and its appendix; in general, Costa, Fragoso and Marques, Discrete-Time Markov Jump
-Linear Systems (2005).
+Propositions 2, 3, 7 and 8 of the paper; in general, Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear
+Systems (2005).
 """
 
 from __future__ import annotations
@@ -18,23 +18,21 @@ from msg_analysis.theory.report import MAX_RELATIVE_ERROR, SolverReport
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
 
-MAX_FALLBACK = 1000
-"""Unknowns up to which equations that do not converge are solved densely."""
+MAX_FALLBACK = 1000  # unknowns up to which equations that do not converge are solved densely
 
 
 class MomentSolver:
-    """The coupled equations of one system.
+    """The coupled equations of the steady second moments C_i (Propositions 2, 3, 7 and 8 of the paper).
 
         continuous: Z_i C_i + C_i Z_i^T - sum_j Gamma_ji C_j = pi_i Q_i
         discrete:   C_i - sum_j P_ji K_j[C_j] = sum_j P_ji pi_j N_j
 
-    Matrix-free: time grows as n d^3, memory as n d^2. Equations that are small and do not converge are solved
-    densely.
+    Matrix-free: time grows as n d^3, memory as n d^2. Equations that are small and do not converge are solved densely.
 
     Parameters
     ----------
     system
-        what to solve for
+        whose second moments are sought
     method
         "auto"; "krylov" or "dense" for this one and no other
     guess
@@ -78,7 +76,7 @@ class MomentSolver:
         return self._solver.report
 
     def steady(self) -> FloatArray:
-        """(n, d, d): C_i = E[y y^T; mode i] in the steady state (the paper's second-moment propositions).
+        """(n, d, d): C_i = E[y y^T; mode i] in the steady state.
 
         Raises
         ------
@@ -101,22 +99,15 @@ class MomentSolver:
         return moments
 
     def dual(self, forms: FloatArray) -> FloatArray:
-        """Adjoint solutions for many quadratic forms at once.
+        """(q, n, d, d): the adjoint solutions Y of q quadratic forms H at once.
 
-        E[y^T H y] = sum_i pi_i tr(Y_i Q) in continuous time, sum_ij pi_i P_ij tr(Y_j N_i) in discrete time.
-
-            continuous: Z_i^T Y_i + Y_i Z_i - sum_j Gamma_ij Y_j = H
-            discrete:   Y_i = H + K_i^*[sum_j P_ij Y_j]
+            continuous: Z_i^T Y_i + Y_i Z_i - sum_j Gamma_ij Y_j = H,     E[y^T H y] = sum_i pi_i tr(Y_i Q_i)
+            discrete:   Y_i = H + K_i^*[sum_j P_ij Y_j],                  E[y^T H y] = sum_ij pi_i P_ij tr(Y_j N_i)
 
         Parameters
         ----------
         forms
             (q, d, d) symmetric H
-
-        Returns
-        -------
-        FloatArray
-            (q, n, d, d)
 
         Raises
         ------
@@ -130,28 +121,17 @@ class MomentSolver:
             return self._solver.dual(forms)
 
     def _fall_back(self) -> None:
-        """To the dense solver, in an exception handler: raise again where that may not be tried."""
+        """Change to the dense solver; called in an exception handler, raises again where that may not be tried."""
         if not self._dense_too or isinstance(self._solver, DenseSolver):
             raise
         self._solver = DenseSolver(self._system)
 
 
 def mode_potential(system: JumpSystem, dual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What the graph alone contributes: the Poisson equation of the chain. Discrete time.
+    """(q,) steady means of y^T H y, and the (q, n) potential kappa of the graph, of pi-mean zero. Discrete time.
 
-    With it f(y, g) = y^T Y_g y + kappa_g satisfies f - E[f(next) | now] = y^T H y - (its steady mean).
-
-    Parameters
-    ----------
-    system
-        discrete time
-    dual
-        (q, n, d, d) from ``MomentSolver.dual``
-
-    Returns
-    -------
-    tuple[FloatArray, FloatArray]
-        steady means (q,) of y^T H y, and kappa (q, n), pi-mean zero
+    kappa solves the Poisson equation of the chain: with it, f(y, g) = y^T Y_g y + kappa_g satisfies f - E[f(next) |
+    now] = y^T H y - (its steady mean), for the adjoint solutions Y (q, n, d, d) of ``MomentSolver.dual``.
     """
     ahead = np.einsum("ij,qjab->qiab", system.chain, dual)
     gained = np.einsum("qiab,iab->qi", ahead, system.noise)
@@ -163,27 +143,20 @@ def mode_potential(system: JumpSystem, dual: FloatArray) -> tuple[FloatArray, Fl
 def transient_mean(
     system: JumpSystem, steady: FloatArray, initial: FloatArray, law: FloatArray, steps: int
 ) -> FloatArray:
-    """Exact mean over the steps 0..steps-1 of E[y(k) y(k)^T] from a known start. Discrete time.
+    """(d, d) exact mean over the steps 0..steps-1 of E[y(k) y(k)^T] from a known start. Discrete time.
 
-    The distance to the steady state is what is stepped, until nothing is left of it.
+    The distance to the steady state is stepped (equations of Proposition 6), until nothing is left of it.
 
     Parameters
     ----------
     system
         discrete time
-    steady
-        (n, d, d) steady moments
-    initial
-        (n, d, d) E[y(0) y(0)^T; mode i]
+    steady, initial
+        (n, d, d) steady moments, and E[y(0) y(0)^T; mode i]
     law
         (n,) of g(0)
     steps
         > 0
-
-    Returns
-    -------
-    FloatArray
-        (d, d)
     """
     away, law_away = initial - steady, law - system.stationary
     scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))

@@ -1,9 +1,7 @@
 """The operators of second moments as matrices on packed moments, mode by mode: for closed forms and transients.
 
-Dense, so for small systems. Symmetric matrices are vectors of their p = d (d + 1) / 2 free entries, see
-``symmetric``.
-
-These are the paper's M and N, in discrete time its A and H, on packed moments and means.
+Dense, so for small systems. Symmetric matrices are vectors of their p = d (d + 1) / 2 free entries, see ``symmetric``.
+They are the paper's M and N (Proposition 1), in discrete time its A and H (Proposition 6).
 """
 
 from __future__ import annotations
@@ -17,13 +15,7 @@ from msg_analysis.types import FloatArray
 
 
 def mode_operators(system: JumpSystem) -> FloatArray:
-    """(n, p, p) matrices of C -> Z_i C + C Z_i^T (continuous time) or of C -> C - K_i[C] (discrete time).
-
-    Parameters
-    ----------
-    system
-        small enough for matrices of (d (d + 1) / 2)^2 entries for each graph
-    """
+    """(n, p, p) matrices of C -> Z_i C + C Z_i^T (continuous time) or of C -> C - K_i[C] (discrete time)."""
     if system.time == "continuous":
         return np.stack([symmetric.lyapunov(z) for z in system.matrices])
     p = symmetric.size(system.dimension)
@@ -35,13 +27,7 @@ def mode_operators(system: JumpSystem) -> FloatArray:
 
 
 def second_moment_propagator(system: JumpSystem) -> Propagator:
-    """Of the stack (n, p + 1) of packed C_i above pi_i: the equations for c(t) and pi(t) in one, noise included.
-
-    Parameters
-    ----------
-    system
-        small enough for matrices of (d (d + 1) / 2)^2 entries for each graph
-    """
+    """Of the stack (n, p + 1) of packed C_i beside pi_i: the equations for c(t) and pi(t) in one, noise included."""
     n, p = system.modes, symmetric.size(system.dimension)
     local = np.zeros((n, p + 1, p + 1))
     local[:, :p, :p] = -mode_operators(system)
@@ -50,24 +36,12 @@ def second_moment_propagator(system: JumpSystem) -> Propagator:
 
 
 def homogeneous_propagator(system: JumpSystem) -> Propagator:
-    """Of the stack (n, p) of packed C_i without noise: exp(-M t), or A^k.
-
-    Parameters
-    ----------
-    system
-        small enough for matrices of (d (d + 1) / 2)^2 entries for each graph
-    """
+    """Of the stack (n, p) of packed C_i without noise: exp(-M t), or A^k."""
     return Propagator(system.time, system.chain, system.stationary, -mode_operators(system))
 
 
 def mean_propagator(system: JumpSystem) -> Propagator:
-    """Of the stack nu (n, d) of means: exp(-N t), or H^k.
-
-    Parameters
-    ----------
-    system
-        continuous or discrete
-    """
+    """Of the stack nu (n, d) of means: exp(-N t), or H^k."""
     discrete = system.time == "discrete"
     local = system.matrices - np.eye(system.dimension) if discrete else -system.matrices
     return Propagator(system.time, system.chain, system.stationary, local)

@@ -1,6 +1,6 @@
 """What theory says about an experiment: in continuous time, for the run's steps, and without switching.
 
-Propositions 3 to 5 of the paper and their discrete twins; for the steps of a run, docs/theory.md.
+Propositions 2 and 3 of the paper, 7 and 8 in discrete time; for the steps of a run, docs/theory.md.
 """
 
 from __future__ import annotations
@@ -28,22 +28,16 @@ if TYPE_CHECKING:
     from msg_analysis.model.experiment import Experiment
 
 
-ROUNDING = 1e-14
-"""Node errors below this, relative to the largest one, are rounding."""
-
-SHOWN_AGENTS = 30
-"""Most agents in a notebook's table; the arrays have all of them."""
-
-WEAK_NOISE = 1e-6
-"""Directions with less noise than this, relative to the noisiest one, do not show whether steps are stable."""
+ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding
+SHOWN_AGENTS = 30  # most agents in a notebook's table; the arrays have all of them
+WEAK_NOISE = 1e-6  # directions with less noise, relative to the noisiest one, do not show whether steps are stable
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Moments:
     """Steady second moments of the agents.
 
-    Node errors that are nothing but rounding, next to the largest one, count as 0: an agent without noise may have
-    none.
+    Node errors below the rounding of the largest one count as 0: an agent without noise may have none.
 
     Attributes
     ----------
@@ -78,12 +72,12 @@ class Moments:
 
     @property
     def system_certainty(self) -> float:
-        """1/E, inf without noise (the paper's certainty index of the system)."""
+        """1/E, inf without noise (the paper's system certainty index, Section 4)."""
         return 1.0 / self.system_error if self.system_error > 0.0 else math.inf
 
     @property
     def node_certainty(self) -> FloatArray:
-        """(m,) 1/E_i, inf where there is no error (the paper's node certainty index)."""
+        """(m,) 1/E_i, inf where there is no error (the paper's node certainty index, Section 4)."""
         errors = self.node_errors
         return np.asarray(np.divide(1.0, errors, out=np.full(len(errors), math.inf), where=errors > 0.0))
 
@@ -107,7 +101,7 @@ class Moments:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Prediction:
-    """Everything ``msg-analysis predict`` says, and what a comparison needs.
+    """The result of ``predict``.
 
     Attributes
     ----------
@@ -116,18 +110,18 @@ class Prediction:
     step
         the experiment compiled to one step of an agent
     solver
-        of the equations of the run's steps, in real time those of its sequential law; its ``system`` is the reduced
-        system
+        of the equations of the run's steps, in real time those of its sequential law
     steady
-        (n, d, d) steady second moments of the reduced system of the run's steps
+        (n, d, d) steady second moments of ``system``
     emulated
-        what the run's steps do, exactly ("discrete" in the document of a discrete-time experiment); in real time if
-        nobody is late
+        exact moments of the run's steps ("discrete" in the document of a discrete-time experiment); in real time if no
+        agent is late
     continuous
         the paper's continuous-time system; None in discrete time, with a protocol, or with noise on the air, loss or
         delay
     static
-        the pi-weighted mean over the graphs held for ever; None where one of them cannot keep the agents together
+        the pi-weighted mean over the graphs held fixed, of the continuous-time system where there is one; None with
+        noise on the air, loss or delay, or where one of the graphs cannot keep the agents together
     """
 
     experiment: Experiment
@@ -139,7 +133,7 @@ class Prediction:
     static: Moments | None
 
     def _laws(self) -> dict[str, Moments]:
-        """What there is, by name in a text."""
+        """Those moments that there are, by the name that texts give them."""
         steps = "steps in turn" if self.emulated.law == "sequential" else "steps of the run"
         laws = {steps: self.emulated, "continuous time": self.continuous, "graphs held for ever": self.static}
         return {name: law for name, law in laws.items() if law is not None}
@@ -178,7 +172,7 @@ class Prediction:
 
 
 def predict(experiment: Experiment) -> Prediction:
-    """Steady-state prediction of an experiment (Propositions 3 to 5 of the paper and their discrete twins).
+    """Steady-state prediction of an experiment (Propositions 2 and 3 of the paper, 7 and 8 in discrete time).
 
     Parameters
     ----------
@@ -209,15 +203,9 @@ def predict(experiment: Experiment) -> Prediction:
 def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
     """(m, m) square root S of the law of x(0) given g(0) = mode in the steady state: S S^T = C_g0 / pi_g0.
 
-    S is the symmetric positive semidefinite root, which is unique. One thread of linear algebra, so that the
-    number of threads does not change its last bits.
-
-    Parameters
-    ----------
-    experiment
-        whose steps, in real time those of its sequential law, the start is stationary for
-    mode
-        g(0), from 0
+    C are the steady second moments of the experiment's steps, in real time those of the sequential law. S is the
+    symmetric positive semidefinite root, which is unique; ``mode`` counts from 0. It is computed in one thread, so that
+    its last bits do not depend on the number of threads.
     """
     step = build_step_model(experiment)
     with threadpool_limits(1):
@@ -228,8 +216,8 @@ def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
 
 
 def _steady(step: StepModel, run: StepModel, problem: str) -> tuple[MomentSolver, FloatArray]:
-    """Of the run's steps. What is stochastic for one agent is so for all of them, one after the other or at once."""
-    limit = _safe_step(step)
+    """Solver and steady moments of the run's steps."""
+    limit = _safe_step(step)  # stochastic weights stay so if agents step one after the other
     try:
         solver = MomentSolver(systems.emulated(run, problem))
         steady = solver.steady()
@@ -245,7 +233,7 @@ def _steady(step: StepModel, run: StepModel, problem: str) -> tuple[MomentSolver
 
 
 def _require_stability(solver: MomentSolver) -> None:
-    """Refuse unstable steps that the noise does not show, because it leaves alone what grows.
+    """Refuse unstable steps that the noise does not show, because it does not reach what grows.
 
     A positive solution of Y_i = I + K_i^*[sum_j P_ij Y_j] exists only where every second moment stays bounded.
     """
@@ -262,10 +250,10 @@ def _require_stability(solver: MomentSolver) -> None:
 
 
 def _safe_step(step: StepModel) -> float:
-    """Largest dt below which no agent overshoots what it hears: W is stochastic then, and stable with any delay."""
+    """The dt below which no agent overshoots what it hears: W is stochastic then, and stable with any delay."""
     own = np.diagonal(step.weights, axis1=1, axis2=2)
     if (step.weights < 0.0).sum() > (own < 0.0).sum():
-        return 0.0  # a protocol that subtracts what it hears: nothing is safe
+        return 0.0  # a protocol that subtracts what it hears: no dt is known to be safe
     heard = (step.weights.sum(axis=2) - own) / (1.0 - step.loss)  # without loss
     pull = (1.0 - step.weights.sum(axis=2)) + heard
     return float(step.dt / pull[:, ~step.grounded].max())
@@ -288,7 +276,7 @@ def _static(system: JumpSystem) -> Moments | None:
 
 
 def _holds_together(experiment: Experiment, mode: int) -> bool:
-    """Whether one graph held for ever bounds the errors: all hear one agent, or a leader, in some steps."""
+    """Whether one graph held fixed bounds the errors: one agent, or the reference, reaches all others."""
     graph = experiment.graph_list[mode]
     digraph: nx.DiGraph = nx.DiGraph()
     digraph.add_nodes_from(range(1, graph.agents + 1))

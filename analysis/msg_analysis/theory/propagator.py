@@ -1,13 +1,6 @@
-"""Linear equations that a Markov chain couples, over time: powers exact for any stiffness, no time steps.
+"""Linear equations that a Markov chain couples, over time, by powers of matrices: accurate for any stiffness.
 
-    continuous: d/dt z_i = A_i z_i + sum_j Gamma_ji z_j           discrete: z_i(k+1) = sum_j P_ji A_j z_j(k)
-
-Two things keep slow motion accurate beside rates that are many orders faster. The modes are rotated to their sum and
-what each is away from its share of it: the chain moves nothing between modes in the sum, and drops out of it exactly.
-And powers are kept as what they change, E in z -> z + E z, as long as little of z dies out: then 2 E + E^2 is the
-square of it, and small changes are not lost beside 1.
-
-docs/theory.md, "Transients", has what comes of it.
+See docs/theory.md, "Transients".
 """
 
 from __future__ import annotations
@@ -21,27 +14,16 @@ import numpy as np
 from msg_analysis.model.chain import Time
 from msg_analysis.types import FloatArray
 
-_KEPT = 8
-"""Powers of recent time differences that are kept: a uniform grid needs one, or two that differ by rounding."""
-
-_DEGREE = 13
-"""Of the Taylor polynomial; with norm at most 1/4 the rest is below 1e-17 of it."""
+_KEPT = 8  # powers of recent time differences that are kept: a uniform grid needs one, or two that differ by rounding
+_DEGREE = 13  # of the Taylor polynomial; with norm at most 1/4 the rest is below 1e-17 of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Power:
-    """The map over some time.
+    """The map over some time; powers of one flow commute."""
 
-    Attributes
-    ----------
-    matrix
-        (k, k) E or P
-    change
-        whether the map is z + E z; otherwise P z, which is better once nearly everything has died out
-    """
-
-    matrix: FloatArray
-    change: bool = True
+    matrix: FloatArray  # (N, N)
+    change: bool = True  # z + matrix @ z; otherwise matrix @ z, which is better once nearly everything has died out
 
     def __call__(self, z: FloatArray) -> FloatArray:
         """The map of (N,) or (N, q)."""
@@ -49,13 +31,7 @@ class Power:
         return np.asarray(z + moved if self.change else moved)
 
     def then(self, other: Power) -> Power:
-        """Both maps, one after the other (they commute).
-
-        Parameters
-        ----------
-        other
-            of the same flow
-        """
+        """Both maps, one after the other."""
         if self.change and other.change:
             change = self.matrix + other.matrix + other.matrix @ self.matrix
             whole = change + np.eye(len(change))
@@ -64,14 +40,10 @@ class Power:
 
 
 class Flow:
-    """Powers of one matrix, in coordinates of its own.
+    """Powers of one matrix A (N, N): y(t) = exp(A t) y(0), or y(k) = (1 + A)^k y(0) in discrete time.
 
-    Parameters
-    ----------
-    time
-        "continuous": y(t) = exp(A t) y(0), "discrete": y(k) = (1 + A)^k y(0)
-    matrix
-        (N, N) A
+    Powers are kept as what they change, E in z -> z + E z, as long as little of z dies out: the square is then 2 E +
+    E^2, and small changes are not lost beside 1. Times are in units of time, or in steps.
     """
 
     def __init__(self, time: Time, matrix: FloatArray) -> None:
@@ -87,7 +59,7 @@ class Flow:
 
     @property
     def slowest(self) -> float:
-        """Rate at which what dies out last does so, like exp(-rate t): 0 if something stays."""
+        """Rate at which the slowest part dies out, like exp(-rate t): 0 if something stays."""
         return self._slowest(self._matrix)
 
     def _slowest(self, matrix: FloatArray) -> float:
@@ -99,43 +71,15 @@ class Flow:
         return -0.5 * math.log1p(growth) if growth > -1.0 else math.inf
 
     def rotated(self, z: FloatArray) -> FloatArray:
-        """Coordinates in which the powers work.
-
-        Parameters
-        ----------
-        z
-            as the flow has them, such as (n, p + 1)
-
-        Returns
-        -------
-        FloatArray
-            of the shape that the powers work on
-        """
+        """The coordinates y of z, in which the powers work."""
         return z
 
     def restored(self, y: FloatArray) -> FloatArray:
-        """What has these coordinates.
-
-        Parameters
-        ----------
-        y
-            of the shape that ``rotated`` gives
-
-        Returns
-        -------
-        FloatArray
-            of the shape of z
-        """
+        """The z that has the coordinates y."""
         return y
 
     def over(self, duration: float) -> Power:
-        """The map from z(0) to z(duration).
-
-        Parameters
-        ----------
-        duration
-            [units of time, or steps]
-        """
+        """The map from z(0) to z(duration)."""
         if self._time == "discrete":
             result, left = Power(np.zeros_like(self._matrix)), round(duration)
             for power in self.doublings():
@@ -156,27 +100,14 @@ class Flow:
         return power
 
     def doublings(self) -> Iterator[Power]:
-        """The maps over 1, 2, 4, ... ticks, for ever; each costs one product."""
+        """The maps over 1, 2, 4, ... ticks, without end; each costs one product."""
         power = Power(self._matrix) if self._time == "discrete" else self.over(self.tick)
         while True:
             yield power
             power = power.then(power)
 
     def grid(self, start: FloatArray, times: FloatArray) -> FloatArray:
-        """(T, ...) at ascending times, from z(0) = start.
-
-        Parameters
-        ----------
-        start
-            z(0), of the shape that the flow moves, such as (n, p + 1)
-        times
-            (T,) ascending [units of time, or steps]
-
-        Returns
-        -------
-        FloatArray
-            (T, n, p + 1) where z is (n, p + 1)
-        """
+        """(T, ...) z at ascending times (T,), from z(0) = start."""
         # Differences of a uniform grid differ in their last bits; they share one power.
         unit = 16.0 * np.finfo(float).eps * float(times[-1]) or 1.0
         y, now = self.rotated(start), 0.0
@@ -195,18 +126,15 @@ class Flow:
 
 
 class Propagator(Flow):
-    """The equations of the module.
+    """The equations of n modes z_i, as stacks (n, q); they are those of Propositions 1 and 6 of the paper.
 
-    Parameters
-    ----------
-    time
-        "continuous" or "discrete"
-    chain
-        (n, n) Gamma or P
-    stationary
-        (n,) pi
-    local
-        (n, q, q) A_i, less the identity in discrete time
+        continuous: d/dt z_i = A_i z_i + sum_j Gamma_ji z_j           discrete: z_i(k+1) = sum_j P_ji A_j z_j(k)
+
+    ``chain``: (n, n) Gamma or P; ``stationary``: (n,) pi; ``local``: (n, q, q) A_i, less the identity in discrete time.
+
+    The modes are rotated to their sum and the deviation of each from its share of the sum. The chain moves nothing in
+    the sum and drops out of it exactly: so slow motion stays accurate beside rates that are many orders of magnitude
+    faster.
     """
 
     def __init__(self, time: Time, chain: FloatArray, stationary: FloatArray, local: FloatArray) -> None:
@@ -229,7 +157,7 @@ class Propagator(Flow):
 
     @property
     def slowest_jump(self) -> float:
-        """``slowest`` of the law of the graph: how fast it forgets where it started. More than one mode."""
+        """``slowest`` of the law of the graph: how fast it forgets its start. More than one mode."""
         return self._slowest(self._jumps)
 
     def rotated(self, z: FloatArray) -> FloatArray:

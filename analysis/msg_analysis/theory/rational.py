@@ -1,8 +1,8 @@
 """Transients of large systems in continuous time: a rational Krylov subspace for c(t) and pi(t) together.
 
 A few dozen solves of shifted equations, (sigma + M) X = R, span a space in which exp(A t) z(0) is accurate for all
-times at once; shifts from the slowest to the fastest rate see to it that stiffness costs nothing. (Ruhe 1984;
-Guettel 2013.) A shifted system is the system with Z_i + sigma / 2: the solver of the steady state does the work.
+times at once; shifts from the slowest to the fastest rate cover stiff systems (Ruhe 1984; Guettel 2013). A shifted
+system is the system with Z_i + sigma / 2, which the solver of the steady state solves.
 """
 
 from __future__ import annotations
@@ -20,34 +20,18 @@ from msg_analysis.theory.propagator import Flow
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
 
-TOLERANCE = 1e-10
-"""Change of the result, relative to the start, at which the space is large enough if it stays below it."""
-
+TOLERANCE = 1e-10  # change of the course between two checks, relative to the start, below which the space suffices
 MAX_BASIS = 100
 CHECK_EVERY = 5
 MAX_BYTES = 2e9
 
 
 class RationalFlow(Flow):
-    """What happens to one start, reduced to a small matrix.
+    """The course of one start, reduced to a small matrix; InputError where it is too large, too stiff or not stable.
 
-    Errors are about 1e-13 of the start, and estimated to be below 1e-10 or refused.
-
-    Parameters
-    ----------
-    system
-        continuous time
-    start
-        (n, p + 1) packed second moments and probability of every mode, or their distance from the steady state
-    slow
-        slowest rate, or 1 / longest time, of interest
-    decays
-        whether the start is a distance from the steady state, of which nothing stays
-
-    Raises
-    ------
-    InputError
-        too large, or the space does not become accurate
+    ``start``: (n, p + 1) packed second moments and probability of every mode, or (``decays``) their distance from the
+    steady state, which dies out entirely. ``slow``: slowest rate of interest, or 1 / longest time [1 / unit of time].
+    The space grows until two checks in a row change the course by at most ``TOLERANCE`` of the start.
     """
 
     def __init__(self, system: JumpSystem, start: FloatArray, slow: float, *, decays: bool) -> None:
@@ -60,8 +44,8 @@ class RationalFlow(Flow):
         self._system, self._decays = system, decays
         # Weighted with 1 / pi the equations are self-adjoint where the network is reversible and undirected.
         self._root = np.sqrt(system.stationary)
-        # A distance has no probability in it. Rounding must not put any there, for it would stay: so the law of the
-        # graph is represented on vectors that have none.
+        # A distance has total probability zero. Rounding must not add any, which would never die out: so the law of
+        # the graph is represented by vectors of total zero.
         self._laws = scipy.linalg.null_space(self._root[None]) if decays else np.eye(system.modes)
         size, part = np.linalg.norm(start[:, :-1] / self._root[:, None]), np.abs(start[:, -1]).max()
         self._law_weight = 10.0 * float(size / part) if size > 0.0 and part > 0.0 else 1.0
@@ -71,7 +55,7 @@ class RationalFlow(Flow):
             self._build(self._joined(symmetric.unpack(start[:, :-1], system.dimension), start[:, -1]), slow)
 
     def rotated(self, z: FloatArray) -> FloatArray:
-        """(k,) of the start, the only one that is represented."""
+        """(k,) of the start, the only z that is represented."""
         return np.asarray(self._basis @ self._joined(symmetric.unpack(z[:, :-1], self._system.dimension), z[:, -1]))
 
     def restored(self, y: FloatArray) -> FloatArray:
@@ -80,7 +64,7 @@ class RationalFlow(Flow):
         return np.concatenate([packed, law[:, None]], axis=1)
 
     def _build(self, start: FloatArray, slow: float) -> None:
-        """Grow the space until what it says does not change."""
+        """Extend the space until the course does not change any more."""
         system = self._system
         fast = 2.0 * float(np.linalg.norm(system.matrices, 2, axis=(1, 2)).max()) + float(
             -system.chain.diagonal().min()
@@ -107,7 +91,7 @@ class RationalFlow(Flow):
                     v = v - np.vdot(u, v) * u
             size = np.linalg.norm(v)
             if not size > 1e-11 * whole:
-                break  # nothing new: the space is invariant
+                break  # the space is invariant
             basis.append(v / size)
             images.append(self._apply(basis[-1]))
         else:
@@ -116,7 +100,7 @@ class RationalFlow(Flow):
                 f"{slow:.1e} to {fast:.1e}): take the steps' law (emulated), or fewer agents"
             )
         self._basis, self._matrix = np.array(basis), matrix
-        # Ritz values of undirected networks cannot be on the wrong side; of directed ones nothing is known beforehand.
+        # Ritz values of undirected networks are always stable; those of directed ones need not be.
         if (self.slowest <= 0.0) if self._decays else (self.slowest < -0.01 * slow):
             raise InputError(
                 "transient: the reduced equations of this large directed network are unstable, though the network is "
@@ -175,14 +159,9 @@ def _course(matrix: FloatArray, first: float, last: float) -> FloatArray:
 
 
 def slowest_rate(system: JumpSystem, steady: FloatArray) -> float:
-    """Rate of the slowest part of second moments and graph, roughly: inverse iteration from the steady state.
+    """Rate of the slowest part of second moments and graph [1 / unit of time]: an estimate by four inverse iterations.
 
-    Parameters
-    ----------
-    system
-        in continuous time
-    steady
-        (n, d, d) steady second moments
+    They start from the steady second moments (n, d, d). Continuous time.
     """
     moments, rate = steady, math.inf
     for _ in range(4):
@@ -197,7 +176,7 @@ def slowest_rate(system: JumpSystem, steady: FloatArray) -> float:
 
 
 def _van_der_corput(index: int) -> float:
-    """Numbers that fill (0, 1) evenly, however many are taken: bits reversed behind the point."""
+    """Numbers that fill (0, 1) evenly, however many are taken: the bits of the index, reversed behind the point."""
     value, weight = 0.0, 0.5
     while index:
         value += weight * (index & 1)

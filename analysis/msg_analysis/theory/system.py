@@ -1,6 +1,6 @@
-"""Reduced Markov jump linear systems: the states in which second moments stay finite.
+"""Reduced Markov jump linear systems: the coordinates in which second moments stay finite.
 
-The paper's sections III (consensus) and IV (tracking), and its appendix in discrete time; for the steps of a run,
+Sections 3.1 (consensus) and 3.2 (tracking) of the paper, its Appendix I in discrete time; for the steps of a run,
 docs/theory.md.
 """
 
@@ -27,37 +27,18 @@ class JumpSystem:
     s are the states x of the m agents. With values that are D steps old, it is x(k), x(k - 1), ..., x(k - D) stacked,
     m (D + 1) numbers, and x - (what x should be) = output @ y.
 
-    Discrete: y(k+1) = W_g(k) y(k) + noise, then g jumps with P. Continuous: dy = -Z_g y dt + F dW, g jumps
-    with Gamma.
-
-    Attributes
-    ----------
-    time
-        "continuous" or "discrete"
-    matrices
-        (n, d, d) Z_i [1 / unit of time] or W_i
-    noise
-        (n, d, d) covariance of the noise, per unit of time or per step
-    chain
-        (n, n) Gamma or P
-    stationary
-        (n,) pi
-    lift
-        (k, d) for k numbers s, columns orthonormal, so that y = lift^T (s - what s should be)
-    loss_variance
-        (n, len(s), len(s)) or None; see ``StepModel.loss_variance``. Discrete time only
-    readout
-        (m, d) with a delay; None without, where ``lift`` is what it would be
+    Discrete: y(k+1) = W_g(k) y(k) + noise, then g jumps with P (eq. 19 of the paper). Continuous: dy = -Z_g y dt + F
+    dW, g jumps with Gamma (eq. 4).
     """
 
     time: Time
-    matrices: FloatArray
-    noise: FloatArray
-    chain: FloatArray
-    stationary: FloatArray
-    lift: FloatArray
-    loss_variance: FloatArray | None = None
-    readout: FloatArray | None = None
+    matrices: FloatArray  # (n, d, d) Z_i [1 / unit of time] or W_i
+    noise: FloatArray  # (n, d, d) covariance of the noise, Q_i per unit of time or N_i per step
+    chain: FloatArray  # (n, n) Gamma or P
+    stationary: FloatArray  # (n,) pi
+    lift: FloatArray  # (k, d) for k numbers s, columns orthonormal, so that y = lift^T (s - what s should be)
+    loss_variance: FloatArray | None = None  # (n, k, k), see ``StepModel.loss_variance``; discrete time only
+    readout: FloatArray | None = None  # (m, d) with a delay; None without, where ``lift`` has this role
 
     @property
     def modes(self) -> int:
@@ -71,50 +52,23 @@ class JumpSystem:
 
     @property
     def output(self) -> FloatArray:
-        """(m, d): what the agents are off is output @ y."""
+        """(m, d): output @ y is the deviation of the agents from what they should be."""
         return self.lift if self.readout is None else self.readout
 
     def lifted(self, moments: FloatArray) -> FloatArray:
-        """(..., m, m) of (..., d, d): second moments of the agents from those of the reduced coordinates.
-
-        Parameters
-        ----------
-        moments
-            (..., d, d) of y y^T
-
-        Returns
-        -------
-        FloatArray
-            (..., m, m)
-        """
+        """(..., m, m) second moments of the agents from those of the reduced coordinates, (..., d, d)."""
         return np.asarray(self.output @ moments @ self.output.T)
 
     def reduced(self, deviations: FloatArray) -> FloatArray:
-        """(..., d) of (..., m): reduced coordinates of deviations; in consensus, of the states.
+        """(..., d) reduced coordinates of the deviations of the agents (..., m); in consensus, of their states.
 
         With a delay, the earlier states are taken to be the same.
-
-        Parameters
-        ----------
-        deviations
-            (..., m) of the agents from what they should be
-
-        Returns
-        -------
-        FloatArray
-            (..., d)
         """
         lift = self.lift.reshape(-1, deviations.shape[-1], self.dimension).sum(axis=0)
         return np.asarray(deviations @ lift)
 
     def propagate(self, moments: FloatArray) -> FloatArray:
-        """(n, d, d): K_j[C_j] = E[W C_j W^T | mode j] for every mode. Discrete time.
-
-        Parameters
-        ----------
-        moments
-            (n, d, d) C_j
-        """
+        """(n, d, d): K_j[C_j] = E[W C_j W^T | mode j] for every mode. Discrete time."""
         after = self.matrices @ moments @ self.matrices.transpose(0, 2, 1)
         if self.loss_variance is not None:
             full = self.lift @ moments @ self.lift.T
@@ -125,43 +79,23 @@ class JumpSystem:
         return np.asarray(after)
 
     def advance(self, moments: FloatArray, law: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """One step of the second moments and of the law of the graph. Discrete time.
+        """Moments C_i (n, d, d) and law (n,) of the graph one step later (Proposition 6 of the paper). Discrete time.
 
-        C_i(k+1) = sum_j P_ji (K_j[C_j(k)] + pi_j(k) N_j); note that the noise enters before the jump.
-
-        Parameters
-        ----------
-        moments
-            (n, d, d) C_i(k) = E[y y^T; mode i]
-        law
-            (n,) of g(k)
-
-        Returns
-        -------
-        tuple[FloatArray, FloatArray]
-            moments (n, d, d) and law (n,) one step later
+        C_i(k+1) = sum_j P_ji (K_j[C_j(k)] + pi_j(k) N_j): the noise enters before the jump.
         """
         after = self.propagate(moments) + law[:, None, None] * self.noise
         return np.tensordot(self.chain, after, axes=(0, 0)), law @ self.chain
 
 
 def emulated(step: StepModel, problem: str) -> JumpSystem:
-    """What the steps of a run do, exactly.
+    """What the steps of a run do, exactly (docs/theory.md, "What the network does" and "Beyond the paper").
 
-    Consensus: the disagreement, in a Helmert basis of the vectors whose entries sum to zero. Exact for every
-    W with W 1 = 1. Tracking: the deviation from the reference, all agents (a start may put grounded leaders
-    elsewhere).
+    "consensus": the disagreement, in a Helmert basis of the vectors whose entries sum to zero; exact for every W with
+    W 1 = 1. "tracking": the deviation from the reference, all agents (a start may put grounded leaders elsewhere).
 
-    With a delay the stacked states make the same kind of step, and W 1 = 1 holds for them. What drops out is one
-    number common to all of them; not one for each x(k - s): the agents' mean moves, and agents of unequal degree
-    feel how far, because they compare their own new values with old ones of others.
-
-    Parameters
-    ----------
-    step
-        the compiled experiment
-    problem
-        "consensus" or "tracking"
+    With a delay the stacked states make the same kind of step, and W 1 = 1 holds for them. What drops out is one number
+    common to all of them, not one for each x(k - s): the agents' mean moves, and this acts on agents of unequal degree,
+    because they compare their own new values with old ones of others.
     """
     m, delay = step.agents, step.delay
     size = m * (delay + 1)
@@ -191,15 +125,9 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
 
 
 def continuous(experiment: Experiment) -> JumpSystem:
-    """The paper's continuous-time system (sections III and IV).
+    """The paper's continuous-time system (Sections 3.1 and 3.2), without noise on the air, loss, delay or protocol.
 
-    Leaders of infinite gain are the exact limit: their rows and columns are deleted, ``lift`` puts the zeros
-    back. Noise on the air, lost and late messages belong to steps; they have no place here.
-
-    Parameters
-    ----------
-    experiment
-        in continuous time, without protocol, loss, delay or noise on the air
+    Leaders of infinite gain are the exact limit: their rows and columns are deleted, ``lift`` puts the zeros back.
     """
     gains = experiment.leader_gains
     follows = np.isfinite(gains)
@@ -218,15 +146,7 @@ def continuous(experiment: Experiment) -> JumpSystem:
 
 
 def held(system: JumpSystem, mode: int) -> JumpSystem:
-    """The same system with one graph held for ever.
-
-    Parameters
-    ----------
-    system
-        continuous or discrete
-    mode
-        graph, from 0
-    """
+    """The same system, in continuous or discrete time, with one graph (``mode``, from 0) held fixed."""
     return JumpSystem(
         time=system.time,
         matrices=system.matrices[mode : mode + 1],

@@ -1,11 +1,6 @@
 """Transients: the law of the graph, means and second moments of every mode over time, from any start.
 
-    continuous: d/dt nu = -N nu,   d/dt c = -M c + pi(t) (x) Q,       d/dt pi = Gamma^T pi
-    discrete:   nu(k+1) = H nu(k), C_i(k+1) = sum_j P_ji (K_j[C_j] + pi_j(k) N_j),   pi(k+1) = P^T pi(k)
-
-Where there is a steady state, the distance to it is what moves: so it is reached exactly, however long the time.
-
-Proposition 1 of the paper for the means, and its discrete twin; docs/theory.md, "Transients", has the rest.
+Propositions 1 and 6 of the paper; docs/theory.md, "Transients", says how they are computed.
 """
 
 from __future__ import annotations
@@ -27,33 +22,18 @@ from msg_analysis.types import FloatArray
 if TYPE_CHECKING:
     from msg_analysis.model.experiment import Experiment
 
-MAX_UNKNOWNS = 300
-"""Largest n p + n, with p = d (d + 1) / 2, whose matrix is propagated as a whole."""
-
-MAX_BYTES = 2e9
-"""Largest result."""
-
-MAX_STEPS = 10_000_000
-"""Most steps that are made one after the other (discrete time, beyond MAX_UNKNOWNS)."""
+MAX_UNKNOWNS = 300  # largest n p + n, with p = d (d + 1) / 2, whose matrix is propagated as a whole
+MAX_BYTES = 2e9  # largest result
+MAX_STEPS = 10_000_000  # most single steps (discrete time, beyond MAX_UNKNOWNS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """What the paper calls pi, nu and c at one time, in reduced coordinates.
+    """The paper's pi, nu and c at one time, in reduced coordinates."""
 
-    Attributes
-    ----------
-    law
-        (n,) pi_i = P(g = i)
-    means
-        (n, d) E[y; mode i]
-    moments
-        (n, d, d) C_i = E[y y^T; mode i]
-    """
-
-    law: FloatArray
-    means: FloatArray
-    moments: FloatArray
+    law: FloatArray  # (n,) pi_i = P(g = i)
+    means: FloatArray  # (n, d) E[y; mode i]
+    moments: FloatArray  # (n, d, d) C_i = E[y y^T; mode i]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -63,7 +43,7 @@ class Transient:
     Attributes
     ----------
     system
-        whose they are
+        whose moments they are
     times
         (T,) ascending; units of time, or numbers of steps
     laws
@@ -115,14 +95,7 @@ class Transient:
 def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | None = None) -> Snapshot:
     """Agents at a known place, independent of the graph.
 
-    Parameters
-    ----------
-    system
-        reduced or not
-    deviation
-        (m,) x(0) - (what x should be); in consensus, x(0)
-    law
-        (n,) of g(0); by default the stationary law
+    ``deviation``: (m,) x(0) - (what x should be), in consensus x(0); ``law``: (n,) of g(0), by default stationary.
     """
     law = system.stationary if law is None else law
     y = system.reduced(deviation)
@@ -130,16 +103,9 @@ def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | Non
 
 
 def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
-    """The start that the experiment's ``run.start`` and ``switching.initial`` say.
+    """The start that ``run.start`` and ``switching.initial`` define, for one of the experiment's laws.
 
-    Parameters
-    ----------
-    experiment
-        whose start
-    system
-        one of its laws
-    stationary
-        (n, d, d) second moments for ``run.start: stationary``
+    ``stationary``: (n, d, d) second moments for ``run.start: stationary``.
     """
     law = system.stationary
     if experiment.switching.initial != "stationary":
@@ -153,14 +119,9 @@ def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray)
 
 
 def unreduced_consensus(experiment: Experiment) -> JumpSystem:
-    """Consensus in continuous time with the agents' mean in it: its second moments grow without bound.
+    """Consensus in continuous time with the mean of the agents included: its second moments grow without bound.
 
-    The twin for the steps of a run is ``systems.emulated(step, "tracking")``, which reduces nothing.
-
-    Parameters
-    ----------
-    experiment
-        consensus in continuous time
+    Proposition 1 of the paper with Z_i = L_i. In steps, ``systems.emulated(step, "tracking")`` reduces nothing either.
     """
     gain = experiment.noise_gain
     drift = np.stack([graph.laplacian for graph in experiment.graph_list])
@@ -175,7 +136,12 @@ def unreduced_consensus(experiment: Experiment) -> JumpSystem:
 
 
 def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None = None) -> Transient:
-    """Exact moments at the given times.
+    """Exact moments at the given times (Propositions 1 and 6 of the paper).
+
+        continuous: d/dt nu = -N nu,   d/dt c = -M c + pi(t) (x) Q,       d/dt pi = Gamma^T pi
+        discrete:   nu(k+1) = H nu(k), C_i(k+1) = sum_j P_ji (K_j[C_j] + pi_j(k) N_j),   pi(k+1) = P^T pi(k)
+
+    With a steady state the distance to it is propagated, so that it is reached exactly, however long the time.
 
     Parameters
     ----------
@@ -184,7 +150,7 @@ def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Fl
     start
         at time 0
     times
-        (T,) >= 0, ascending; whole numbers of steps in discrete time
+        (T,) >= 0, ascending; units of time, or whole numbers of steps
     steady
         (n, d, d) of ``MomentSolver(system).steady()``; None where there is no steady state
 
@@ -201,29 +167,15 @@ def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Fl
 
 
 def unknowns(system: JumpSystem) -> int:
-    """Size n p + n of the joint equations of second moments and graph law.
-
-    Parameters
-    ----------
-    system
-        reduced or not
-    """
+    """Size n p + n of the joint equations of second moments and graph law."""
     return system.modes * (symmetric.size(system.dimension) + 1)
 
 
 def joint_flow(system: JumpSystem, stack: FloatArray, slow: Callable[[], float], *, decays: bool) -> Flow:
-    """How the joint equations move: as a whole where they are small, otherwise reduced for this start.
+    """The flow of the joint equations for one ``joint_stack`` (n, p + 1): reduced for it where they are large.
 
-    Parameters
-    ----------
-    system
-        small, or in continuous time
-    stack
-        (n, p + 1) of ``joint_stack``
-    slow
-        gives the slowest rate of interest
-    decays
-        whether the stack is a distance from the steady state
+    ``slow`` gives the slowest rate of interest [1 / unit of time]; ``decays``: the stack is a distance from the steady
+    state.
     """
     if unknowns(system) <= MAX_UNKNOWNS:
         return second_moment_propagator(system)
@@ -262,48 +214,24 @@ def _powered(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Flo
 
 
 def distance(system: JumpSystem, snapshot: Snapshot, steady: FloatArray) -> Snapshot:
-    """What is left to the steady state, which moves by the same equations.
-
-    Parameters
-    ----------
-    system
-        that has a steady state
-    snapshot
-        at some time
-    steady
-        (n, d, d) steady second moments
-    """
+    """The distance of the snapshot from the steady state, which obeys the same equations."""
     return Snapshot(snapshot.law - system.stationary, snapshot.means, snapshot.moments - steady)
 
 
 def joint_stack(snapshot: Snapshot) -> FloatArray:
-    """(n, p + 1) packed second moments and probability of every mode.
-
-    Parameters
-    ----------
-    snapshot
-        at some time
-    """
+    """(n, p + 1) packed second moments and probability of every mode."""
     return np.concatenate([symmetric.pack(snapshot.moments), snapshot.law[:, None]], axis=1)
 
 
 def advance(system: JumpSystem, snapshot: Snapshot) -> Snapshot:
-    """One step. Discrete time; right for the distance to the steady state too.
-
-    Parameters
-    ----------
-    system
-        in discrete time
-    snapshot
-        before the step
-    """
+    """One step, of a snapshot or of its distance from the steady state. Discrete time."""
     moments, law = system.advance(snapshot.moments, snapshot.law)
     moved = np.einsum("nab,nb->na", system.matrices, snapshot.means)
     return Snapshot(law, system.chain.T @ moved, moments)
 
 
 def _stepped(system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None) -> Transient:
-    """The same by single steps, which need no matrix of the whole. Discrete time."""
+    """By single steps, which need no matrix of the whole. Discrete time."""
     n, d = system.modes, system.dimension
     now = start if steady is None else distance(system, start, steady)
     laws, means, moments = np.zeros((len(times), n)), np.zeros((len(times), n, d)), np.zeros((len(times), n, d, d))

@@ -1,15 +1,6 @@
 """Two graphs: the error as the static baseline minus what switching gains, in closed form.
 
-With u_i = C_i / pi_i the equations of two modes reduce to one for the difference u_2 - u_1. Packed symmetric
-matrices, S_i the operator C -> Z_i C + C Z_i^T, s_i = S_i^-1 Q_i the moments of graph i held for ever:
-
-    E = E_static - pi_1 pi_2 h (S_2^-1 - S_1^-1) (I / beta + Omega)^-1 (s_2 - s_1)
-    Omega = pi_2 S_1^-1 + pi_1 S_2^-1,    beta = q_12 + q_21
-
-It is the paper's proposition for two topologies, whose alpha (I + beta Omega)^-1 is pi_1 pi_2 (I / beta +
-Omega)^-1 without the overflow: right for every beta > 0, and its limits are plain to see. In discrete time, with
-S_i: C -> C - K_i[C] and beta = P_12 + P_21, the same derivation gives the same formula with Omega - I in place of
-Omega. The differences come from S_2 - S_1, without cancellation.
+Propositions 4 and 5 of the paper, and its remark on discrete time; docs/theory.md, "Two graphs in closed form".
 """
 
 from __future__ import annotations
@@ -27,30 +18,18 @@ from msg_analysis.theory.operators import mode_operators
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
 
-MAX_UNKNOWNS = 2000
-"""Largest p = d (d + 1) / 2 for which the p x p matrices are built: about 60 agents."""
+MAX_UNKNOWNS = 2000  # largest p = d (d + 1) / 2 for which the p x p matrices are built: about 60 agents
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoTopology:
-    """Error = static baseline + switching term, for every agent and for all of them.
+    """Error = static baseline + switching term, for every agent and for all of them."""
 
-    Attributes
-    ----------
-    rate
-        beta = q_12 + q_21 [1 / unit of time], or P_12 + P_21
-    static
-        (m,) pi-weighted mean of the node errors of the two graphs held for ever
-    switching
-        (m,) what switching adds to them; negative where it helps
-    fast
-        (m,) limit of ``switching`` for beta to infinity (continuous time), or its value at beta = 1, where the graphs
-        of successive steps are independent (discrete time)
-    """
-
-    rate: float
-    static: FloatArray
-    switching: FloatArray
+    rate: float  # beta = q_12 + q_21 [1 / unit of time], or P_12 + P_21
+    static: FloatArray  # (m,) pi-weighted mean of the node errors of the two graphs held fixed
+    switching: FloatArray  # (m,) what switching adds to them; negative where it helps
+    # (m,) limit of ``switching`` for beta to infinity (continuous time), or its value at beta = 1, where the graphs of
+    # successive steps are independent (discrete time).
     fast: FloatArray
 
     @property
@@ -76,6 +55,17 @@ class TwoTopology:
 def two_topology(system: JumpSystem) -> TwoTopology:
     """Closed form of the steady node errors under two graphs, each of which has a steady error of its own.
 
+    With packed symmetric matrices, S_i the operator C -> Z_i C + C Z_i^T, s_i = S_i^-1 Q_i the moments of graph i held
+    fixed, and h the packed quadratic form of the error (trace, or one diagonal entry):
+
+        E = E_static - pi_1 pi_2 h (S_2^-1 - S_1^-1) (I / beta + Omega)^-1 (s_2 - s_1)
+        Omega = pi_2 S_1^-1 + pi_1 S_2^-1,    beta = q_12 + q_21
+
+    These are Propositions 4 and 5 of the paper, with pi_1 pi_2 (I / beta + Omega)^-1 for alpha (I + beta Omega)^-1,
+    which is the same without overflow, and right for every beta > 0. In discrete time, with S_i: C -> C - K_i[C] and
+    beta = P_12 + P_21, Omega - I takes the place of Omega. The differences are computed from S_2 - S_1, without
+    cancellation.
+
     Parameters
     ----------
     system
@@ -84,7 +74,7 @@ def two_topology(system: JumpSystem) -> TwoTopology:
     Raises
     ------
     InputError
-        not two graphs, too many agents, or a graph that cannot be held for ever
+        not two graphs, too many agents, or a graph without a steady error of its own
     """
     if system.modes != 2:
         raise InputError(f"two-topology form: {system.modes} graphs, expected 2: use predict")
