@@ -1,4 +1,4 @@
-"""What happened on the air against what should have: the logged losses, and the noise in what was published."""
+"""Tests of the logged message losses, and of the noise added to published values."""
 
 from __future__ import annotations
 
@@ -13,74 +13,40 @@ from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.reception import mode_links
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
-MIN_EXPECTED = 25.0
-"""Fewest losses, and messages that come, to be expected of what is tested by a chi-square law."""
+MIN_EXPECTED = 25.0  # smallest expected count for which a chi-square law is used
 
 
 @dataclass(frozen=True, slots=True)
 class LossTest:
-    """The logged losses against independent ones of a probability.
+    """The logged losses against independent losses of equal probability."""
 
-    Attributes
-    ----------
-    lost
-        messages
-    expected
-        number of messages times the probability
-    p
-        None where there was no message
-    """
-
-    lost: int
-    expected: float
-    p: float | None
+    lost: int  # messages
+    expected: float  # number of messages times the probability
+    p: float | None  # None where there was no message
 
 
 def loss_test(observation: Observation | Measurement) -> LossTest | None:
-    """Test that every message is lost with the same probability, whatever happens to others; None without loss.
+    """Test that messages are lost independently, all with the same probability; None without (logged) loss.
 
-    Given the graphs, the losses of each link are binomial, exactly. Added to the chi-squares of the links come those of
-    the products of (lost - p) of successive messages of one link, and of pairs of messages in one step. What is too
-    rare for a chi-square law is left out, links too rare for it are taken together; where these are too rare as
-    well, their number is held against the binomial law itself.
-
-    Parameters
-    ----------
-    observation
-        of a run with ``noise.loss``, or without
+    Given the graphs, the losses of each link are exactly binomial. The statistic adds one chi-square per link and two
+    for the products of (lost - p): of messages of one link in successive steps, and of pairs of messages in one step.
+    Links with too few messages for a chi-square law are pooled and tested by the exact binomial law; products that are
+    too rare are left out.
     """
     tally = LossTally.of(observation)
     return tally.test() if tally else None
 
 
 class LossTally:
-    """Sums over the messages of a run; xi = lost - p.
-
-    Parameters
-    ----------
-    observation
-        of a run with ``noise.loss``
-
-    Attributes
-    ----------
-    probability
-        p
-    pairs
-        (links, 2) receiver and sender of every link that is in any graph
-    messages, lost
-        (links,) messages of each, and how many of them were lost
-    successive, successive_pairs
-        sum of xi xi' of successive messages of a link, and their number
-    same_step, same_step_pairs
-        sum of xi xi' of pairs of messages in one step, and their number
-    """
+    """Sums over the messages of a run with ``noise.loss``; xi = lost - p."""
 
     def __init__(self, observation: Observation | Measurement) -> None:
         step = observation.step
         self.probability = step.loss
-        self.pairs: IntArray = np.argwhere(step.listens())
+        self.pairs: IntArray = np.argwhere(step.listens())  # (links, 2) receiver and sender of links in any graph
         links = len(self.pairs)
         self.messages, self.lost = np.zeros(links, np.int64), np.zeros(links, np.int64)
+        # Sums of xi xi' over messages of a link in successive steps and over pairs in one step, and their numbers.
         self.successive = self.same_step = 0.0
         self.successive_pairs = self.same_step_pairs = 0
         numbers = np.cumsum(step.listens().ravel()).reshape(step.agents, step.agents) - 1
@@ -94,23 +60,11 @@ class LossTally:
 
     @classmethod
     def of(cls, observation: Observation | Measurement) -> LossTally | None:
-        """Of a run; None where no message can be lost, or none was logged.
-
-        Parameters
-        ----------
-        observation
-            of any run
-        """
+        """Tally of a run; None where no message can be lost, or no loss was logged."""
         return cls(observation) if observation.step.loss and observation.lost is not None else None
 
     def merge(self, other: LossTally) -> None:
-        """Take what another run of the same experiment adds up to.
-
-        Parameters
-        ----------
-        other
-            of another run, with another seed
-        """
+        """Add the tally of another run of the same experiment, with another seed."""
         self.messages += other.messages
         self.lost += other.lost
         self.successive, self.same_step = self.successive + other.successive, self.same_step + other.same_step
@@ -140,7 +94,7 @@ class LossTally:
     def _add(
         self, sent: BoolArray, xi: FloatArray, before: tuple[BoolArray, FloatArray]
     ) -> tuple[BoolArray, FloatArray]:
-        """Take a block of steps, and the last step before it; the last step of the block."""
+        """Add a block of steps, given the last step before it; returns the last step of the block."""
         self.messages += sent.sum(axis=0)
         self.lost += (sent & (xi > 0.0)).sum(axis=0)
         in_step = sent.sum(axis=1)
@@ -171,28 +125,15 @@ def _block(
 
 
 class BroadcastSums:
-    """What the noise in what was published adds up to, in units of what it should be.
-
-    Parameters
-    ----------
-    observation
-        of a run with ``noise.broadcast``
-
-    Attributes
-    ----------
-    scatter
-        (m, m) sum of the products of the agents' noise
-    samples
-        number of published values, replicas counted
-    """
+    """Sums over the noise in published values, in units of its nominal standard deviation."""
 
     def __init__(self, observation: Observation) -> None:
         assert observation.published is not None
         deviation = observation.prediction.experiment.noise.broadcast
         agents = observation.step.agents
-        self.scatter = np.zeros((agents, agents))
+        self.scatter = np.zeros((agents, agents))  # sum of the products of the agents' noise
         length = observation.steps + 1
-        self.samples = length * observation.replicas
+        self.samples = length * observation.replicas  # published values of each agent
         for first, last in [*observation.blocks(observation.states[0].size), (length - 1, length)]:
             noise = (observation.published[first:last] - observation.states[first:last]) / deviation
             flat = noise.transpose(1, 0, 2).reshape(agents, -1)
@@ -200,24 +141,12 @@ class BroadcastSums:
 
     @classmethod
     def of(cls, observation: Observation) -> BroadcastSums | None:
-        """Of a run; None without broadcast noise.
-
-        Parameters
-        ----------
-        observation
-            of any run
-        """
+        """Sums of a run; None without broadcast noise."""
         noisy = observation.prediction.experiment.noise.broadcast
         return cls(observation) if noisy and observation.published is not None else None
 
     def merge(self, other: BroadcastSums) -> None:
-        """Take what another run of the same experiment adds up to.
-
-        Parameters
-        ----------
-        other
-            of another run, with another seed
-        """
+        """Add the sums of another run of the same experiment, with another seed."""
         self.scatter += other.scatter
         self.samples += other.samples
 
@@ -228,12 +157,6 @@ class BroadcastSums:
 
 
 def broadcast_p(observation: Observation) -> float | None:
-    """p-value of what was published, less the states: N(0, s^2 I) of agents; None without broadcast noise.
-
-    Parameters
-    ----------
-    observation
-        of any run
-    """
+    """p-value of published - state being N(0, s^2 I), s = ``noise.broadcast``; None without broadcast noise."""
     sums = BroadcastSums.of(observation)
     return sums.p_value() if sums else None

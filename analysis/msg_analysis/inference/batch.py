@@ -1,4 +1,4 @@
-"""Batch means: the interval that believes no model."""
+"""Batch means: a confidence interval that assumes no model."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ BATCHES = 20
 
 
 def batch_interval(series: FloatArray, level: float = 0.95) -> tuple[float, float] | None:
-    """Interval for the mean of a correlated stationary series from its batch means (Student's t).
+    """95 % (by default) interval for the mean of a correlated stationary series, from 20 batch means and Student's t.
 
-    Covers too rarely when the graphs switch slowly compared with a batch; it stands beside the martingale
-    interval as a check that uses no model.
+    Its coverage is too low when the graphs switch slowly compared with a batch. It is reported beside the martingale
+    interval as a model-free check.
 
     Parameters
     ----------
@@ -26,12 +26,12 @@ def batch_interval(series: FloatArray, level: float = 0.95) -> tuple[float, floa
     Returns
     -------
     tuple[float, float] | None
-        (low, high), or None for a series shorter than two values a batch
+        (low, high), or None for a series shorter than two values per batch
     """
     length = len(series) // BATCHES
     if length < 2:
         return None
-    # The remainder is left out at the beginning, where a start may still be felt.
+    # The remainder is dropped at the beginning, where the start may still have an effect.
     means = series[len(series) - length * BATCHES :].reshape(BATCHES, length).mean(axis=1)
     half = stats.t.ppf(0.5 + level / 2, BATCHES - 1) * means.std(ddof=1) / np.sqrt(BATCHES)
     return float(means.mean() - half), float(means.mean() + half)

@@ -1,9 +1,9 @@
-"""Why a run disagrees: which single causes explain it, with estimates, in words.
+"""Diagnosis of a run that disagrees: single causes that explain it, with estimates, in words.
 
-Causes are looked for in groups: agents that stand still; gains, references and ignored messages (regression of the
-innovations); variances of the noise; rates of switching; losses; noise of what is published. Within a group they are
-selected forwards, each given the others; consequences that cross groups are taken out: agents that stand still are
-left out of the regression and of the noise, and what wrong gains add to the innovations is no noise.
+Causes are searched for in groups: frozen agents; gains, references and ignored messages (regression of the
+innovations); noise variances; switching rates; losses; broadcast noise. Within a group they are selected forwards, each
+given the others. Consequences across groups are removed: frozen agents are left out of the regression and of the noise,
+and the part of the innovations that wrong gains explain is not counted as noise.
 """
 
 from __future__ import annotations
@@ -38,47 +38,25 @@ Kind = Literal[
     "broadcast",
     "unknown",
 ]
-MAX_PAIRS = 1225
-"""Most pairs of agents whose noise is looked at for correlation: 50 agents."""
+MAX_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One thing that is wrong.
-
-    Attributes
-    ----------
-    kind
-        what it is about
-    words
-        a sentence
-    agent
-        number of the agent, from 1; None where it is not one
-    link
-        numbers of sender and receiver, or of both ends of an edge; None where it is not one link
-    graph
-        its name; of switching [from, to] or [from]; None where it is all of them
-    estimate, expected
-        what was measured and what the experiment says: a factor of a gain or of a variance (expected 1), a share, a
-        rate
-    interval
-        95 %, for this one cause
-    p
-        adjusted for all that could have been blamed; 0 where it is impossible otherwise
-    """
+    """One thing that is wrong."""
 
     kind: Kind
-    words: str
-    agent: int | None = None
-    link: tuple[int, int] | None = None
-    graph: str | list[str] | None = None
-    estimate: float | None = None
-    interval: tuple[float, float] | None = None
-    expected: float | None = None
-    p: float | None = None
+    words: str  # a sentence
+    agent: int | None = None  # from 1; None where the cause is not one agent
+    link: tuple[int, int] | None = None  # from 1: sender and receiver, or the two ends of an edge or of a correlation
+    graph: str | list[str] | None = None  # name; for switching [from, to] or [from]; None: all graphs
+    estimate: float | None = None  # measured: factor of a gain or variance, share, rate, correlation or value
+    interval: tuple[float, float] | None = None  # 95 %, for this cause alone
+    expected: float | None = None  # the same according to the experiment; 1 for a factor
+    p: float | None = None  # adjusted for all candidate causes; 0 where the law makes it impossible
 
     def to_json(self) -> dict[str, Any]:
-        """The document."""
+        """The JSON document."""
         return {
             "kind": self.kind,
             "words": self.words,
@@ -94,43 +72,23 @@ class Cause:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accused:
-    """What is known of runs that disagree.
+    """What is known of runs that disagree: the law, and sums over the runs."""
 
-    Attributes
-    ----------
-    names
-        of the graphs
-    chain, dt
-        of the graphs, and the time of a step
-    reference
-        of the leaders
-    innovations, transitions, loss, broadcast
-        sums over the runs; the latter None where there are none
-    loss_probability
-        what it should be
-    """
-
-    names: Sequence[str]
+    names: Sequence[str]  # of the graphs
     chain: MarkovChain
-    dt: float
+    dt: float  # simulated time of a step
     reference: float
     innovations: InnovationSums
     transitions: Transitions
-    loss: LossTally | None
-    broadcast: BroadcastSums | None
+    loss: LossTally | None  # None without loss
+    broadcast: BroadcastSums | None  # None without broadcast noise
 
 
 def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list[Cause]:
-    """Name what is wrong with runs that disagree, what is surest first.
+    """Find what is wrong with runs that disagree: frozen agents first, then by p-value; never empty.
 
-    Parameters
-    ----------
-    accused
-        the runs
-    level
-        chance of blaming anything where nothing is wrong
-    rejected
-        names of the tests that reject
+    ``level`` bounds the probability of finding a cause where nothing is wrong. Where nothing is found, one cause of
+    kind "unknown" names the ``rejected`` tests.
     """
     sums, names = accused.innovations, accused.names
     still = suspects.frozen(sums)
@@ -142,7 +100,7 @@ def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list
         losses = suspects.losses(tally.pairs, tally.messages, tally.lost, tally.probability)
     if accused.broadcast:
         broadcast = suspects.variances(np.diag(accused.broadcast.scatter), accused.broadcast.samples)
-    # All classes are counted before anything is selected: 3 of the rates, 1 of the pairs.
+    # All classes count before anything is selected: also the 3 of the rates and the 1 of the pairs.
     guess = suspects.noise(sums, pardoned, np.zeros(len(sums.terms)))
     groups = (gains, guess, losses, broadcast)
     families = sum(len(group.classes) for group in groups if group) + 4
@@ -156,7 +114,7 @@ def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list
     if noise:
         selected, _ = select(noise.score, noise.information, noise.classes, families, level)
         found += [_noise_words(one, names) for one in selected]
-        if not change.any():  # wrong gains make innovations of agents go together as well
+        if not change.any():  # wrong gains correlate the agents' innovations, too
             found += _correlations(sums, pardoned, families, level)
     if losses and accused.loss:
         selected, _ = select(losses.score, losses.information, losses.classes, families, level)
@@ -240,7 +198,7 @@ def _noise_words(one: Selected, names: Sequence[str]) -> Cause:
 
 
 def _correlations(sums: InnovationSums, pardoned: Sequence[int], families: int, level: float) -> list[Cause]:
-    """Pairs of agents whose noise goes together more, or less, than it should."""
+    """Pairs of agents whose noise correlation differs from the expected one, by Fisher's z."""
     m = sums.still.shape[1]
     agents = [i for i in range(m) if i not in pardoned]
     pairs = [(i, j) for place, i in enumerate(agents) for j in agents[:place]]
@@ -272,7 +230,7 @@ def _correlations(sums: InnovationSums, pardoned: Sequence[int], families: int, 
 
 
 def _switching(accused: Accused, families: int, level: float) -> list[Cause]:
-    """Rates, or in discrete time probabilities, of switching that are wrong."""
+    """Switching rates, or in discrete time probabilities, that are wrong."""
     names, counts = accused.names, accused.transitions.counts
     transition = accused.chain.transition(accused.dt)
     found = []

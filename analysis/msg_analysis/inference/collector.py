@@ -1,4 +1,4 @@
-"""States that come one by one, while a network runs, put together to whole steps."""
+"""Collects single states into whole steps while a network runs."""
 
 from __future__ import annotations
 
@@ -9,12 +9,9 @@ import numpy as np
 
 from msg_analysis.types import FloatArray, IntArray
 
-SPREAD = 64
-"""Steps that neighbours can be apart in lockstep."""
-LOST = 5_000
-"""States of an agent that a reliable reader may get only when they are sent again: the history of a writer."""
-MOST_WAITING = 20_000
-"""Steps that are kept while states of them are missing, at most."""
+SPREAD = 64  # steps that neighbours can be apart in lockstep
+LOST = 5_000  # states of one agent that may arrive late because they have to be sent again: a writer's history
+MOST_WAITING = 20_000  # incomplete steps kept, at most
 
 LATE, AGAIN, OUT_OF_RANGE = "too late", "received again", "step out of range"
 CONTRADICTION = "contradicts an earlier copy"
@@ -23,63 +20,35 @@ NOT_FINITE, DISAGREEMENT = "not finite", "agents used different graphs"
 
 @dataclass(slots=True)
 class _Row:
-    """What has come of one step."""
+    """What has arrived of one step."""
 
     payloads: list[bytes | None]
-    left: int
-    mode: int
-    usable: bool = True
+    left: int  # agents whose state is missing
+    mode: int  # graph that led to the step, from 1
+    usable: bool = True  # False after a contradiction
     used: bool = False
     states: bytes | None = None
 
 
 class StepCollector:
-    """Puts states that come one by one, in any order, together to whole steps.
+    """Collects the states of m agents, in any order, into whole steps.
 
-    Parameters
-    ----------
-    agents
-        their number m
-    modes
-        number of graphs
-    last
-        last step of the run
-    lockstep
-        whether all agents make a step with the same graph; then a step is ready only with the one after it, which says
-        which graph that was. Otherwise the graph is not asked for
-
-    Attributes
-    ----------
-    refused
-        states, or steps, that do not count, by reason
-    newest
-        largest step that anything came of; -1: none
-    whole
-        largest step that came whole; -1: none
+    In lockstep a step is ready only with its successor, which says which graph was used; else graphs are ignored.
     """
 
     def __init__(self, agents: int, modes: int, last: int, *, lockstep: bool) -> None:
         self._agents, self._modes, self._last, self._lockstep = agents, modes, last, lockstep
         self._window = min(SPREAD * (agents + 1) + LOST, MOST_WAITING)
         self._rows: dict[int, _Row] = {}
-        self._low = 0  # steps before it are gone
+        self._low = 0  # earlier steps are no longer kept
         self._ready: list[tuple[int, int, bytes, bytes]] = []  # step, mode, states, those after it
-        self.refused: Counter[str] = Counter()
-        self.newest = self.whole = -1
+        self.refused: Counter[str] = Counter()  # states or steps that do not count, by reason
+        self.newest = self.whole = -1  # largest step with any state, and with all states; -1: none
 
     def add(self, agent: int, step: int, mode: int, payload: bytes) -> None:
-        """Take one state.
+        """Take x(step) of an agent (from 0) as little-endian float64.
 
-        Parameters
-        ----------
-        agent
-            index from 0
-        step
-            k
-        mode
-            graph of the step that led there, from 1; 0 at step 0
-        payload
-            its numbers
+        ``mode`` is the graph of the step that led to it, from 1; 0 at step 0.
         """
         row = self._rows.get(step)
         if row is None:
@@ -95,7 +64,7 @@ class StepCollector:
             self.refused[AGAIN] += 1
             differs = before != payload or (self._lockstep and mode != row.mode)
             if differs and row.usable:
-                row.usable = False  # nobody knows which of them is forged
+                row.usable = False  # which copy is genuine is unknown
                 self.refused[CONTRADICTION] += 1
             return
         row.payloads[agent] = payload
@@ -107,13 +76,10 @@ class StepCollector:
             self._complete(step, row)
 
     def take(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-        """Steps that have become ready since the last time.
+        """Steps that have become ready since the last call: k (b,), graphs (b,), x(k) and x(k+1) (b, m, width).
 
-        Returns
-        -------
-        tuple[IntArray, IntArray, FloatArray, FloatArray]
-            steps k (b,); graph of each step k -> k+1, from 0 (b,), 0 if it is not asked for; x(k) (b, m, width); and
-            x(k+1) (b, m, width), which is x(k) if the graph is not asked for
+        Graphs are those of the step k -> k+1, from 0. Outside lockstep the graphs are 0, and x(k) takes the place of
+        x(k+1).
         """
         ready, self._ready = self._ready, []
         steps = np.array([entry[0] for entry in ready], dtype=np.int64)
@@ -139,7 +105,7 @@ class StepCollector:
             self._low += 1
 
     def _pair(self, step: int) -> None:
-        """A step is ready, if it is there with the one after it."""
+        """Make a step ready once it and its successor are whole."""
         here, after = self._rows.get(step), self._rows.get(step + 1)
         if here is None or after is None or here.states is None or after.states is None or here.used:
             return
@@ -148,7 +114,7 @@ class StepCollector:
         here.used = True
 
     def _forget(self, low: int) -> None:
-        if low - self._low > len(self._rows):  # after a jump: who comes late begins in the middle
+        if low - self._low > len(self._rows):  # after a jump: a late reader begins in the middle of the run
             self._rows = {step: row for step, row in self._rows.items() if step >= low}
         else:
             for step in range(self._low, low):

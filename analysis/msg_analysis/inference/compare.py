@@ -1,4 +1,4 @@
-"""A run against its prediction: the verdict."""
+"""Comparison of a run with its prediction, and the verdict."""
 
 from __future__ import annotations
 
@@ -24,32 +24,22 @@ from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.types import FloatArray, IntArray
 
-MIN_STEPS = 100
-"""Fewest steps for which numbers are given."""
+MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 RUNNING_POINTS = 400
 
 
 def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
-    """Compare a run with what theory predicts for it.
+    """Compare a run, or its complete beginning, with what theory predicts for it; see ``api.compare``.
 
-    Every test assumes exactly the law that the record says was run; the family of all of them is wrong with
-    probability at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In
-    real time, the family is what is exact whatever the timing was.
-
-    Where the law has no prediction (a protocol that is not linear, or not here), the run is measured, and only its
-    graphs and losses are tested.
-
-    Parameters
-    ----------
-    trajectory
-        from a bag or from the twin. If something is missing, the numbers are those of the complete beginning
-    level
-        chance of calling a run that follows its law one that disagrees
+    Every test assumes exactly the law that the record says was run; the probability of any false rejection in the
+    family is at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In real
+    time, the family has only tests that are exact whatever the timing was. Where the law has no prediction (a protocol
+    that is not linear, or is not installed), only graphs and losses are tested.
 
     Raises
     ------
     InputError
-        no prediction (too large, unbounded), or a log that does not say what is needed
+        no prediction (too large, unbounded), or a log without what is needed
     """
     protocol = trajectory.record.experiment.protocol
     unpredicted = protocol.unpredictable() if protocol else None
@@ -71,20 +61,9 @@ def judge(
     level: float,
     more: Sequence[tuple[str, float | None]] = (),
 ) -> Comparison:
-    """The verdict on what a run, or several, add up to.
+    """The verdict on the evidence of one run, or of several; ``more`` has names and p-values of further tests.
 
-    Parameters
-    ----------
-    trajectory
-        of the run; of several runs, one that has the account of what is missing
-    prediction
-        of their experiment
-    evidence
-        of all of them
-    level
-        chance of a false "disagrees"
-    more
-        names and p-values of further tests of the same law
+    Of several runs, ``trajectory`` is one with the completeness of all.
     """
     means = evidence.means
     system_error, node_errors = estimates(means, prediction.system)
@@ -150,7 +129,7 @@ def _accused(prediction: Prediction, evidence: Evidence) -> Accused:
 
 
 def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Comparison:
-    """What can be said without a prediction."""
+    """Comparison without a prediction."""
     measurement = Measurement.of(trajectory)
     agents, enough = measurement.step.agents, True
     if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
@@ -185,19 +164,7 @@ def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Compari
 
 
 def without_numbers(trajectory: Trajectory, level: float, prediction: Prediction, steps: int) -> Comparison:
-    """Too little came: only what was expected.
-
-    Parameters
-    ----------
-    trajectory
-        with the account of what is missing
-    level
-        chance of a false "disagrees"
-    prediction
-        of its experiment
-    steps
-        that came whole
-    """
+    """Comparison with too few steps: only what was expected."""
     predicted = prediction.emulated
     return Comparison(
         trajectory=trajectory,
@@ -216,7 +183,7 @@ def without_numbers(trajectory: Trajectory, level: float, prediction: Prediction
 
 
 def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
-    # A statistic that is no number, from a log that nobody can compute with, is none that the law gives.
+    # A NaN statistic (a log with numbers too large to compute with) counts as p = 0: the law never gives one.
     tested = [(name, 0.0 if math.isnan(p) else p) for name, p in family if p is not None]
     adjusted = holm(np.array([p for _, p in tested], dtype=float))
     return [Test(name, p, float(a), bool(a < level)) for (name, p), a in zip(tested, adjusted, strict=True)]

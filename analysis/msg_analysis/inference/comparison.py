@@ -1,4 +1,4 @@
-"""What comes out when a run is held against its prediction: numbers, tests, verdict."""
+"""The result of a comparison of a run with its prediction: numbers, tests, verdict."""
 
 from __future__ import annotations
 
@@ -35,68 +35,56 @@ EXIT_CODES: dict[Verdict, int] = {"agrees": 0, "disagrees": 1, "incomplete": 3, 
 
 @dataclass(frozen=True, slots=True)
 class Test:
-    """One member of the family that the verdict is about; ``p_adjusted`` is Holm's, over the family.
-
-    Attributes
-    ----------
-    name
-        what is tested
-    p
-        of this test alone
-    p_adjusted
-        Holm's, over the family
-    rejected
-        whether ``p_adjusted`` is at most the level
-    """
+    """One member of the family of tests that the verdict is about."""
 
     name: str
-    p: float
-    p_adjusted: float
-    rejected: bool
+    p: float  # of this test alone
+    p_adjusted: float  # Holm's, over the family
+    rejected: bool  # whether ``p_adjusted`` is below the level
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Comparison:
-    """What ``msg-analysis compare`` says.
+    """The result of ``msg-analysis compare``.
 
     Attributes
     ----------
     trajectory
-        what was compared
+        what was compared; of several runs it has no data, but the completeness of all
     level
-        chance of a false "disagrees"
+        probability of a false "disagrees", at most
     steps
         steps used: all, or those before the first gap
     system_error, node_errors, covariance, innovations, switching
-        one test or several each
+        estimates and tests; ``switching`` is None where too few steps arrived
     continuous_error
         the paper's continuous-time system error; None where it has none
     batch
-        model-free interval for the system error
+        (low, high), the 95 % interval of batch means for the system error; None for short runs
     tests
         the family, in the order of the report
     running
-        "time" [units of simulated time], "system_error" and "standard_error" of the mean up to then, (400,) each, fewer
-        for short runs
+        "time" [units of simulated time], and the mean of the system error up to then with its standard error (0 without
+        a prediction): "system_error", "standard_error"; arrays of the same length, at most 400
     loss
-        of the messages that were lost; None where none can be
+        test of the lost messages; None where none can be lost
     p_broadcast
-        of the noise in what was published; None without
+        of the noise in published values; None without
     unpredicted
         why there is no prediction; None where there is one
     transient
-        steps at the start that are left out of the measured errors; None with a prediction, which knows them
+        steps at the start that are left out of the measured errors; None with a prediction, which includes them
     timing, laws
         in real time: how time was kept, and which laws the log supports; None in lockstep. The errors and the
-        covariance are then held against the first of the laws that there is
+        covariance are compared with the logged-pattern law where it is available, else with the sequential law
     given
-        errors given the path of the graphs; None where they are not had
+        errors given the path of the graphs; None where they are not computed
     order
-        which agents are more certain than which; None where that is not known
+        which agents have smaller errors than which; None where that is not known
     blame
         what is wrong, where the verdict is "disagrees"
     pool
-        the runs, where they are several; ``trajectory`` has then no data, but the account of what is missing
+        the runs, where there are several
     """
 
     trajectory: Trajectory
@@ -148,9 +136,9 @@ class Comparison:
 
     @property
     def verdict(self) -> Verdict:
-        """Incomplete data get no verdict; else one rejected test of the family is a disagreement.
+        """Verdict: "incomplete" if data are missing, else "disagrees" if a test of the family is rejected.
 
-        Without a prediction, what is left of the family cannot say that a run agrees with it.
+        Without a prediction the remaining tests cannot show that a run agrees: "unpredicted".
         """
         if not self.trajectory.completeness.complete:
             return "incomplete"
@@ -165,7 +153,7 @@ class Comparison:
 
     @property
     def _law(self) -> str:
-        """That the errors are held against."""
+        """The law that the errors are compared with."""
         if self.laws:
             return self.laws.measured_against
         tested = any(test.name == "system error" for test in self.tests)

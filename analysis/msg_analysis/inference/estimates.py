@@ -1,4 +1,4 @@
-"""Measured errors beside what is expected of them."""
+"""Measured errors beside their expectations."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from msg_analysis.types import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A measured error beside its prediction; None where it cannot be had.
+    """A measured error beside its prediction; None where a number is not available.
 
     Attributes
     ----------
     measured, predicted
         time mean over the run, and its exact expectation
     standard_error
-        of the measured one, the martingale one
+        of ``measured``, by the martingale method
     z
-        (measured - predicted) / standard_error
+        (measured - predicted) / standard_error; None without noise
     p
         two-sided, of z
     p_holm
@@ -49,48 +49,24 @@ class Estimate:
         return self.measured - half, self.measured + half
 
     def to_json(self) -> dict[str, Any]:
-        """The document of one estimate."""
+        """The JSON document."""
         return {**asdict(self), "interval": list(self.interval)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CovarianceTest:
-    """All second moments at once; arrays are (m, m), None where they were not estimated.
+    """Test of all second moments together."""
 
-    Attributes
-    ----------
-    measured
-        (m, m) time mean; None where not estimated
-    predicted
-        (m, m) its expectation
-    chi2
-        of the half-vectorised difference; None where there is no joint test
-    dof
-        degrees of freedom of ``chi2``
-    p
-        of the test
-    note
-        why there is none, if so
-    """
-
-    measured: FloatArray | None = None
-    predicted: FloatArray | None = None
-    chi2: float | None = None
-    dof: int | None = None
+    measured: FloatArray | None = None  # (m, m) time mean
+    predicted: FloatArray | None = None  # (m, m) its expectation
+    chi2: float | None = None  # of the half-vectorised difference; None without a joint test
+    dof: int | None = None  # of ``chi2``
     p: float | None = None
-    note: str | None = None
+    note: str | None = None  # why there is no test
 
 
 def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:
-    """The system error and the node errors; the latter without standard errors if these were too many.
-
-    Parameters
-    ----------
-    means
-        what was measured, and what is expected
-    system
-        whose second moments these are
-    """
+    """The system error and the node errors; the latter without standard errors where only the system error has one."""
     combinations = np.vstack([means.trace, means.nodes])
     measured, predicted = combinations @ means.measured, combinations @ means.predicted
     errors = np.sqrt(np.einsum("aq,qr,ar->a", combinations, means.covariance, combinations).clip(0.0))
@@ -102,12 +78,9 @@ def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Esti
 
 
 def beside(measured: FloatArray, predicted: FloatArray, errors: FloatArray) -> tuple[Estimate, list[Estimate]]:
-    """What was measured beside what is expected of it.
+    """Estimates of the system error and of the node errors from arrays (1 + nodes,), the system error first.
 
-    Parameters
-    ----------
-    measured, predicted, errors
-        (1 + nodes,) first of the system, then of the nodes; errors are standard errors
+    ``errors`` are standard errors. The p-values of the nodes are adjusted by Holm.
     """
     found = [estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
     tested = [i for i, entry in enumerate(found) if i > 0 and entry.p is not None]
@@ -121,32 +94,30 @@ def beside(measured: FloatArray, predicted: FloatArray, errors: FloatArray) -> t
 
 
 def estimate(measured: float, predicted: float, error: float, scale: float) -> Estimate:
-    """A measured error beside its prediction.
-
-    Parameters
-    ----------
-    measured, predicted
-        the error
-    error
-        standard error of the measured one
-    scale
-        of all errors: a standard error that is nothing but rounding next to it counts as none
-    """
-    if error <= 1e-12 * scale or error == 0.0:  # without noise: nothing but rounding
+    """A measured error beside its prediction; a standard error of rounding size, relative to ``scale``, gives no z."""
+    if error <= 1e-12 * scale or error == 0.0:  # without noise: rounding only
         return Estimate(float(measured), float(predicted), float(error))
     z = float((measured - predicted) / error)
     return Estimate(float(measured), float(predicted), float(error), z, float(2 * stats.norm.sf(abs(z))))
 
 
 def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
-    """All second moments at once; see ``estimates``.
+    """Test of all second moments together, by the quadratic form of measured - predicted.
+
+    Its law is chi-square where the covariance is known from the model. Where it is estimated from n squares (lost
+    messages), it is Hotelling's T^2: (n - dof) / (dof (n - 1)) T^2 has the law F(dof, n - dof).
 
     Parameters
     ----------
     means
         of the run, or of several
     system
-        that they are held against
+        the reduced system whose moments they are
+
+    Returns
+    -------
+    CovarianceTest
+        without ``chi2`` where not all moments are estimated together; without ``p`` where dof = 0 or n <= dof
     """
     measured = system.lifted(means.second_moments)
     predicted = system.lifted(means.expected_moments)
@@ -160,8 +131,8 @@ def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
     if dof and not means.squares:
         p = float(stats.chi2.sf(chi2, dof))
     elif dof and means.squares > dof:
-        # The covariance is itself estimated, from so many squares. Chi-square would reject too often, and Hotelling's
-        # law, which takes all of it for estimated, a little too seldom.
+        # The covariance is itself estimated, from this many squares. Chi-square would reject too often; Hotelling's
+        # law, which assumes that all of it is estimated, rejects slightly too seldom.
         rest = means.squares - dof
         p = float(stats.f.sf(chi2 * rest / (dof * (means.squares - 1)), dof, rest))
     return CovarianceTest(measured, predicted, chi2, dof, p)

@@ -1,4 +1,4 @@
-"""In which order the states of a run in real time were made, and what the network looked like at the sampling times."""
+"""Order of the steps of a run in real time, and the state of the network at the sampling times."""
 
 from __future__ import annotations
 
@@ -14,29 +14,16 @@ from msg_analysis.types import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Order:
-    """The steps of all agents as events, one after the other.
+    """The steps of all agents as one sequence of events."""
 
-    Attributes
-    ----------
-    position
-        (N, m) place of the event in which agent i makes x_i(k+1)
-    contradiction
-        why the times in the log cannot be those of a cause and its effect; None where they can
-    """
-
-    position: IntArray
-    contradiction: str | None
+    position: IntArray  # (N, m) place of the event in which agent i makes x_i(k+1)
+    contradiction: str | None  # why the times in the log contradict cause and effect; None where they do not
 
 
 def order_events(observation: Observation) -> Order:
-    """Order the events of a run by when they were made; at equal times, what was used first.
+    """Order the events of a run in real time by time; at equal times, a value comes before the steps that use it.
 
     Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
     """
     timers = _timers(observation)
     made = timers.made
@@ -74,7 +61,7 @@ def order_events(observation: Observation) -> Order:
 
 
 def _turns(source: IntArray, target: IntArray, count: int) -> tuple[IntArray, bool]:
-    """A place for each of ``count`` things, so that every source comes before its target; and whether there is none."""
+    """A place for each of ``count`` items, every source before its target; and whether there is a cycle."""
     turn = np.zeros(count, dtype=np.int64)
     order = np.argsort(source, kind="stable")
     ends = np.searchsorted(source[order], np.arange(count + 1)).tolist()
@@ -82,7 +69,7 @@ def _turns(source: IntArray, target: IntArray, count: int) -> tuple[IntArray, bo
     waits_for = np.bincount(target, minlength=count)
     ready = np.setdiff1d(source, target).tolist()
     waiting = waits_for.tolist()
-    for one in ready:  # grows on the way
+    for one in ready:  # grows during the loop
         for other in targets[ends[one] : ends[one + 1]]:
             waiting[other] -= 1
             if not waiting[other]:
@@ -92,13 +79,7 @@ def _turns(source: IntArray, target: IntArray, count: int) -> tuple[IntArray, bo
 
 
 def newest_steps(observation: Observation) -> IntArray:
-    """(N + 1, m): step of the newest state of every agent that was made at simulated time <= k dt.
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    """
+    """(N + 1, m): step of each agent's newest state that was made at simulated time <= k dt."""
     made = np.maximum.accumulate(_timers(observation).made, axis=0)
     times = sampling_times(observation)
     newest = [np.searchsorted(made[:, i], times, side="right") - 1 for i in range(made.shape[1])]
@@ -106,24 +87,12 @@ def newest_steps(observation: Observation) -> IntArray:
 
 
 def sampled(observation: Observation) -> FloatArray:
-    """(N + 1, m, R): the states X(k) that the network shows at simulated time k dt; what is compared in real time.
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    """
+    """(N + 1, m, R): the newest states at simulated time k dt, which are compared in real time."""
     return np.asarray(observation.states[newest_steps(observation), np.arange(observation.step.agents)])
 
 
 def sampling_times(observation: Observation) -> IntArray:
-    """(N + 1,) k dt [ns].
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    """
+    """(N + 1,): k dt [ns of simulated time]."""
     return StepClock(observation.step.dt).times(np.arange(observation.steps + 1))
 
 

@@ -1,4 +1,4 @@
-"""What one run, or several of one experiment, add up to: all that the verdict needs, however long they are."""
+"""Sums over one run, or over several of one experiment: all that the verdict needs."""
 
 from __future__ import annotations
 
@@ -19,48 +19,22 @@ from msg_analysis.inference.timing import Timing, measure_timing
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Sums over the steps of runs; those of several runs of one experiment are simply added up.
-
-    Attributes
-    ----------
-    steps
-        of all runs
-    means
-        time means, and what is expected of them
-    decisive
-        whether they are held against a law that is exact
-    given
-        errors given the path; None where they are not had
-    innovations, transitions
-        of all runs
-    loss, broadcast
-        None where nothing is lost, or nothing is noisy
-    timing, laws
-        of one run in real time
-    """
+    """Sums over the steps of runs; those of several runs of one experiment are added up."""
 
     steps: int
-    means: TimeMeans
-    decisive: bool
-    given: GivenPath | None
+    means: TimeMeans  # time means, and their expectation
+    decisive: bool  # whether the law that the means are compared with is exact
+    given: GivenPath | None  # None where it is not computed
     innovations: InnovationSums
     transitions: Transitions
-    loss: LossTally | None
-    broadcast: BroadcastSums | None
-    timing: Timing | None = None
-    laws: Laws | None = None
+    loss: LossTally | None  # None without loss
+    broadcast: BroadcastSums | None  # None without broadcast noise
+    timing: Timing | None = None  # of one run in real time
+    laws: Laws | None = None  # of one run in real time
 
     @classmethod
     def of(cls, observation: Observation, level: float) -> Evidence:
-        """Of one run.
-
-        Parameters
-        ----------
-        observation
-            of the run
-        level
-            at which laws of a run in real time are tested
-        """
+        """Evidence of one run; laws of a run in real time are tested at ``level``."""
         laws, timing, position, given = None, None, None, None
         if observation.timers:
             timing, order = measure_timing(observation), order_events(observation)
@@ -83,15 +57,10 @@ class Evidence:
         )
 
     def merged(self, other: Evidence) -> Evidence:
-        """With that of other runs of the same experiment, whose sums are used up.
+        """The evidence of these and other runs of the same experiment; the sums of ``self`` are changed in place.
 
-        Time means are weighted with the numbers of steps: that is the mean over all steps, and every increment of the
-        martingale counts the same.
-
-        Parameters
-        ----------
-        other
-            of another run of the experiment
+        Time means are weighted with the numbers of steps, so that every step, and every martingale increment, counts
+        the same.
         """
         self.innovations.merge(other.innovations)
         if self.loss and other.loss:
@@ -131,7 +100,7 @@ def _merged_means(one: TimeMeans, steps: int, other: TimeMeans, more: int) -> Ti
 
 
 def _coarser(means: TimeMeans, other: TimeMeans) -> TimeMeans:
-    """Of what both know: the node errors, or only the system error."""
+    """Reduced to what both have: the node errors, or only the system error."""
     combinations = means.nodes if len(means.nodes) and len(other.nodes) else means.trace[None]
     count = len(combinations)
     return replace(

@@ -9,10 +9,11 @@ from msg_analysis.types import FloatArray
 
 
 def covariance_statistic(scatter: FloatArray, samples: int) -> tuple[float, float]:
-    """Statistic and degrees of freedom of a chi-square test that independent vectors are N(0, I).
+    """Statistic and degrees of freedom of a chi-square test that ``samples`` independent vectors are N(0, I).
 
     Likelihood ratio with Bartlett's correction: Anderson, An Introduction to Multivariate Statistical Analysis, section
-    10.8. With too few samples for a determinant: the exact chi-square of the total size.
+    10.8. With fewer than 10 r samples: the exact chi-square test of the total size, two-sided, converted to 1 degree of
+    freedom. The statistic is infinite where the vectors do not span their space.
 
     Parameters
     ----------
@@ -20,15 +21,10 @@ def covariance_statistic(scatter: FloatArray, samples: int) -> tuple[float, floa
         (r, r) sum of e e^T
     samples
         number of vectors
-
-    Returns
-    -------
-    tuple[float, float]
-        (inf, degrees of freedom) where the vectors do not span their space
     """
     rank = len(scatter)
     if samples < 10 * rank:
-        # A chi-square of its own many degrees of freedom, brought to one so that sums of statistics stay one.
+        # Converted to a chi-square of 1 degree of freedom, so that sums of statistics have a chi-square law.
         p = stats.chi2.sf(np.trace(scatter), samples * rank)
         return float(stats.chi2.isf(min(2 * min(p, 1 - p), 1.0), 1)), 1.0
     dof = rank * (rank + 1) / 2

@@ -1,13 +1,9 @@
-"""The errors of a run beside what its own path of graphs leads to expect: a control variate for slow switching.
+"""Errors of a run given its own path of graphs: a control variate for slow switching (docs/statistics.md).
 
-Given the path (and, where messages are lost, given which ones), the states are a linear function of independent normal
-numbers from a known start. So the expectation of the time mean follows from the recursion
-
-    M(k+1) = W_k M(k) W_k^T + N_k,      Y(k) = H + W_k^T Y(k+1) W_k   (what is still to come, backwards)
-
-exactly, and its variance is the sum of tr( Y N Y (4 M - 2 N) ) / R, since replicas are independent given the path. The
-expectation given the path is itself random, and its mean is the prediction: measured less (expected given the path less
-predicted) has the mean of the measured error without the part of its variance that is due to the path.
+Given the path (and which messages were lost), the states are linear in independent normal numbers. The expectation of
+the time mean follows exactly from M(k+1) = W_k M(k) W_k^T + N_k, and with Y(k) = H + W_k^T Y(k+1) W_k (backwards) its
+variance is the sum of tr( Y N Y (4 M - 2 N) ) / R: replicas are independent given the path. So measured - (expected
+given the path - predicted) has the right mean, without the part of the variance that is due to the path.
 """
 
 from __future__ import annotations
@@ -26,33 +22,19 @@ from msg_analysis.model.step import StepModel
 from msg_analysis.theory import symmetric
 from msg_analysis.types import FloatArray, IntArray
 
+# Numbers in the matrices of all kinds of steps, at most; there are many kinds where many messages are lost
 MAX_NUMBERS = 20_000_000
-"""Most numbers in the matrices of all kinds of steps; many, where many messages can be lost."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GivenPath:
-    """Node errors, with what is expected of them given the path of the graphs.
+    """Node errors, and their expectation given the path of the graphs."""
 
-    Attributes
-    ----------
-    measured
-        (m,) time means over the run
-    expected
-        (m,) their exact expectation given the path
-    predicted
-        (m,) their expectation over all paths
-    covariance
-        (m, m) of measured - expected
-    unconditional
-        variance of the measured system error over all paths
-    """
-
-    measured: FloatArray
-    expected: FloatArray
-    predicted: FloatArray
-    covariance: FloatArray
-    unconditional: float
+    measured: FloatArray  # (m,) time means over the run
+    expected: FloatArray  # (m,) their exact expectation given the path
+    predicted: FloatArray  # (m,) their expectation over all paths
+    covariance: FloatArray  # (m, m) of measured - expected
+    unconditional: float  # variance of the measured system error over all paths
 
     @property
     def variance_ratio(self) -> float | None:
@@ -68,14 +50,14 @@ class GivenPath:
 
     @property
     def node_errors(self) -> list[Estimate]:
-        """Corrected for the path."""
+        """Corrected for the path; without ``p_holm``."""
         corrected, scale = self.measured - self.expected + self.predicted, float(self.predicted.sum())
         errors = np.sqrt(np.diag(self.covariance).clip(0.0))
         numbers = zip(corrected, self.predicted, errors, strict=True)
         return [estimate(float(c), float(p), float(e), scale) for c, p, e in numbers]
 
     def to_json(self) -> dict[str, Any]:
-        """The document."""
+        """The JSON document."""
         return {
             "expected": float(self.expected.sum()),
             "system_error": self.system_error.to_json(),
@@ -85,14 +67,9 @@ class GivenPath:
 
 
 def given_path(observation: Observation, means: TimeMeans) -> GivenPath | None:
-    """Errors of a run in lockstep given its path; None where it would take long (over 20 agents).
+    """Errors of a run given its path of graphs, by the recursions of this module; ``means`` are those over all paths.
 
-    Parameters
-    ----------
-    observation
-        of the run
-    means
-        its time means over all paths
+    None in real time, and where it would take long: over ``MAX_JOINT`` second moments, or too many kinds of steps.
     """
     system, steps = observation.prediction.system, observation.steps
     if symmetric.size(system.dimension) > MAX_JOINT or not means.joint or observation.timers:
@@ -118,7 +95,7 @@ def _follow(
 ) -> tuple[FloatArray, FloatArray]:
     """Sum of the packed M(0..N-1) (p,), and the sum of Cov(D) (q, q) of one replica.
 
-    In blocks: M is computed again from the beginning of a block when the Y come by.
+    Works in blocks: going backwards, the M of a block are computed again from its beginning.
     """
     steps, d, q = len(which), matrices.shape[1], len(forms)
     ahead = np.array([symmetric.product(matrix, matrix) for matrix in matrices])
@@ -134,7 +111,7 @@ def _follow(
     covariance = np.zeros((q, q))
     dual = forms  # Y(last)
     for block in reversed(range(len(beginnings))):
-        first, last = block * length, min((block + 1) * length, steps - 1)  # noise of the last step shows in no error
+        first, last = block * length, min((block + 1) * length, steps - 1)  # the noise of the last step is in no error
         if last <= first:
             continue
         moments, duals = np.empty((last - first, len(start))), np.empty((last - first, *forms.shape))
@@ -153,7 +130,7 @@ def _follow(
 
 
 def _steps(observation: Observation) -> tuple[IntArray, FloatArray, FloatArray]:
-    """(N,) kind of every step, and of every kind the reduced matrix (d, d) and covariance of its noise (d, d)."""
+    """(N,) kind of every step; and of every kind the reduced matrix and noise covariance, (kinds, d, d) each."""
     system, step, lost = observation.prediction.system, observation.step, observation.lost
     if lost is None or not step.loss:
         return observation.modes, system.matrices, system.noise

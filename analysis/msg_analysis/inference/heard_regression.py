@@ -1,4 +1,4 @@
-"""The score test of the gains where something becomes of values on the air, and in real time."""
+"""Score test of the gains with noise or loss on the air, and in real time."""
 
 from __future__ import annotations
 
@@ -13,21 +13,17 @@ from msg_analysis.types import FloatArray, IntArray
 class HeardRegression:
     """Score test: innovations do not depend on what the agents heard, with the weights it was used with.
 
-    As without noise on the air, see ``innovations``; but the differences that row i uses are y_j - x_i of the values
-    that came, with y_j as published, and the covariance of the innovations is that of each step.
-
-    In real time the agents make a step one after the other. Where their noise is correlated, a value that is used may
-    have a part of the noise of the very step in it; so each innovation is first freed of what those that were made
-    earlier in the step say about it.
+    As ``regression.StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as
+    published, and the covariance of the innovations is that of each step. In real time the agents make a step one after
+    the other. With correlated noise, a value that is used may contain a part of the noise of the same step; so each
+    innovation is first freed of what those made earlier in the step say about it (``position``, needed only then).
 
     Parameters
     ----------
-    observation
-        of the run
     most
-        largest number of regressors
+        largest number of regressors K; beyond it, fewer kinds of them are tested
     position
-        (N, m) when the states were made; needed in real time, if the noise is correlated
+        (N, m) order in which the states were made
     """
 
     def __init__(self, observation: Observation, most: int, position: IntArray | None = None) -> None:
@@ -35,7 +31,7 @@ class HeardRegression:
         self._replicas = observation.replicas
         self._position = position
         n, m = step.modes, step.agents
-        # What is added to a state by itself: the leaders' own pull.
+        # Weight of a state's own deviation from the reference: the leaders' pull.
         self._pull = step.nominal.sum(axis=2) - 1.0
         leads = np.abs(self._pull) > 1e-12
         self._links = [mode_links(step, mode) for mode in range(n)]
@@ -43,7 +39,7 @@ class HeardRegression:
         self._each = count <= most
         if not self._each:
             count = n * m + m if n * m + m <= most else 2 * m
-        #: Place of the regressor of a link, of a leader, or of all that pulls an agent; by the agent's graph
+        # Index of the regressor of a link, of a leader, or of the whole pull on an agent; by the agent's graph.
         self._link_place = np.zeros((n, m, step.most_neighbours), dtype=np.int64)
         self._lead_place = np.full((n, m), -1)
         self._pull_place = np.zeros((n, m), dtype=np.int64)
@@ -60,21 +56,21 @@ class HeardRegression:
 
     @property
     def numbers_per_step(self) -> int:
-        """Size of the largest temporary array: regressors, or the weights of all messages."""
+        """Size of the largest temporary array, per step."""
         m, d = self._step.agents, self._step.most_neighbours
         return max((2 + d) * m * self._replicas, m * d)
 
     def statistic(self) -> tuple[FloatArray, FloatArray]:
-        """Scores (K,) and their covariance (K, K)."""
+        """Scores U (K,) and their covariance (K, K)."""
         return self._score, self._covariance
 
     def gram(self) -> FloatArray | None:
-        """See ``StateRegression.gram``; None where innovations are freed of what is known of them."""
+        """See ``StateRegression.gram``; None where innovations are freed of earlier ones."""
         return None if self._position is not None else self._gram
 
     @property
     def terms(self) -> list[Term]:
-        """What the regressors are; the weights are those of what came."""
+        """The regressors (K); the weights are the nominal ones."""
         step = self._step
         found = [Term("constant", i) for i in range(step.agents)]
         if not self._each:
@@ -88,17 +84,7 @@ class HeardRegression:
         return found
 
     def add(self, reception: Reception, innovations: FloatArray, first: int = 0) -> None:
-        """Take a block of steps, from ``first`` on, with their innovations (b, m, R).
-
-        Parameters
-        ----------
-        reception
-            of a block
-        innovations
-            (b, m, R) of its steps
-        first
-            step of the block
-        """
+        """Add a block of steps, beginning with step ``first``, and their innovations (b, m, R)."""
         order = None
         if self._position is not None:
             order = np.argsort(self._position[first : first + len(innovations)], axis=1)
@@ -150,7 +136,7 @@ class HeardRegression:
 
 
 def _freed(e: FloatArray, process: FloatArray, agents: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Innovations of a step less what those of agents earlier in the order say about them; and their covariance."""
+    """Innovations less what those of agents earlier in the order say about them; and their covariance (m, m)."""
     free = np.eye(len(agents))
     for number, i in enumerate(agents.tolist()):
         before = agents[:number]

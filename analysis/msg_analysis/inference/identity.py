@@ -1,4 +1,4 @@
-"""Whether runs are of one experiment: what of an experiment file makes its law, and what does not."""
+"""Whether runs are of one experiment: which keys of an experiment file define its law."""
 
 from __future__ import annotations
 
@@ -9,18 +9,12 @@ from typing import Any
 
 from msg_analysis.model.experiment import Experiment
 
+# Keys of an experiment that do not change its law
 MAY_DIFFER = {"name", "run.seed", "run.duration", "run.processes", "run.speed"}
-"""Keys of an experiment that change nothing about its law."""
 
 
 def law_keys(experiment: Experiment) -> dict[str, Any]:
-    """Every key, with dots, that makes the law of a run, and its value.
-
-    Parameters
-    ----------
-    experiment
-        checked
-    """
+    """Every key (nested ones with dots) that defines the law of a run, and its value."""
     found = _flat(experiment.to_document())
     # The order of the graphs is that of the modes.
     found["graphs"] = [graph.name for graph in experiment.graph_list]
@@ -30,27 +24,13 @@ def law_keys(experiment: Experiment) -> dict[str, Any]:
 
 
 def law_identity(experiment: Experiment) -> str:
-    """A short text that is the same for runs of the same law.
-
-    Parameters
-    ----------
-    experiment
-        checked
-    """
+    """A text of 16 hexadecimal digits, the same for runs of the same law."""
     text = json.dumps(law_keys(experiment), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def first_difference(one: Experiment, other: Experiment) -> tuple[str, Any, Any] | None:
-    """Key and both values of what is different; None where the law is the same.
-
-    Parameters
-    ----------
-    one
-        experiment
-    other
-        experiment
-    """
+    """Key and both values of the first difference, by name; None where the law is the same."""
     a, b = law_keys(one), law_keys(other)
     for key in sorted(a.keys() | b.keys()):
         if a.get(key) != b.get(key):

@@ -1,8 +1,8 @@
-"""What a step adds that its mean does not explain: e(k) = x(k+1) - W_g(k) x(k) - offset_g(k).
+"""Tests of the innovations e(k) = x(k+1) - W_g(k) x(k) - offset_g(k): what a step adds to its mean.
 
-Under the model the e(k) are independent N(0, N_g(k)), whatever the graphs do; so these tests are exact or
-nearly so, and find what the time means hardly see. With noise or loss on the air, and in real time, what the agents
-heard takes the place of others' states (see ``reception``), and the same holds given that, whoever was late.
+Under the model the e(k) are independent N(0, N_g(k)), for any path of the graphs; so these tests are exact or nearly
+so, and find what the time means hardly show. With noise or loss on the air, and in real time, the same holds given the
+values that the agents heard (see ``reception``), for any timing. See docs/statistics.md.
 """
 
 from __future__ import annotations
@@ -26,99 +26,48 @@ from msg_analysis.model.step import StepModel
 from msg_analysis.types import FloatArray, IntArray
 
 LAGS = 10
-ROUNDING = 1e-9
-"""Relative size of what counts as rounding in such directions."""
+ROUNDING = 1e-9  # relative size of what counts as rounding in directions without noise
 
 
 @dataclass(frozen=True, slots=True)
 class InnovationTests:
-    """p-values; None where there is nothing to test.
+    """p-values; None where there is nothing to test."""
 
-    Attributes
-    ----------
-    p_covariance
-        covariance of the innovations against N_g; 0 if anything moves where there is no noise
-    p_whiteness
-        correlation in time (lags 1..10) and between replicas
-    p_gain
-        regression on what the agents heard: wrong gains, references, offsets
-    p_common_gain
-        the same for one factor of all gains: messages that are ignored
-    ratios
-        (m,) variance of each agent's innovations over what it should be; NaN where that is nothing
-    samples
-        innovations of each agent, replicas counted: times their number, a ratio has their chi-square law
-    """
-
-    p_covariance: float | None
-    p_whiteness: float | None
-    p_gain: float | None
-    p_common_gain: float | None = None
+    p_covariance: float | None  # of their covariance being N_g; 0 if anything moves in a direction without noise
+    p_whiteness: float | None  # correlation in time (lags 1..10) and between replicas
+    p_gain: float | None  # regression on what the agents heard: wrong gains, references, offsets
+    p_common_gain: float | None = None  # the same for one factor of all gains: ignored messages
+    # (m,) measured over nominal variance; NaN where an agent has no noise in some graph
     ratios: tuple[float, ...] | None = None
-    samples: int | None = None
+    samples: int | None = None  # of each agent, replicas counted; samples * ratio is chi-square(samples)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Directions:
-    """Directions of the noise of one graph: N_g = (basis * variances) basis^T, largest variance first.
+    """Directions of the noise of one graph, N_g = (basis * variances) basis^T, largest variance first."""
 
-    Attributes
-    ----------
-    whitener
-        (r, m)
-    quiet
-        (m, m - r) orthonormal basis of the directions without noise
-    """
-
-    whitener: FloatArray
-    quiet: FloatArray
+    whitener: FloatArray  # (r, m)
+    quiet: FloatArray  # (m, m - r) orthonormal basis of the directions without noise
 
 
 class InnovationSums:
-    """What the innovations of runs of one experiment add up to: enough for the tests, and for what is wrong.
+    """Sums over the innovations of runs of one experiment: enough for the tests and for the diagnosis (``blame``).
 
-    Parameters
-    ----------
-    observation
-        of the first run
-    position
-        (N, m) in real time, when the states were made (``events.Order.position``)
-
-    Attributes
-    ----------
-    noises
-        (n, m, m) what their covariance should be
-    samples
-        (n,) number of innovations, replicas counted, of each graph
-    scatter
-        (n, m, m) sum of e e^T
-    still
-        (n, m) steps in which no replica of an agent changed
-    quiet
-        largest |e| in directions without noise
-    largest
-        largest |x|
-    replicas
-        of a run
-    terms
-        what the innovations were regressed on
-    score, covariance
-        (K,), (K, K) of that regression
-    gram
-        (K, K) see ``StateRegression.gram``; None where it cannot be had
+    In real time, ``position`` is that of ``events.Order``, (N, m).
     """
 
     def __init__(self, observation: Observation, position: IntArray | None = None) -> None:
         step, noise = observation.step, observation.prediction.experiment.noise
         n, m = step.modes, step.agents
+        # (n, m, m) nominal covariances
         self.noises: FloatArray = full_reception_noise(observation) if noise.on_air else step.noise
         self.replicas = observation.replicas
+        # Number of innovations, replicas counted, and sum of e e^T, by graph.
         self.samples, self.scatter = np.zeros(n, np.int64), np.zeros((n, m, m))
-        self.still = np.zeros((n, m), np.int64)
-        self.quiet = self.largest = 0.0
+        self.still = np.zeros((n, m), np.int64)  # steps in which no replica of an agent changed
+        self.quiet = self.largest = 0.0  # largest |e| in directions without noise; largest |x|
         self._directions = [_directions(matrix) for matrix in self.noises]
-        # Graphs may differ in the number of noisy directions; the strongest ones that all have are iid N(0, I) in
-        # any case.
+        # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
         self._whiteness = Whiteness(min(len(d.whitener) for d in self._directions))
         varies = step.loss > 0.0 and noise.link > 0.0
         if observation.timers:
@@ -131,22 +80,16 @@ class InnovationSums:
         )
         self._add(observation, regression)
         self.terms = regression.terms
-        self.score, self.covariance = regression.statistic()
-        self.gram = regression.gram()
+        self.score, self.covariance = regression.statistic()  # (K,), (K, K)
+        self.gram = regression.gram()  # (K, K), see ``StateRegression.gram``; None where it is not available
 
     @property
     def steps(self) -> IntArray:
-        """(n,) of each graph."""
+        """(n,): steps of each graph."""
         return self.samples // self.replicas
 
     def merge(self, other: InnovationSums) -> None:
-        """Take what another run of the same experiment adds up to.
-
-        Parameters
-        ----------
-        other
-            of another run, with another seed
-        """
+        """Add the sums of another run of the same experiment, with another seed."""
         self.samples += other.samples
         self.scatter += other.scatter
         self.still += other.still
@@ -159,9 +102,9 @@ class InnovationSums:
         self.gram = None if self.gram is None or other.gram is None else self.gram + other.gram
 
     def tests(self) -> InnovationTests:
-        """The tests of all of them."""
+        """All tests of the innovations."""
         ratios: tuple[float, ...] | None = None
-        # What NO_NOISE hides may be there: ten standard deviations of it.
+        # Variances below NO_NOISE are allowed for: ten standard deviations.
         hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
         p_whiteness = self._whiteness.p_value()
         if self._equalizer and not self._equalizer.possible:
@@ -185,7 +128,7 @@ class InnovationSums:
         return tuple((parts.sum(axis=0) / max(int(self.samples.sum()), 1)).tolist())
 
     def _common_gain_p(self) -> float | None:
-        """One direction of the regression: every message counts for less, or for more, than it should."""
+        """Score test of one direction of the regression: every message counts for less, or more, than it should."""
         agents = np.array([term.agent for term in self.terms])
         size = np.diagonal(self.noises, axis1=1, axis2=2).mean(axis=0)[agents]
         weights = np.array([term.weight if term.kind in ("link", "pull") else 0.0 for term in self.terms])
@@ -227,7 +170,7 @@ class InnovationSums:
             self._whiteness.add(white)
 
     def _covariance_p(self) -> float | None:
-        """Of all steps together when the noise is the same in every graph, else per graph and added up."""
+        """Of all steps together when the noise is the same in every graph, else added up over the graphs."""
         modes = range(len(self.noises))
         groups = [list(modes)] if (self.noises == self.noises[0]).all() else [[g] for g in modes]
         statistic, dof = 0.0, 0.0
@@ -242,31 +185,18 @@ class InnovationSums:
 
 
 def innovation_tests(observation: Observation, position: IntArray | None = None) -> InnovationTests:
-    """Test the innovations of a run.
+    """Test the innovations of a run: covariance, whiteness and gains.
 
-    Parameters
-    ----------
-    observation
-        of a run
-    position
-        (N, m) in real time, when the states were made (``events.Order.position``)
+    ``position`` is that of ``events.Order``, (N, m), in real time; see ``covariance_statistic``, ``Whiteness`` and
+    ``StateRegression`` for the tests.
     """
     return InnovationSums(observation, position).tests()
 
 
 def innovations(observation: Observation, first: int, last: int, reception: Reception | None = None) -> FloatArray:
-    """(last - first, m, R): e of the steps first..last-1, given what was heard, if that was not the states.
+    """(last - first, m, R): innovations e(k) of the steps first..last-1, given what was heard.
 
-    Parameters
-    ----------
-    observation
-        of the run
-    first
-        step
-    last
-        step behind the last one
-    reception
-        of these steps; None: everybody heard the states of the step before
+    Without a ``reception`` of these steps, all agents heard the states themselves.
     """
     step, now = observation.step, observation.states[first:last]
     after = observation.states[first + 1 : last + 1].copy()
@@ -280,7 +210,7 @@ def innovations(observation: Observation, first: int, last: int, reception: Rece
 
 
 def _correlated(step: StepModel) -> bool:
-    """Whether the process noise of an agent says something about that of another, whichever graphs they use."""
+    """Whether the process noise of two agents can be correlated, under any graphs that they use."""
     together = np.einsum("gik,hjk->ij", np.abs(step.noise_gain), np.abs(step.noise_gain))
     return bool((together - np.diag(np.diag(together))).any())
 
@@ -293,12 +223,10 @@ def _directions(noise: FloatArray) -> _Directions:
 
 
 class Whiteness:
-    """Portmanteau test of iid N(0, I) vectors: lags 1..LAGS, and lag 0 between replicas.
+    """Portmanteau test of iid N(0, I) vectors of length r: lags 1..LAGS, and lag 0 between replicas.
 
-    Parameters
-    ----------
-    rank
-        length of the vectors
+    The sum of squared sample correlations, each over its variance under the null hypothesis, is chi-square with LAGS
+    r^2 degrees of freedom, and r more where there are replicas.
     """
 
     def __init__(self, rank: int) -> None:
@@ -311,13 +239,7 @@ class Whiteness:
         self._steps, self._replicas = 0, 1
 
     def add(self, white: FloatArray) -> None:
-        """Take the next (b, rank, R) block.
-
-        Parameters
-        ----------
-        white
-            (b, rank, R) standard normal, if the law holds
-        """
+        """Add the next block (b, r, R), which is standard normal if the law holds."""
         self._steps += len(white)
         self._replicas = white.shape[2]
         squares = (white**2).sum(axis=2)
@@ -335,13 +257,7 @@ class Whiteness:
         self._tail = joined[-LAGS:]
 
     def merge(self, other: Whiteness) -> None:
-        """Take what another run adds up to; nothing is said of pairs of steps of different runs.
-
-        Parameters
-        ----------
-        other
-            of another run, with another seed
-        """
+        """Add the sums of another run with another seed; no lags are counted across runs."""
         self._products += other._products
         self._counts += other._counts
         self._squares += other._squares
@@ -349,7 +265,7 @@ class Whiteness:
         self._steps += other._steps
 
     def p_value(self) -> float | None:
-        """None without noise. Each coordinate is divided by its own size: that is another test's matter."""
+        """None without noise or with at most LAGS steps. Coordinates are scaled by their size, tested elsewhere."""
         size = self._squares / (self._steps * self._replicas)
         if not self.rank or self._steps <= LAGS or not (size > 0.0).all():
             return None
@@ -364,7 +280,7 @@ class Whiteness:
 
 
 def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, int]:
-    """(v^T C^+ v, rank C), with the rank judged on the correlations, whatever the units of the entries.
+    """(v^T C^+ v, rank C), with the rank judged on the correlations (eigenvalues above 1e-10), whatever the units.
 
     Parameters
     ----------

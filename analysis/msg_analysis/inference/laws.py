@@ -1,4 +1,4 @@
-"""Which of the laws of a run in real time its log supports: logged pattern, sequential, continuous."""
+"""Which laws of a run in real time its log supports: logged pattern, sequential, continuous."""
 
 from __future__ import annotations
 
@@ -17,62 +17,40 @@ from msg_analysis.inference.pattern import PatternUnavailableError, pattern_mean
 from msg_analysis.inference.timing import Timing
 from msg_analysis.model.words import percent
 
-MAX_MISSED = 0.01
-"""Largest share of missed deadlines with which a law that assumes that nobody is late can be supported."""
+MAX_MISSED = 0.01  # largest share of missed deadlines with which a law without lateness can be supported
 
-MAX_EFFECT = 0.01
-"""Largest relative change of the system error that a law may leave out and still be supported."""
+MAX_EFFECT = 0.01  # largest relative change of the system error that a law may leave out and still be supported
 
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """A law beside the log.
+    """A law beside the log."""
 
-    Attributes
-    ----------
-    system_error
-        measured, and predicted by this law
-    supported
-        whether the log goes with it; None where that cannot be said
-    why
-        in words
-    """
-
-    system_error: Estimate
-    supported: bool | None
+    system_error: Estimate  # measured, and predicted by this law
+    supported: bool | None  # whether the log supports it; None where that is not decided
     why: str
 
     def to_json(self) -> dict[str, Any]:
-        """The document."""
+        """The JSON document."""
         return {"system_error": self.system_error.to_json(), "supported": self.supported, "why": self.why}
 
 
 @dataclass(frozen=True, slots=True)
 class Laws:
-    """The laws of a run in real time.
+    """The laws of a run in real time."""
 
-    Attributes
-    ----------
-    pattern
-        given the values and graphs that the agents say they used; exact whatever the timing
-    sequential
-        nobody is late, everything is heard at once
-    continuous
-        the paper's
-    """
-
-    pattern: Law
-    sequential: Law
-    continuous: Law
+    pattern: Law  # given the values and graphs that the agents logged as used; exact for any timing
+    sequential: Law  # no step is late, every value is heard at once
+    continuous: Law  # the paper's
 
     @property
     def measured_against(self) -> Literal["pattern", "sequential"]:
-        """The law that the errors of the comparison are held against: the pattern law where it is available."""
+        """The law that the errors of the comparison are compared with: the pattern law where it is available."""
         return "sequential" if self.pattern.system_error.predicted is None else "pattern"
 
     @property
     def why(self) -> str:
-        """All of it in words."""
+        """The reasons of all three, in words."""
         laws = {
             "logged-pattern law": self.pattern,
             "sequential law": self.sequential,
@@ -82,7 +60,7 @@ class Laws:
         return " ".join(f"The {name} is {said[law.supported]}: {law.why}." for name, law in laws.items())
 
     def to_json(self) -> dict[str, Any]:
-        """The document."""
+        """The JSON document."""
         return {
             "pattern": self.pattern.to_json(),
             "sequential": self.sequential.to_json(),
@@ -92,22 +70,11 @@ class Laws:
 
 
 def measure_laws(observation: Observation, order: Order, timing: Timing, level: float) -> tuple[TimeMeans, Laws]:
-    """Hold a run in real time against each law; and the time means under the one that is exact, if it is available.
+    """Compare a run in real time with each law; also the time means under the pattern law, else the sequential law.
 
-    A law is not supported if the errors reject it, or if the log says that deadlines were missed to an extent that it
-    does not allow for. It is supported if what it leaves out is known to change the system error by no more than
-    ``MAX_EFFECT``; otherwise the run is too short to decide.
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    order
-        of its events
-    timing
-        of the run
-    level
-        chance of not supporting a law that holds
+    The pattern law is supported unless the errors reject it at ``level``. The others are not supported if the errors
+    reject them, or if more deadlines were missed than ``MAX_MISSED``. They are supported if what they leave out is
+    known to change the system error by at most ``MAX_EFFECT``; otherwise the run is too short to decide.
     """
     sequential = time_means(replace(observation, states=sampled(observation)))
     error, p = _least(observation, sequential)
@@ -140,7 +107,7 @@ def _pattern(observation: Observation, means: TimeMeans, level: float) -> Law:
 
 
 def _departures(timing: Timing) -> list[str]:
-    """What of the log is not as the sequential law assumes."""
+    """Facts in the log that contradict the sequential law."""
     facts = []
     if timing.missed:
         facts.append(f"{percent(timing.missed_share)} of the deadlines were missed")
@@ -173,7 +140,7 @@ def _sequential(
 
 
 def _continuous(observation: Observation, sequential: Estimate, level: float, late: bool) -> Law:
-    """With the standard error of the sequential law: that of the continuous law would hardly be another."""
+    """With the standard error of the sequential law, from which that of the continuous law would hardly differ."""
     law, experiment = observation.prediction.continuous, observation.prediction.experiment
     if law is None:
         return Law(Estimate(sequential.measured), None, "there is none for this experiment")
@@ -201,7 +168,7 @@ def _continuous(observation: Observation, sequential: Estimate, level: float, la
 
 
 def _least(observation: Observation, means: TimeMeans) -> tuple[Estimate, float | None]:
-    """The system error, and the least adjusted p of all that is known of the second moments."""
+    """The system error, and the smallest adjusted p-value of all tests of the second moments."""
     system = observation.prediction.system
     error, nodes = estimates(means, system)
     tests = [error.p, *(node.p for node in nodes), covariance_test(means, system).p]

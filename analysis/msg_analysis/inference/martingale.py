@@ -1,25 +1,11 @@
-"""Time means of second moments, with standard errors that hold under the model being tested.
+"""Time means of second moments, with standard errors that hold under the model being tested (docs/statistics.md).
 
-For a quadratic form h(y) = y^T H y the Poisson equation gives f(y, g) = y^T Y_g y + kappa_g with
-f - E[f(next) | now] = h - (steady mean of h). So the
-
-    D_k = f(y_k+1, g_k+1) - E[f(y_k+1, g_k+1) | y_k, g_k]
-
-are martingale differences whose sum is N times the error of the time mean, up to a boundary term, whatever
-the correlation in time. The covariance of the sum is estimated by the predictable quadratic variation, the
-sum of Cov(D_k | y_k, g_k), and not by sum D_k D_k^T: jumps of the graph that did not happen count as much as
-those that did, so that the standard errors do not break down in runs with a few jumps. With every step's
-second moments s_k packed, and a_k = (s_k, 1), it is exact.
-Replicas share the path of the graphs: they are averaged inside h, and share the part of Cov(D_k) that is due
-to the jump.
-
-Replicas also share lost messages, on which the noise of a step depends too. Then D_k is split at the moment when
-the step has been made and the graph has not jumped yet: with F_k = E[f(y_k+1, g_k+1) | y_k+1, g_k],
-
-    D_k = (F_k - E[f(next) | now])  +  (f(next) - F_k).
-
-The variance of the second part, the jump's, given y_k+1 and g_k is known as before; the first part is squared:
-every step adds to it, so its squares do add up to its variance.
+For h(y) = y^T H y, f(y, g) = y^T Y_g y + kappa_g solves the Poisson equation f - E[f(next) | now] = h - (steady mean of
+h). So D_k = f(y_k+1, g_k+1) - E[f(y_k+1, g_k+1) | y_k, g_k] are martingale differences, whose sum is N times the error
+of the time mean up to a boundary term, whatever the correlation in time. The covariance of the sum is estimated by the
+sum of Cov(D_k | y_k, g_k), an exact function of a_k = (s_k, 1), s_k the packed second moments of a step. Graph jumps
+that did not happen count as much as those that did, so this holds in runs with a few jumps. Replicas are averaged
+inside h, and share the part that is due to the jump.
 """
 
 from __future__ import annotations
@@ -37,85 +23,44 @@ from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.system import JumpSystem
 from msg_analysis.types import FloatArray
 
-MAX_JOINT = 210
-"""Most second moments that are all estimated (20 agents); beyond that, only the node errors."""
+MAX_JOINT = 210  # second moments that are all estimated (d = 20), at most; beyond that, only the node errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeMeans:
-    """Time means over the steps 0..N-1 of linear functions of y y^T.
+    """Time means over the steps 0..N-1 of q linear functions of y y^T.
 
-    Attributes
-    ----------
-    second_moments
-        (d, d) time mean of y y^T
-    expected_moments
-        (d, d) its exact expectation under the run's start and length
-    joint
-        whether what follows is about all entries of y y^T, packed (q = p); else the node errors (q = m)
-    measured
-        (q,) time means, replicas averaged
-    predicted
-        (q,) their exact expectation under the run's start and length
-    covariance
-        (q, q) of measured under the model
-    squares
-        number of steps whose squares make up ``covariance``; 0 where it is known from the model
-    nodes
-        (m, q) the node errors as combinations of them; (0, q) where they are too many
-    trace
-        (q,) the system error as a combination of them
-    system_series
-        (N,) system error of every step, replicas averaged
-    system_variances
-        (N,) of the system error: Var(D_k | y_k, g_k), or what stands for it with lost messages
+    All entries of y y^T, packed (joint, q = p), the node errors (q = m), or the system error (q = 1).
     """
 
-    second_moments: FloatArray
-    expected_moments: FloatArray
-    joint: bool
-    measured: FloatArray
-    predicted: FloatArray
-    covariance: FloatArray
-    squares: int
-    nodes: FloatArray
-    trace: FloatArray
-    system_series: FloatArray
-    system_variances: FloatArray
+    second_moments: FloatArray  # (d, d) time mean of y y^T
+    expected_moments: FloatArray  # (d, d) its exact expectation for the run's start and length
+    joint: bool  # whether q = p
+    measured: FloatArray  # (q,) time means, replicas averaged
+    predicted: FloatArray  # (q,) their exact expectation for the run's start and length
+    covariance: FloatArray  # (q, q) of measured, under the model
+    squares: int  # steps whose squares make up ``covariance``; 0 where it is known from the model
+    nodes: FloatArray  # (m, q) the node errors as combinations of the functions; (0, q) where these are too many
+    trace: FloatArray  # (q,) the system error as a combination of the functions
+    system_series: FloatArray  # (N,) system error of every step, replicas averaged
+    system_variances: FloatArray  # (N,) Var(D_k | y_k, g_k) of the system error, or its estimate with lost messages
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Value:
-    """What the next step may do to the values f of q forms, given one graph g and a = (s, 1).
+    """What the next step may do to the values f of q forms, given the graph g of this step.
 
-    Attributes
-    ----------
-    probability
-        (n,) P_gj
-    surprises
-        (n, q, p + 1): E[f(next) | next graph j] - E[f(next)] = surprises[j] @ a
-    forms
-        (n, q, d, d) Y_j
-    weights
-        (d, d) W_g
-    noise
-        (d, d) N_g
+    In the methods, a is (b, p + 1): packed moments and 1 of b steps, averaged over R replicas; a combination is (q,).
     """
 
-    probability: FloatArray
-    surprises: FloatArray
-    forms: FloatArray
-    weights: FloatArray
-    noise: FloatArray
+    probability: FloatArray  # (n,) P_gj
+    surprises: FloatArray  # (n, q, p + 1), E[f(next) | next graph j] - E[f(next)] = surprises[j] @ a
+    forms: FloatArray  # (n, q, d, d) Y_j
+    weights: FloatArray  # (d, d) W_g
+    noise: FloatArray  # (d, d) N_g
 
     def jumps(self, a: FloatArray) -> FloatArray:
-        """(q, q): the part of the sum over steps of Cov(D_k | now) that the next graph is to blame for.
-
-        Parameters
-        ----------
-        a
-            (b, p + 1) of some steps
-        """
+        """(q, q): the part of the sum over the steps of Cov(D_k | now) that is due to the next graph."""
         total = np.zeros((self.forms.shape[1],) * 2)
         for probability, surprise in zip(self.probability, self.surprises, strict=True):
             surprised = a @ surprise.T
@@ -123,14 +68,9 @@ class Value:
         return total
 
     def spread(self, total: FloatArray) -> FloatArray:
-        """(q, q): the part that the noise is to blame for, with one replica.
+        """(q, q): the part that is due to the noise, with one replica; ``total`` (p + 1,) is the sum of a.
 
         Given the next graph j, the next state is N(W y, N): Cov(f_a, f_b) = 2 tr(A N B N) + 4 y^T W^T A N B W y.
-
-        Parameters
-        ----------
-        total
-            (p + 1,) sum of a over the steps
         """
         moved = self.weights @ symmetric.unpack(total[:-1], len(self.weights)) @ self.weights.T
         seen = 2.0 * total[-1] * self.noise + 4.0 * moved
@@ -141,40 +81,16 @@ class Value:
         return result
 
     def variances(self, combination: FloatArray, a: FloatArray, replicas: int) -> FloatArray:
-        """(b,): Var(D_k | now) of one combination (q,) of the forms in every step, a being (b, p + 1).
-
-        Parameters
-        ----------
-        combination
-            (q,) of the forms
-        a
-            (b, p + 1) packed moments and 1, of each step
-        replicas
-            R, over which ``a`` is averaged
-        """
+        """(b,): Var(D_k | now) of one combination of the forms in every step."""
         return np.asarray(self.jump_variances(combination, a) + a @ self.spread_variance(combination) / replicas)
 
     def jump_variances(self, combination: FloatArray, a: FloatArray) -> FloatArray:
-        """(b,): the part of ``variances`` that the next graph is to blame for.
-
-        Parameters
-        ----------
-        combination
-            (q,) of the forms
-        a
-            (b, p + 1) packed moments and 1, of each step
-        """
+        """(b,): the part of ``variances`` that is due to the next graph."""
         parts = [(a @ (combination @ surprise)) ** 2 for surprise in self.surprises]
         return np.asarray(self.probability @ np.array(parts))
 
     def spread_variance(self, combination: FloatArray) -> FloatArray:
-        """(p + 1,): as a function of a, the part that the noise is to blame for, with one replica.
-
-        Parameters
-        ----------
-        combination
-            (q,) of the forms
-        """
+        """(p + 1,): coefficients on a of the part of ``variances`` that is due to the noise, with one replica."""
         linear = np.zeros(self.surprises.shape[2])
         for probability, form in zip(self.probability, self.forms, strict=True):
             matrix = np.tensordot(combination, form, axes=1)
@@ -186,45 +102,24 @@ class Value:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedValue:
-    """The same where replicas share lost messages; b = (s, 1) is that of the next state, before the jump.
+    """As ``Value``, where replicas share lost messages, on which the noise of a step depends too.
 
-    Attributes
-    ----------
-    probability
-        (n,) P_gj
-    surprises
-        (n, q, p + 1): f(next) - F_k = surprises[j] @ b for the next graph j
-    reached
-        (q, p + 1): F_k = reached @ b
-    expected
-        (q, p + 1): E[f(next)] = expected @ a
+    With F_k = E[f(y_k+1, g_k+1) | y_k+1, g_k], D_k = (F_k - E[f(next) | now]) + (f(next) - F_k). The variance of the
+    second part, the jump's, given y_k+1 and g_k is known. The first part is squared: every step adds to it, so its
+    squares do add up to its variance. b is a of the next state, before the jump; both are (steps, p + 1).
     """
 
-    probability: FloatArray
-    surprises: FloatArray
-    reached: FloatArray
-    expected: FloatArray
+    probability: FloatArray  # (n,) P_gj
+    surprises: FloatArray  # (n, q, p + 1), f(next) - F_k = surprises[j] @ b for the next graph j
+    reached: FloatArray  # (q, p + 1), F_k = reached @ b
+    expected: FloatArray  # (q, p + 1), E[f(next)] = expected @ a
 
     def increments(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """(steps, q): F_k - E[f(next)] of steps with these a and b, both (steps, p + 1).
-
-        Parameters
-        ----------
-        a
-            (steps, p + 1) packed moments and 1 before each step
-        b
-            (steps, p + 1) the same after it
-        """
+        """(steps, q): F_k - E[f(next)]."""
         return np.asarray(b @ self.reached.T - a @ self.expected.T)
 
     def jumps(self, b: FloatArray) -> FloatArray:
-        """(q, q): sum over steps of Cov(f(next) - F_k), with b (steps, p + 1).
-
-        Parameters
-        ----------
-        b
-            (steps, p + 1) packed moments and 1 after each step
-        """
+        """(q, q): sum over the steps of Cov(f(next) - F_k)."""
         total = np.zeros((self.surprises.shape[1],) * 2)
         for probability, surprise in zip(self.probability, self.surprises, strict=True):
             surprised = b @ surprise.T
@@ -232,29 +127,26 @@ class SharedValue:
         return total
 
     def jump_variances(self, combination: FloatArray, b: FloatArray) -> FloatArray:
-        """(steps,): Var(f(next) - F_k) of one combination (q,) of the forms.
-
-        Parameters
-        ----------
-        combination
-            (q,) of the forms
-        b
-            (steps, p + 1) packed moments and 1 after each step
-        """
+        """(steps,): Var(f(next) - F_k) of one combination (q,) of the forms."""
         parts = [(b @ (combination @ surprise)) ** 2 for surprise in self.surprises]
         return np.asarray(self.probability @ np.array(parts))
 
 
 def expected_mean(observation: Observation) -> FloatArray:
-    """(d, d) exact mean of E[y(k) y(k)^T] over the run's steps: steady, or transient from the known start.
+    """Exact mean of E[y y^T] over the steps of a run: steady, or transient from the known start.
 
-    A run that was not started from the stationary law is taken as it started, at the x(0) of its record and
-    the graph that it logged first: what one draw of g(0) does to a transient is no error.
+    A run that did not start from the stationary law is conditioned on the x(0) of its record and the first logged
+    graph: the effect of one draw of g(0) on a transient is not an error.
 
     Parameters
     ----------
     observation
         of a run in lockstep
+
+    Returns
+    -------
+    FloatArray
+        (d, d)
     """
     prediction = observation.prediction
     step, system, steady = prediction.step, prediction.system, prediction.steady
@@ -269,14 +161,9 @@ def expected_mean(observation: Observation) -> FloatArray:
 
 
 def time_means(observation: Observation) -> TimeMeans:
-    """Measure a run's second moments and their standard errors.
+    """Second moments of a run in lockstep and their standard errors, by the martingale method of this module.
 
     Time and memory per step are those of p = d (d + 1) / 2 second moments.
-
-    Parameters
-    ----------
-    observation
-        of a run in lockstep
     """
     system, steps = observation.prediction.system, observation.steps
     p = symmetric.size(system.dimension)
@@ -323,7 +210,7 @@ def time_means(observation: Observation) -> TimeMeans:
 
 
 def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedValue]:
-    """One for each graph.
+    """Values f of the Poisson equation, one object for each graph.
 
     Parameters
     ----------
@@ -339,7 +226,7 @@ def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedV
     here = np.concatenate([packed, kappa.T[:, :, None]], axis=2)  # f(y, j) = here[j] @ (s, 1)
     values: list[Value | SharedValue] = []
     for mode, step in enumerate(system.matrices):
-        before = step.T @ dual @ step  # (q, n, d, d): the adjoint of what this graph's step does
+        before = step.T @ dual @ step  # (q, n, d, d): the adjoint of this graph's step
         if system.loss_variance is not None:
             before += lost_adjoint(system.lift, system.loss_variance[mode], dual)
         constant = packed @ symmetric.pack(system.noise[mode]) + kappa.T
@@ -357,20 +244,13 @@ def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedV
 def forms_of(
     system: JumpSystem, kind: Literal["joint", "nodes", "system"]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What is estimated: all second moments, the node errors, or the system error.
-
-    Parameters
-    ----------
-    system
-        reduced
-    kind
-        what to estimate
+    """Linear functions of packed y y^T to be estimated: all second moments, the node errors, or the system error.
 
     Returns
     -------
     tuple[FloatArray, FloatArray, FloatArray]
-        the forms (q, p) on packed y y^T; the node errors (m, q) as combinations of them, or (0, q) if only the system
-        error is estimated; the system error (q,), which is the sum of the node errors
+        the forms (q, p); the node errors as combinations of them (m, q), or (0, q) if only the system error is
+        estimated; the system error (q,), which is the sum of the node errors
     """
     per_node = symmetric.pack(system.lift[:, :, None] * system.lift[:, None, :])
     if kind == "joint":
@@ -381,31 +261,11 @@ def forms_of(
 
 
 def moments(observation: Observation, first: int, last: int, states: FloatArray) -> FloatArray:
-    """(last - first, p): packed y y^T of the states first..last-1 of (N + 1, m, R), averaged over the replicas.
-
-    Parameters
-    ----------
-    observation
-        of the run
-    first
-        step
-    last
-        step behind the last one
-    states
-        (N + 1, m, R) of the run
-    """
+    """(last - first, p): packed y y^T of the states first..last-1 of (N + 1, m, R), averaged over the replicas."""
     return packed_moments(states[first:last] - observation.step.reference, observation.prediction.system)
 
 
 def packed_moments(deviations: FloatArray, system: JumpSystem) -> FloatArray:
-    """(b, p): packed y y^T of what the agents are off in some steps, (b, m, R), averaged over the replicas.
-
-    Parameters
-    ----------
-    deviations
-        (b, m, R) from what the states should be
-    system
-        whose reduced coordinates
-    """
+    """(b, p): packed y y^T of deviations (b, m, R) from what the states should be, averaged over the replicas."""
     y = np.einsum("kmr,md->krd", deviations, system.lift, optimize=True)
     return symmetric.pack(y.transpose(0, 2, 1) @ y / deviations.shape[2])

@@ -1,4 +1,4 @@
-"""What a run did, without a prediction to hold it against."""
+"""Measured errors of a run without a prediction."""
 
 from __future__ import annotations
 
@@ -12,43 +12,22 @@ from msg_analysis.model.step import Wiring
 from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
-BATCH = 5
-"""Steps taken together when looking for the end of the transient."""
+BATCH = 5  # steps averaged when searching for the end of the transient
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """The complete beginning of a run, without the transient at its start.
+    """The complete beginning of a run, with errors after the transient at its start."""
 
-    Attributes
-    ----------
-    first
-        step from which on it is measured
-    step
-        who hears whom, and how the graphs switch
-    deviations
-        (N - first, m, R) of the agents from the reference, or in consensus from their mean
-    modes
-        (N,) g(0..N-1)
-    lost
-        (N, m, D) see ``Trajectory.lost``
-    """
-
-    first: int
+    first: int  # step at which the errors begin
     step: Wiring
-    deviations: FloatArray
-    modes: IntArray
-    lost: BoolArray | None
+    deviations: FloatArray  # (N - first, m, R) from the reference, or in consensus from the agents' mean
+    modes: IntArray  # (N,) g(0..N-1)
+    lost: BoolArray | None  # (N, m, D) see ``Trajectory.lost``
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> Measurement:
-        """Everything before the first gap.
-
-        Parameters
-        ----------
-        trajectory
-            of a bag or of the twin
-        """
+        """Everything before the first gap, of a run from a bag or from the twin."""
         experiment, steps = trajectory.record.experiment, max(trajectory.prefix, 0)
         values = trajectory.values[:steps]
         consensus = experiment.problem == "consensus"
@@ -80,23 +59,17 @@ class Measurement:
         return _system_errors(self.deviations)
 
     def blocks(self, numbers_per_step: int) -> Iterator[tuple[int, int]]:
-        """See ``Observation.blocks``.
-
-        Parameters
-        ----------
-        numbers_per_step
-            that are kept at once for a step
-        """
+        """See ``Observation.blocks``."""
         length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
         for first in range(0, self.steps, length):
             yield first, min(first + length, self.steps)
 
 
 def transient_length(series: FloatArray) -> int:
-    """Steps at the start of a series that its mean is better without, by MSER-5 (White 1997); at most half of them.
+    """Steps at the start of a series without which its mean is more precise, by MSER-5 (White 1997).
 
-    Of means over 5 steps, those are left out without which the variance of the mean of the others, as if they were
-    independent, is least.
+    Of the means of 5 steps, the number left out minimises the variance of the mean of the others, as if these were
+    independent. At most half are left out; 0 for series shorter than 20.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Many tests, one level: Holm's step-down adjustment."""
+"""Holm's step-down adjustment of many tests to one level."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from msg_analysis.types import FloatArray
 
 
 def holm(p_values: FloatArray) -> FloatArray:
-    """Adjusted p-values: rejecting those below a level keeps the chance of any false rejection below it.
+    """Adjusted p-values: the probability that any true hypothesis has one below a level is at most that level.
 
-    Holds whatever the dependence between the tests (Holm 1979).
+    This holds for any dependence between the tests (Holm 1979).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A run beside its prediction: what every test looks at."""
+"""A run beside its prediction: the input of every test."""
 
 from __future__ import annotations
 
@@ -13,76 +13,37 @@ from msg_analysis.model.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
+# States are clipped to this: fourth powers of much larger numbers overflow, and no test could be computed
 LARGEST = 1e60
-"""No run comes near it. The square of the square of a number much larger is none, and then no test says anything."""
-BLOCK_NUMBERS = 2_000_000
-"""Numbers of temporary arrays per block of steps: 16 MB each, however long the run."""
+BLOCK_NUMBERS = 2_000_000  # numbers in temporary arrays per block of steps: 16 MB each, for runs of any length
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timers:
-    """What the agents of a run in real time say of each of their steps.
+    """What the agents of a run in real time log about each of their steps."""
 
-    Attributes
-    ----------
-    graphs
-        (N, m) index of the graph that the agent used
-    used
-        (N, m, D) see ``Trajectory.used``
-    made
-        (N + 1, m) [ns of simulated time] see ``Trajectory.made``
-    """
-
-    graphs: IntArray
-    used: IntArray
-    made: IntArray
+    graphs: IntArray  # (N, m) index of the graph that the agent used
+    used: IntArray  # (N, m, D) see ``Trajectory.used``
+    made: IntArray  # (N + 1, m) [ns of simulated time] see ``Trajectory.made``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """The complete beginning of a run, and what theory says about it.
+    """The complete beginning of a run, and its prediction."""
 
-    Attributes
-    ----------
-    prediction
-        of the experiment that the record says was run
-    states
-        (N + 1, m, R) x(0..N), as of ``bounded``
-    modes
-        (N,) g(0..N-1)
-    start
-        (m, R) x(0) of the record
-    published
-        (N + 1, m, R) what others heard of x(0..N), where that is not the truth; else None
-    lost
-        (N, m, D) see ``Trajectory.lost``
-    timers
-        in real time; None in lockstep
-    """
-
-    prediction: Prediction
-    states: FloatArray
-    modes: IntArray
-    start: FloatArray
-    published: FloatArray | None = None
-    lost: BoolArray | None = None
-    timers: Timers | None = None
+    prediction: Prediction  # of the experiment in the record
+    states: FloatArray  # (N + 1, m, R) x(0..N), clipped by ``bounded``
+    modes: IntArray  # (N,) g(0..N-1)
+    start: FloatArray  # (m, R) x(0) of the record
+    published: FloatArray | None = None  # (N + 1, m, R) what others heard of x(0..N); None where that is x
+    lost: BoolArray | None = None  # (N, m, D) see ``Trajectory.lost``
+    timers: Timers | None = None  # None in lockstep
 
     @classmethod
     def of(cls, trajectory: Trajectory, prediction: Prediction) -> Observation:
         """Everything before the first gap.
 
-        Parameters
-        ----------
-        trajectory
-            of a bag or of the twin
-        prediction
-            of its experiment
-
-        Raises
-        ------
-        InputError
-            a run in real time whose log does not say what the agents used
+        InputError if the log of a run in real time does not say what the agents used.
         """
         real_time = trajectory.record.experiment.run.pace == "realtime"
         steps = _known_steps(trajectory) if real_time else trajectory.prefix
@@ -107,7 +68,7 @@ class Observation:
 
     @property
     def step(self) -> StepModel:
-        """What one step of the run does."""
+        """The law of one step."""
         return self.prediction.step
 
     @property
@@ -121,38 +82,21 @@ class Observation:
         return int(self.states.shape[2])
 
     def blocks(self, numbers_per_step: int) -> Iterator[tuple[int, int]]:
-        """(first, last + 1) of blocks of steps that keep temporary arrays small.
-
-        Parameters
-        ----------
-        numbers_per_step
-            size of the largest temporary array, per step
-        """
+        """(first, last + 1) of blocks of steps that keep temporary arrays of so many numbers per step small."""
         length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
         for first in range(0, self.steps, length):
             yield first, min(first + length, self.steps)
 
 
 def bounded(states: FloatArray) -> FloatArray:
-    """The same, and what is beyond ``LARGEST`` as large as that: wrong all the same, and it can be computed with.
-
-    Parameters
-    ----------
-    states
-        of any shape
-
-    Returns
-    -------
-    FloatArray
-        of the same shape
-    """
+    """The array, of any shape, clipped to ``LARGEST`` either way: such states are wrong, but can be computed with."""
     if not states.size or (states.max() <= LARGEST and states.min() >= -LARGEST):
         return states
     return np.clip(states, -LARGEST, LARGEST)
 
 
 def _known_steps(trajectory: Trajectory) -> int:
-    """Steps of the longest complete beginning in which nobody uses a value from after its end."""
+    """Steps of the longest complete beginning in which no agent uses a value from after its end."""
     steps = trajectory.prefix
     if trajectory.agent_modes is None or trajectory.used is None or trajectory.made is None:
         raise InputError(

@@ -1,12 +1,10 @@
-"""The errors of a network beside their prediction while it runs: the numbers of a comparison, one step at a time.
+"""Errors of a network beside their prediction while it runs: the numbers of a comparison, one step at a time.
 
-Measured are time means, as in :mod:`msg_analysis.inference.martingale`, with the same standard errors: of a run that
-has come whole, both give the same. Nothing of the past is kept but sums. Per step, the system error takes O(m^2), and
-so do the node errors: with more than ``EVERY_STEP`` agents, what a node's standard error needs is looked at in some
-steps only, which stand for all. While a start that is not stationary is still felt, the expectation is stepped along:
-O(n m^3).
-
-Steps that did not come whole are left out of the measured and of the predicted mean alike.
+Measured are time means with the standard errors of :mod:`msg_analysis.inference.martingale`: of a complete run of up to
+``EVERY_STEP`` agents, both give the same. Only sums are kept. Per step, the system error takes O(m^2), and so do the
+node errors: with more agents, the standard errors of the nodes are estimated from some of the steps only. While the
+effect of a start that is not stationary lasts, the expectation is stepped along: O(n m^3). Incomplete steps are left
+out of the measured and of the predicted mean alike.
 """
 
 from __future__ import annotations
@@ -24,67 +22,37 @@ from msg_analysis.theory import symmetric
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.types import FloatArray, IntArray
 
-EVERY_STEP = 20
-"""Agents up to which every step is looked at for the standard errors of the nodes; beyond, one in m / 20."""
-MOST_BYTES = 256 * 2**20
-"""Of what the standard errors of the nodes are computed with; if that does not do, they are left out."""
+EVERY_STEP = 20  # agents up to which every step is used for the standard errors of the nodes; beyond, one in m / 20
+MOST_BYTES = 256 * 2**20  # memory for the standard errors of the nodes; where that is too little, they are left out
 
 
 @dataclass(frozen=True, slots=True)
 class LiveReport:
-    """How far a network has come, and its errors so far.
+    """Progress of a network, and its errors so far."""
 
-    Attributes
-    ----------
-    first, last
-        first and last step that went into the errors; -1: none did
-    steps
-        how many did
-    newest
-        largest step that anything has come of; -1: nothing has
-    system, nodes
-        measured beside predicted
-    note
-        why there is no prediction, or no standard error; None where there are both
-    refused
-        states or steps that do not count, by reason
-    latest
-        of the newest whole step: its number, its graph from 0 (in real time: 0), and the first replica (m,)
-    """
-
-    first: int
-    last: int
-    steps: int
-    newest: int
+    first: int  # first step in the errors; -1: none
+    last: int  # last step in the errors; -1: none
+    steps: int  # number of steps in the errors
+    newest: int  # largest step with any state; -1: none
     system: Estimate
     nodes: list[Estimate]
-    note: str | None
-    refused: dict[str, int] = field(default_factory=dict)
+    note: str | None  # why there is no prediction, or no standard error; None where there are both
+    refused: dict[str, int] = field(default_factory=dict)  # states or steps that do not count, by reason
+    # Newest whole step: number, graph from 0 (in real time: 0), first replica (m,)
     latest: tuple[int, int, FloatArray] | None = None
 
     @property
     def missing(self) -> int:
-        """Steps between first and last that did not come whole."""
+        """Incomplete steps between first and last."""
         return self.last - self.first + 1 - self.steps if self.steps else 0
 
 
 class LiveEstimate:
-    """The errors of a run beside their prediction, from the states as they come.
+    """The errors of a run beside their prediction, from the states as they arrive.
 
-    In real time agents are not at the same step at the same moment, and what is expected of the errors depends on their
-    timing: then there is no standard error, and the prediction is that of agents that are never late.
-
-    Parameters
-    ----------
-    record
-        of the run
-    nodes
-        whether to give standard errors of the nodes, too, where that is not too much
-
-    Raises
-    ------
-    InputError
-        no prediction (too large, unbounded)
+    In real time agents are at different steps at the same moment, and the expected errors depend on their timing: then
+    there is no standard error, and the prediction is that of agents that are never late. ``nodes`` asks for standard
+    errors of the nodes. InputError where there is no prediction (too large, unbounded).
     """
 
     def __init__(self, record: RunRecord, *, nodes: bool = True) -> None:
@@ -104,35 +72,11 @@ class LiveEstimate:
             self._note = "too many agents for standard errors of each"
 
     def add(self, agent: int, step: int, mode: int, payload: bytes) -> None:
-        """See ``StepCollector.add``.
-
-        Parameters
-        ----------
-        agent
-            index from 0
-        step
-            k
-        mode
-            graph that led to it, from 0; -1 at step 0
-        payload
-            x(k), 8 bytes for each number
-        """
+        """Add x(step) of an agent (from 0), see ``StepCollector.add``; ``mode`` is from 1, 0 at step 0."""
         self.steps.add(agent, step, mode, payload)
 
     def add_whole(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
-        """Take steps that have come whole by another way, each once ever.
-
-        Parameters
-        ----------
-        steps
-            (b,) k
-        modes
-            (b,) graph of the step k -> k+1, from 0
-        states
-            (b, m, width) x(k)
-        after
-            (b, m, width) x(k+1)
-        """
+        """Add whole steps k (b,), each only once: graphs of k -> k+1 from 0 (b,), x(k) and x(k+1) (b, m, width)."""
         if not len(steps):
             return
         self._errors.add(steps, modes, states, after)
@@ -142,7 +86,7 @@ class LiveEstimate:
             self._latest = int(steps[newest]), int(modes[newest]), states[newest, :, 0].copy()
 
     def report(self) -> LiveReport:
-        """The numbers up to now."""
+        """The numbers so far."""
         self.add_whole(*self.steps.take())
         errors = self._errors
         system, nodes = errors.estimates()
@@ -160,32 +104,15 @@ class LiveEstimate:
 
 
 class RunningErrors:
-    """Sums over steps from which the errors of the agents and their standard errors can be had at any time.
-
-    Parameters
-    ----------
-    record
-        of the run
-    prediction
-        of its experiment; None: the errors are only measured
-    nodes
-        whether there should be standard errors of the nodes too
-
-    Attributes
-    ----------
-    first, last, count
-        first and last step that was added, and how many were; -1, -1, 0 at first
-    nodes_judged
-        whether there are standard errors of the nodes too
-    """
+    """Sums over steps that give errors and standard errors at any time; without a prediction, errors only."""
 
     def __init__(self, record: RunRecord, prediction: Prediction | None, *, nodes: bool = True) -> None:
         experiment = record.experiment
         self._record, self._prediction = record, prediction
         self._agents, self._replicas = experiment.agents, experiment.run.replicas
-        self.first = self.last = -1
-        self.count = 0
-        self.nodes_judged = False
+        self.first = self.last = -1  # first and last step that was added; -1: none
+        self.count = 0  # steps that were added
+        self.nodes_judged = False  # whether the nodes have standard errors, too
         self._squares = np.zeros(self._agents)  # sums of the agents' errors
         self._judge: _Judge | None = None
         self._expected: _Expected | None = None
@@ -196,17 +123,7 @@ class RunningErrors:
                 self.nodes_judged = self._judge.nodes
 
     def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
-        """Let steps count.
-
-        Parameters
-        ----------
-        steps
-            (b,) k, each once ever
-        modes
-            (b,) graph of the step k -> k+1, from 0
-        states, after
-            (b, m, width) x(k), x(k+1)
-        """
+        """Add steps, arrays as in ``LiveEstimate.add_whole``."""
         if not len(steps):
             return
         self.first = int(steps.min()) if self.first < 0 else min(self.first, int(steps.min()))
@@ -221,7 +138,7 @@ class RunningErrors:
             self._judge.add(steps, modes, deviations, later)
 
     def estimates(self) -> tuple[Estimate, list[Estimate]]:
-        """System error and node errors up to now."""
+        """System error and node errors so far."""
         if not self.count:
             return Estimate(), [Estimate()] * self._agents
         measured = np.concatenate([[self._squares.sum()], self._squares]) / self.count
@@ -239,7 +156,7 @@ class RunningErrors:
         return system, judged_nodes + [Estimate(float(m), float(p)) for m, p in pairs]
 
     def _deviations(self, states: FloatArray) -> FloatArray:
-        """(b, m, R): what the agents are off."""
+        """(b, m, R): deviations of the agents from the reference, or in consensus from their mean."""
         values = bounded(states[:, :, : self._replicas])
         if self._record.experiment.problem == "consensus":
             return np.asarray(values - values.mean(axis=1, keepdims=True))
@@ -247,18 +164,13 @@ class RunningErrors:
 
 
 class _Judge:
-    """Sums from which the variances of the time means follow, as in ``martingale.time_means``.
-
-    Attributes
-    ----------
-    nodes
-        whether of the node errors too, and not only of the system error; not where it would take too much
-    """
+    """Sums that give the variances of the time means, as in ``martingale.time_means``."""
 
     def __init__(self, prediction: Prediction, replicas: int, *, nodes: bool = True) -> None:
         system = prediction.system
         p = symmetric.size(system.dimension)
         agents = len(system.output)
+        # Whether the node errors are judged, too, and not only the system error.
         self.nodes = nodes and 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
         forms, _, trace = forms_of(system, "nodes" if self.nodes else "system")
         self._system, self._replicas = system, replicas
@@ -272,11 +184,11 @@ class _Judge:
             for value in self._values
         ]
         self._squares = np.zeros(1 + len(self._each))
-        self._looked = self._count = 0  # steps looked at for the nodes, and all
+        self._looked = self._count = 0  # steps used for the nodes, and all
         self._length = max(1, BLOCK_NUMBERS // max(p, agents * replicas))
 
     def add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
-        """Arrays as in ``RunningErrors.add``."""
+        """Arrays as in ``RunningErrors.add``, with deviations in place of states."""
         for first in range(0, len(steps), self._length):
             at = slice(first, first + self._length)
             self._add(steps[at], modes[at], deviations[at], later[at])
@@ -326,26 +238,20 @@ class _Judge:
 
 
 class _Expected:
-    """Exact expectation of the node errors, summed over steps.
-
-    Attributes
-    ----------
-    total
-        (m,)
-    """
+    """Exact expectation of the node errors, summed over steps."""
 
     def __init__(self, prediction: Prediction) -> None:
         self._prediction = prediction
         steady = prediction.steady
         self._steady = np.diag(prediction.system.lifted(steady.sum(axis=0)))
-        self._away: FloatArray | None = None  # from the steady state, of the step to be looked at next
+        self._away: FloatArray | None = None  # (n, d, d) from the steady state, of the next step
         self._law = np.empty(0)
         self._scale = 0.0
-        self._series: list[FloatArray] = []  # distance from the steady errors, of every step up to there
-        self.total = np.zeros(len(self._steady))
+        self._series: list[FloatArray] = []  # distance from the steady errors, of every step before that
+        self.total = np.zeros(len(self._steady))  # (m,)
 
     def add(self, steps: IntArray, record: RunRecord, first_mode: int | None) -> None:
-        """Let steps count; ``first_mode`` is g(0) if it is known."""
+        """Add steps; ``first_mode`` is g(0), which counts if it is known in the first call."""
         if self._away is None:
             self._begin(record, first_mode)
         assert self._away is not None

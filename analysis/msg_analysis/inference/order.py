@@ -1,4 +1,4 @@
-"""Which agents are more certain than which: pairs that a run can tell apart, all of them at one level."""
+"""Which agents have smaller errors than which: pairs that a run can distinguish, all at one level."""
 
 from __future__ import annotations
 
@@ -12,39 +12,24 @@ from msg_analysis.inference.martingale import TimeMeans
 from msg_analysis.inference.multiplicity import holm
 from msg_analysis.types import FloatArray, IntArray
 
-MAX_PAIRS = 4950
-"""Most pairs that are looked at: 100 agents."""
-SHOWN = 12
-"""Most statements in words."""
-EQUAL = 1e-9
-"""Relative difference of predicted errors that counts as none."""
+MAX_PAIRS = 4950  # pairs tested, at most: 100 agents
+SHOWN = 12  # statements in words, at most
+EQUAL = 1e-9  # relative difference of predicted errors that counts as none
 
 
 @dataclass(frozen=True, slots=True)
 class Distinction:
-    """A pair whose errors can be told apart; numbers from 1.
+    """A pair whose errors can be distinguished; numbers from 1."""
 
-    Attributes
-    ----------
-    better, worse
-        the one with the smaller measured error, and the other
-    difference, standard_error
-        of the measured errors, worse less better
-    confidence
-        1 - p, adjusted for all pairs (Holm)
-    predicted
-        whether theory has them in this order (True), in the other (False), or equal (None)
-    """
-
-    better: int
+    better: int  # the agent with the smaller measured error
     worse: int
-    difference: float
-    standard_error: float
-    confidence: float
-    predicted: bool | None
+    difference: float  # of the measured errors, worse - better
+    standard_error: float  # of ``difference``
+    confidence: float  # 1 - p, adjusted for all pairs (Holm)
+    predicted: bool | None  # whether the predicted order is the same; None if equal or unknown
 
     def to_json(self) -> dict[str, Any]:
-        """The document."""
+        """The JSON document."""
         return {
             "better": self.better,
             "worse": self.worse,
@@ -57,44 +42,30 @@ class Distinction:
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Measured errors in order.
+    """Measured errors in order."""
 
-    Attributes
-    ----------
-    ranking
-        numbers from 1, smallest measured error first
-    predicted_ranking
-        the same of the predicted errors; None without a prediction
-    distinctions
-        pairs that can be told apart, surest first
-    pairs
-        that were looked at
-    level
-        chance that any distinction is wrong
-    """
-
-    ranking: tuple[int, ...]
-    predicted_ranking: tuple[int, ...] | None
-    distinctions: tuple[Distinction, ...]
-    pairs: int
-    level: float
+    ranking: tuple[int, ...]  # numbers from 1, smallest measured error first
+    predicted_ranking: tuple[int, ...] | None  # the same of the predicted errors; None without a prediction
+    distinctions: tuple[Distinction, ...]  # pairs that can be distinguished, smallest p first
+    pairs: int  # that were tested
+    level: float  # probability that any distinction is wrong, at most
 
     @property
     def contradictions(self) -> tuple[Distinction, ...]:
-        """Pairs that are told apart otherwise than predicted."""
+        """Distinguished pairs whose predicted order is another, or whose predicted errors are equal."""
         if self.predicted_ranking is None:
             return ()
         return tuple(pair for pair in self.distinctions if not pair.predicted)
 
     @property
     def ties(self) -> tuple[tuple[int, int], ...]:
-        """Neighbours in the ranking that cannot be told apart."""
+        """Neighbours in the ranking that cannot be distinguished."""
         apart = {frozenset((pair.better, pair.worse)) for pair in self.distinctions}
         following = zip(self.ranking, self.ranking[1:], strict=False)
         return tuple(pair for pair in following if frozenset(pair) not in apart)
 
     def to_json(self) -> dict[str, Any]:
-        """The document."""
+        """The JSON document."""
         return {
             "ranking": list(self.ranking),
             "predicted_ranking": None if self.predicted_ranking is None else list(self.predicted_ranking),
@@ -108,15 +79,7 @@ class Order:
 
 
 def order_of_nodes(means: TimeMeans, level: float) -> Order | None:
-    """Put the agents in the order of their certainty; None where their errors are not estimated together.
-
-    Parameters
-    ----------
-    means
-        of a run, or of several
-    level
-        chance of telling any pair apart wrongly
-    """
+    """Order the agents by measured error; None where their errors are not estimated together."""
     if not len(means.nodes):
         return None
     covariance = means.nodes @ means.covariance @ means.nodes.T
@@ -124,18 +87,16 @@ def order_of_nodes(means: TimeMeans, level: float) -> Order | None:
 
 
 def order_of(measured: FloatArray, covariance: FloatArray, predicted: FloatArray | None, level: float) -> Order | None:
-    """Put estimates in order, and tell pairs of them apart; None where there is no pair, or too many.
+    """Order estimates, and distinguish pairs of them by z-tests, adjusted by Holm.
+
+    None where there is no pair, no noise, or more than ``MAX_PAIRS``.
 
     Parameters
     ----------
-    measured
-        (q,) estimates
-    covariance
-        (q, q) of them
-    predicted
-        (q,) what they should be, or None
+    measured, covariance, predicted
+        (q,) estimates, their (q, q), and (q,) what they should be, or None
     level
-        chance of telling any pair apart wrongly
+        probability of any wrong distinction, at most
     """
     q = len(measured)
     first, second = np.triu_indices(q, 1)
@@ -178,6 +139,6 @@ def _distinction(
 
 
 def _ranking(values: FloatArray) -> tuple[int, ...]:
-    # Rounding must not decide between what is equal by symmetry.
+    # Rounding must not order errors that are equal by symmetry.
     rounded: IntArray = np.rint(values / (EQUAL * max(float(np.abs(values).max(initial=0.0)), 1e-300))).astype(np.int64)
     return tuple(int(i) + 1 for i in np.argsort(rounded, kind="stable"))

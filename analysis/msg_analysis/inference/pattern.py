@@ -1,17 +1,13 @@
-"""The logged-pattern law: what a run in real time should show, given which values and graphs its log says were used.
+"""The logged-pattern law: the errors of a run in real time, given which values and graphs its log says were used.
 
-Timing does not depend on the states. So given the log the states are a linear function of independent normal numbers,
-from a known start, and replicas are independent of each other. With z(K) the stack of ``pattern_events``,
+Timing does not depend on the states. So given the log the states are linear in independent normal numbers, and replicas
+are independent. With z(K) the stack of ``pattern_events``,
 
-    z(K) = A_K z(K-1) + noise N_K,     M(K) = E[z z^T] = A_K M(K-1) A_K^T + N_K,
+    z(K) = A_K z(K-1) + noise N_K,     M(K) = E[z z^T] = A_K M(K-1) A_K^T + N_K,     Y(K-1) = H + A_K^T Y(K) A_K.
 
-the expectation of the time mean is exact, and so is its variance: for quadratic forms H the dual
-Y(K-1) = H + A_K^T Y(K) A_K gives E[sum of what is still to come | z], whose increments are martingale differences with
-
-    E[Cov(D_a, D_b)] = tr( Y_a N Y_b (4 M(K) - 2 N) ) / R,
-
-for the mean over R replicas. M is computed forwards, Y backwards, in blocks: the M of a block are computed again from
-its beginning when the Y come by.
+M gives the exact expectation of the time mean. For quadratic forms H the dual Y gives E[sum of what is still to come |
+z], with martingale increments D: E[Cov(D_a, D_b)] = tr( Y_a N Y_b (4 M(K) - 2 N) ) / R. M is computed forwards, Y
+backwards, in blocks: going backwards, the M of a block are computed again from its beginning.
 """
 
 from __future__ import annotations
@@ -29,33 +25,31 @@ from msg_analysis.theory import symmetric
 from msg_analysis.twin_realtime import IdealTimers
 from msg_analysis.types import FloatArray
 
-MAX_WORK = 6e10
-"""Most multiplications; a minute or so. What would need more is left out: joint test first, then the node errors."""
+MAX_WORK = 6e10  # multiplications, at most (about a minute); the joint test is left out first, then the node errors
 
-MAX_ENTRIES = 400
-"""Most entries of a stack."""
+MAX_ENTRIES = 400  # entries of a stack, at most
 
 
 class PatternUnavailableError(Exception):
-    """The log does not allow for its pattern law, or it would take too long; says why."""
+    """The log does not allow the pattern law, or it would take too long; the message says why."""
 
 
 def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
-    """What the timing of a run did to its system error, exactly: expectation given the log over that with ideal timers.
+    """Effect of a run's timing on its system error: expectation given the log over that with ideal timers, less 1.
 
-    The graphs of the network and the start are the same in both, so hardly anything is left to chance.
+    Both are exact, for the same start and graphs of the network, so that hardly anything is left to chance.
 
     Parameters
     ----------
     observation
         of a run in real time
     means
-        what ``pattern_means`` says of it
+        of ``pattern_means``
 
     Returns
     -------
     float | None
-        the quotient less 1; None where there is no error to speak of
+        None where the expected error is 0
     """
     experiment = observation.prediction.experiment
     graphs, used, made = IdealTimers(experiment, observation.step).log(observation.modes)
@@ -69,16 +63,10 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
 def pattern_means(observation: Observation, order: Order) -> TimeMeans:
     """Time means of the sampled states, with expectation and standard errors given the log.
 
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    order
-        of its events
-
     Raises
     ------
     PatternUnavailableError
+        contradictory times, too many values to be known at the same time, or a run that is too long
     """
     if order.contradiction:
         raise PatternUnavailableError(order.contradiction)
@@ -153,15 +141,15 @@ def _follow(
 
 
 def _start(observation: Observation) -> FloatArray:
-    """(m, m) mean of x x^T over the replicas at the start, which is known."""
+    """(m, m): mean of x x^T over the replicas at the known start."""
     start = observation.start - observation.step.reference
     if observation.prediction.experiment.problem == "consensus":
-        start = start - start.mean(axis=0)  # what all have in common does not count, and is large in numbers
+        start = start - start.mean(axis=0)  # the common part does not count, and can be large
     return np.asarray(start @ start.T / observation.replicas)
 
 
 def _forward(periods: Periods, start: FloatArray) -> tuple[FloatArray, list[FloatArray], int]:
-    """Sum of E[X X^T] (m, m), and M at the beginning of every block of so many periods."""
+    """Sum of E[X X^T] (m, m), M at the beginning of every block, and the number of periods in a block."""
     m, length = len(start), max(1, math.isqrt(periods.steps))
     total, beginnings, moment = np.zeros((m, m)), [], start
     for number in range(periods.steps):

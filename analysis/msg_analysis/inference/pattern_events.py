@@ -1,8 +1,8 @@
-"""A run in real time, period after period, as linear maps of what is known at its sampling times.
+"""The periods of a run in real time as linear maps between the states known at its sampling times.
 
-The network's state at the sampling time K dt is stacked: the newest state of every agent; older ones that some later
-step still uses, because a message was slow or its reader late; and, if noise is correlated between agents, numbers of
-a step that some agents have made and others not yet. A period takes one stack to the next by a matrix and noise, which
+The state of the network at the sampling time K dt is a stack: the newest state of every agent; older ones that a later
+step still uses, because a message was slow or its reader late; and, if noise is correlated between agents, the noise of
+a step that some agents have made and others not yet. A period maps one stack to the next by a matrix and noise, which
 depend on the log alone. Nearly all periods of a run are alike: matrices are computed once for each pattern.
 """
 
@@ -18,38 +18,23 @@ from msg_analysis.inference.reception import neighbour_tables, neighbour_weights
 from msg_analysis.model.step import StepModel
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
-CACHED_NUMBERS = 20_000_000
-"""Numbers in cached matrices: 160 MB."""
+CACHED_NUMBERS = 20_000_000  # numbers in cached matrices: 160 MB
 
-_OWN = np.iinfo(np.int64).min
-"""Stands for a value that was never heard, whose place the agent's own takes."""
+_OWN = np.iinfo(np.int64).min  # stands for a value that was never heard; the agent's own value takes its place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Period:
-    """z(K) = matrix @ z(K-1) + noise, in deviations from the reference.
+    """z(K) = matrix @ z(K-1) + noise, in deviations from the reference; the size S of the stack may change to S'."""
 
-    Attributes
-    ----------
-    matrix
-        (S', S), of a shape that may change from period to period
-    noise
-        (S', S') covariance, of the shape that the stack has after the period
-    """
-
-    matrix: FloatArray
-    noise: FloatArray
+    matrix: FloatArray  # (S', S)
+    noise: FloatArray  # (S', S') covariance
 
 
 class Periods:
-    """The periods K = 1..N-1 of a run, from sampling time K-1 to K. The first m entries of a stack are X.
+    """The periods K = 1..N-1 of a run in real time, from sampling time K-1 to K.
 
-    Parameters
-    ----------
-    observation
-        in real time
-    position
-        (N, m) order in which the states were made
+    A stack begins with the m newest states. ``position`` (N, m) is the order in which the states were made.
     """
 
     def __init__(self, observation: Observation, position: IntArray) -> None:
@@ -59,7 +44,7 @@ class Periods:
         graphs, used, made = observation.timers.graphs, observation.timers.used, observation.timers.made
         steps, m = graphs.shape
         newest = newest_steps(observation)[:steps]
-        period = np.searchsorted(sampling_times(observation)[:steps], made[1:], side="left")  # N: too late to be seen
+        period = np.searchsorted(sampling_times(observation)[:steps], made[1:], side="left")  # N: not seen
         agents = np.arange(m)
         senders = neighbour_tables(step).senders[graphs, agents]
         known = np.minimum(period, steps - 1) - 1
@@ -78,11 +63,11 @@ class Periods:
         self.steps = steps
 
     def _extras(self, period: IntArray, newest: IntArray, used: IntArray, senders: IntArray, offsets: IntArray) -> None:
-        """What is stacked beside the newest states: rows (entry, its step from the newest one, or from K), by K."""
+        """What is stacked after the newest states: rows (entry, its step from the newest one, or from K), by K."""
         steps, m = period.shape
         k, i, d = np.nonzero((used >= 0) & (offsets < 0))
         sender, step, last = senders[k, i, d], used[k, i, d], period[k, i] - 1
-        # The next state of that agent was there at this sampling time already.
+        # First sampling time at which that agent has a newer state.
         first = period[step, sender]
         values, owner = np.unique(np.column_stack([sender, step, first]), axis=0, return_inverse=True)
         end = np.full(len(values), -1)
@@ -99,21 +84,14 @@ class Periods:
         found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0]))]
         self._extra = np.ascontiguousarray(found[:, 1:])
         self._extra_ends = np.searchsorted(found[:, 0], np.arange(steps + 1))
-        self.largest = m + int(np.diff(self._extra_ends).max(initial=0))
-        """Most entries of a stack."""
+        self.largest = m + int(np.diff(self._extra_ends).max(initial=0))  # entries of the largest stack
 
     def entries(self, number: int) -> int:
-        """Entries of the stack at a sampling time.
-
-        Parameters
-        ----------
-        number
-            K of the sampling time, from 0
-        """
+        """Entries of the stack at sampling time ``number``, from 0."""
         return self._step.agents + int(self._extra_ends[number + 1] - self._extra_ends[number])
 
     def __getitem__(self, number: int) -> Period:
-        """Of the period that ends at sampling time ``number`` (1..N-1)."""
+        """The period that ends at sampling time ``number`` (1..N-1)."""
         events = self._table[self._ends[number] : self._ends[number + 1]]
         before, after = (self._extra[self._extra_ends[k] : self._extra_ends[k + 1]] for k in (number - 1, number))
         key = b"|".join((events.tobytes(), before.tobytes(), after.tobytes()))
@@ -163,14 +141,9 @@ _Key = tuple[int, int]
 
 
 class _Live:
-    """Values as combinations of the stack at the beginning of a period, with the covariance of what noise has added.
+    """Values as combinations of the stack at the beginning of a period, and the covariance of the noise added since.
 
-    Parameters
-    ----------
-    entries
-        of the stack
-    agents
-        m; keys from there on are numbers of the noise, fresh and of variance 1 where they are not known yet
+    Keys are (agent or m + source, step); noise sources are numbers of variance 1, new where not known yet.
     """
 
     def __init__(self, entries: int, agents: int) -> None:
@@ -181,12 +154,12 @@ class _Live:
         self._free = list(range(2 * entries))[::-1]
 
     def start(self, key: _Key) -> None:
-        """The next entry of the stack."""
+        """Add the next entry of the stack."""
         place = self._new(key)
         self._matrix[place, len(self._place) - 1] = 1.0
 
     def add(self, key: _Key, terms: dict[_Key, float], variance: float) -> None:
-        """A combination of others, plus noise of its own."""
+        """Add a combination of others, plus noise of its own."""
         rows, weights = [self._find(used) for used in terms], np.array(list(terms.values()))
         matrix, noise = weights @ self._matrix[rows], weights @ self._noise[rows]
         own = float(noise[rows] @ weights) + variance
@@ -196,13 +169,13 @@ class _Live:
         self._noise[place, place] = own
 
     def drop(self, keys: list[_Key]) -> None:
-        """Forget what is not used any more."""
+        """Drop values that are no longer used."""
         for key in keys:
             if key in self._place:
                 self._free.append(self._place.pop(key))
 
     def take(self, keys: list[_Key]) -> Period:
-        """The stack at the end."""
+        """The period that ends with this stack."""
         rows = [self._find(key) for key in keys]
         return Period(self._matrix[rows], self._noise[np.ix_(rows, rows)])
 
@@ -224,12 +197,12 @@ class _Live:
 
 
 def _shared_sources(step: StepModel) -> BoolArray:
-    """(m,): sources of noise that more than one agent feels, in any graph."""
+    """(m,): whether more than one agent feels a source of noise, in any graph."""
     return np.asarray((step.noise_gain != 0.0).any(axis=0).sum(axis=0) > 1)
 
 
 def _spread(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
-    """All integers first..last of many ranges, and of which range each is."""
+    """All integers first..last of many ranges, and the index of each one's range."""
     lengths = np.maximum(last - first + 1, 0)
     which = np.repeat(np.arange(len(first)), lengths)
     starts = np.cumsum(lengths) - lengths

@@ -25,33 +25,17 @@ from msg_analysis.theory.prediction import Prediction, predict
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Member:
-    """One of the runs.
+    """One of the runs."""
 
-    Attributes
-    ----------
-    name
-        of its bag
-    record
-        of the run
-    steps
-        used: all, or those before the first gap; 0 where these are too few
-    completeness
-        of the bag
-    system_error
-        measured and predicted
-    verdict
-        on this run alone
-    """
-
-    name: str
+    name: str  # of its bag
     record: RunRecord
-    steps: int
+    steps: int  # used: all, or those before the first gap; 0 where these are too few
     completeness: Completeness
     system_error: Estimate
-    verdict: str
+    verdict: str  # on this run alone
 
     def to_json(self) -> dict[str, Any]:
-        """The document of one row."""
+        """The JSON document of one row."""
         count = self.completeness
         return {
             "bag": self.name,
@@ -69,15 +53,7 @@ class Member:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pool:
-    """The runs that a verdict is about.
-
-    Attributes
-    ----------
-    members
-        one for each run
-    chi2, dof, p
-        whether their system errors differ by more than chance makes them; None with less than two
-    """
+    """The runs of a comparison, and Cochran's Q test of whether their system errors differ; None without."""
 
     members: tuple[Member, ...]
     chi2: float | None = None
@@ -90,22 +66,15 @@ class Pool:
 
 
 def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.01) -> Comparison:
-    """Compare several runs of one experiment with its prediction, to one verdict.
+    """Compare several runs of one experiment, (name, trajectory) each, with its prediction, to one verdict.
 
-    All that is tested is added up over the runs, so that every step of every run counts the same, and long runs count
-    more. A further test of the family asks whether the runs are alike.
-
-    Parameters
-    ----------
-    runs
-        name and trajectory, one after the other; none is kept
-    level
-        chance of calling runs that follow their law ones that disagree
+    Sums are added up over the runs, so that every step counts the same. A further test of the family asks whether the
+    runs are alike (Cochran's Q). No trajectory is kept.
 
     Raises
     ------
     InputError
-        experiments that differ, a run that is there twice, or no prediction
+        no run, different experiments, a run or seed that is there twice, or no prediction
     """
     total: Evidence | None = None
     prediction: Prediction | None = None
@@ -133,7 +102,7 @@ def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.0
 
 
 def _examine(name: str, run: Trajectory, prediction: Prediction, level: float) -> tuple[Member, Evidence | None]:
-    """One run by itself; no evidence where too little of it came."""
+    """One run by itself; no evidence where too little of it arrived."""
     own = dataclasses.replace(prediction, experiment=run.record.experiment)
     observation = Observation.of(run, own)
     if observation.steps < compare.MIN_STEPS and not run.completeness.complete:
@@ -151,7 +120,7 @@ def _require_prediction(name: str, experiment: Experiment) -> None:
 
 
 def _require_another(members: list[Member], name: str, record: RunRecord) -> None:
-    """Another run of the same experiment, independent of the others."""
+    """InputError unless it is another run of the same experiment, independent of the others."""
     for other in members:
         if record.run == other.record.run:
             raise InputError(f"{name}: the same run as in {other.name} ({record.run}): give each run once")
@@ -177,7 +146,7 @@ def _shown(value: Any) -> str:
 
 
 def _without_data(run: Trajectory) -> Trajectory:
-    """Only what it was a run of."""
+    """Only the record and the completeness."""
     return dataclasses.replace(
         run,
         states=run.states[:0],
@@ -207,7 +176,7 @@ def _sum(counts: list[Completeness]) -> Completeness:
 
 
 def _pool(members: list[Member]) -> Pool:
-    """Whether what was measured less what was expected is the same in all runs: Cochran's Q."""
+    """Test whether measured - expected is the same in all runs: Cochran's Q."""
     z, errors = [], []
     for member in members:
         error = member.system_error

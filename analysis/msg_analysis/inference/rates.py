@@ -1,4 +1,4 @@
-"""Which rates of switching are wrong, and what they are: maximum likelihood of the counted transitions."""
+"""Which switching rates are wrong, and their estimates: maximum likelihood from the counted transitions."""
 
 from __future__ import annotations
 
@@ -12,46 +12,32 @@ from msg_analysis.inference.selection import Candidate, select
 from msg_analysis.model.chain import MarkovChain
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
-WIDEST = math.log(1e3)
-"""Largest change of a rate, either way, as a logarithm."""
-MAX_JUMPS = 400
-"""Most kinds of jumps that are looked at one by one."""
+WIDEST = math.log(1e3)  # largest change of a rate, either way, as a logarithm
+MAX_JUMPS = 400  # kinds of jumps; with more, no rates are tested
 
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Rates, or in discrete time probabilities, that are all wrong by one factor.
+    """Rates, or in discrete time probabilities, that are all wrong by one factor."""
 
-    Attributes
-    ----------
-    jumps
-        (from, to) of which they are, from 0
-    origin
-        the graph that is left, where it is all jumps of one; None for all
-    factor, interval
-        over what they should be; 95 % by the likelihood ratio
-    log_p
-        adjusted, see ``selection``
-    """
-
-    jumps: tuple[tuple[int, int], ...]
-    origin: int | None
-    factor: float
-    interval: tuple[float, float]
-    log_p: float
+    jumps: tuple[tuple[int, int], ...]  # (from, to) from 0
+    origin: int | None  # the graph that is left, where it is all jumps from one; else None
+    factor: float  # measured over nominal
+    interval: tuple[float, float]  # 95 %, by the likelihood ratio
+    log_p: float  # adjusted, see ``selection``
 
 
 def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, level: float) -> list[Rate]:
-    """Find the rates that explain the counted transitions.
+    """Find the rates that explain the counted transitions: score tests, then maximum likelihood of the factors.
 
     Parameters
     ----------
     counts
         (n, n) of transitions from step to step
     chain
-        what it should be
+        the nominal chain; with more than ``MAX_JUMPS`` kinds of jumps nothing is found
     dt
-        time of a step
+        length of a step [simulated time]
     families, level
         see ``selection.select``
     """
@@ -63,7 +49,7 @@ def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, l
     origin, target = np.array(jumps).T
     visits = counts.sum(axis=1)
     stay = np.diag(transition)
-    # Log-likelihood of e^theta P_gh, what stays making up for it: multinomial, row by row.
+    # Log-likelihood of e^theta P_gh, with P_gg making up the difference: multinomial, row by row.
     odds = np.divide(transition[origin, target], stay[origin], out=np.zeros(len(jumps)), where=stay[origin] > 0.0)
     score = counts[origin, target] - counts[origin, origin] * odds
     expected = visits[origin] * transition[origin, target]
@@ -93,13 +79,13 @@ def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, l
 def _likeliest(counts: IntArray, chain: MarkovChain, dt: float, chosen: BoolArray) -> tuple[float, tuple[float, float]]:
     """Logarithm of the factor of the chosen jumps, and the interval in which 2 log L falls by less than 3.84."""
     highest = WIDEST
-    if chain.time == "discrete":  # rows sum to 1
+    if chain.time == "discrete":  # the diagonal must not become negative
         given = (chain.matrix * chosen).sum(axis=1)
         room = np.diag(chain.matrix) + given
         highest = min(highest, float(np.log(room[given > 0.0] / given[given > 0.0]).min()) - 1e-9)
 
     def less(theta: float) -> float:
-        """Minus the log-likelihood."""
+        """Negative log-likelihood."""
         law = MarkovChain(chain.time, _scaled(chain.matrix, chain, chosen, theta)).transition(dt)
         with np.errstate(divide="ignore"):
             terms = np.where(counts > 0, counts * np.log(np.maximum(law, 1e-300)), 0.0)

@@ -1,9 +1,9 @@
-"""What the agents heard in the steps of a run: where something becomes of values on the air, and in real time.
+"""What the agents heard in the steps of a run, with noise or loss on the air, and in real time.
 
-From the log follows, for every step, what each agent used: which values of its neighbours, and in real time of which
-step they were and under which graph. Given that, the innovations are normal and independent, with a covariance that is
-known exactly: process noise, by the graph that each agent used, plus the link noise of the messages that came.
-Broadcast noise, losses and delays are in what was used; they are tested, or reported, by themselves.
+The log gives, for every step, what each agent used: which values of its neighbours, and in real time their steps and
+the graph. Given that, the innovations are normal and independent, with an exactly known covariance: process noise, by
+the graph that each agent used, plus the link noise of the received messages. Broadcast noise, losses and delays are
+part of what was used; they are tested, or reported, separately.
 """
 
 from __future__ import annotations
@@ -19,35 +19,20 @@ from msg_analysis.inference.observation import Observation
 from msg_analysis.model.step import StepModel, Wiring
 from msg_analysis.types import FloatArray, IntArray
 
-NO_NOISE = 1e-13
-"""Directions with less variance than this, relative to the noisiest one, count as free of noise."""
+NO_NOISE = 1e-13  # directions with less variance than this, relative to the noisiest one, count as without noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbours:
-    """The neighbours of every agent in every graph, padded.
+    """The neighbours of every agent in every graph, padded."""
 
-    Attributes
-    ----------
-    senders
-        (n, m, D) the d-th neighbour, ascending; the agent itself beyond their number
-    count
-        (n, m) their number
-    """
-
-    senders: IntArray
-    count: IntArray
+    senders: IntArray  # (n, m, D) the d-th neighbour, ascending; the agent itself beyond their number
+    count: IntArray  # (n, m) their number
 
 
 @lru_cache(maxsize=4)
 def neighbour_tables(wiring: Wiring) -> Neighbours:
-    """The neighbours that the log of a run with this wiring speaks of.
-
-    Parameters
-    ----------
-    wiring
-        of the experiment
-    """
+    """Tables of the neighbours, in the order of the log."""
     n, m = wiring.modes, wiring.agents
     senders = np.tile(np.arange(m)[:, None], (n, 1, wiring.most_neighbours))
     count = np.zeros((n, m), dtype=np.int64)
@@ -61,13 +46,7 @@ def neighbour_tables(wiring: Wiring) -> Neighbours:
 
 @lru_cache(maxsize=4)
 def neighbour_weights(step: StepModel) -> FloatArray:
-    """(n, m, D): nominal weights of the neighbours' values; 0 beyond their number.
-
-    Parameters
-    ----------
-    step
-        compiled experiment
-    """
+    """(n, m, D): nominal weights of the neighbours' values; 0 beyond their number."""
     tables = neighbour_tables(step)
     there = np.arange(step.most_neighbours) < tables.count[:, :, None]
     return np.where(there, np.take_along_axis(step.nominal, tables.senders, axis=2), 0.0)
@@ -75,53 +54,21 @@ def neighbour_weights(step: StepModel) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reception:
-    """What was heard in a block of b steps.
+    """What was heard in a block of b steps."""
 
-    Attributes
-    ----------
-    modes
-        (b,) graphs of the network
-    graphs
-        (b, m) graphs that the agents used; in lockstep those of the network
-    states
-        (b, m, R) x
-    published
-        (N + 1, m, R) what the agents published, of all steps
-    used
-        (b, m, D) step of the value of the d-th neighbour that was used; any where none came
-    senders
-        (b, m, D) who that neighbour is
-    weights
-        (b, m, D) nominal weights of what came; 0 for others
-    own
-        (b, m) weight of an agent's own state, which stands for what did not come too
-    link_variance
-        (b, m) of the link noise in what each agent heard
-    """
-
-    modes: IntArray
-    graphs: IntArray
-    states: FloatArray
-    published: FloatArray
-    used: IntArray
-    senders: IntArray
-    weights: FloatArray
-    own: FloatArray
-    link_variance: FloatArray
+    modes: IntArray  # (b,) graphs of the network
+    graphs: IntArray  # (b, m) graphs that the agents used; in lockstep those of the network
+    states: FloatArray  # (b, m, R) x
+    published: FloatArray  # (N + 1, m, R) what the agents published, of all steps
+    used: IntArray  # (b, m, D) step of the used value of the d-th neighbour; arbitrary where none arrived
+    senders: IntArray  # (b, m, D) that neighbour
+    weights: FloatArray  # (b, m, D) nominal weights of received values; 0 for others
+    own: FloatArray  # (b, m) weight of an agent's own state, which also replaces values that did not arrive
+    link_variance: FloatArray  # (b, m) of the link noise in what each agent heard
 
     @classmethod
     def of(cls, observation: Observation, first: int, last: int) -> Reception:
-        """Of the steps first..last-1.
-
-        Parameters
-        ----------
-        observation
-            of a run whose log says what was heard
-        first
-            step
-        last
-            step behind the last one
-        """
+        """Reception of the steps first..last-1."""
         step, modes, timers = observation.step, observation.modes[first:last], observation.timers
         tables, agents = neighbour_tables(step), np.arange(step.agents)
         if timers is None:
@@ -147,22 +94,14 @@ class Reception:
         )
 
     def heard(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
-        """(len(at), a, R): in some steps of the block, what these agents (a,) used for these neighbours (a,).
-
-        Parameters
-        ----------
-        at
-            (k,) steps, counted from the first of the block
-        agents
-            (a,) receivers, from 0
-        which
-            (a,) places of the senders among their neighbours
+        """(k, a, R): what ``agents`` (a,) used of their neighbours ``which`` (a,) in the steps ``at`` (k,) of the
+        block.
         """
         index = at[:, None], agents, which
         return np.asarray(self.published[self.used[index], self.senders[index]])
 
     def mean(self) -> FloatArray:
-        """(b, m, R): what these steps lead to without noise and without what the reference adds."""
+        """(b, m, R): the next states without noise and without the term of the reference."""
         total = self.own[:, :, None] * self.states
         every, agents = np.arange(len(self.modes)), np.arange(self.states.shape[1])
         for d in range(self.weights.shape[2]):
@@ -170,12 +109,9 @@ class Reception:
         return np.asarray(total)
 
     def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
-        """Steps of the block that are alike: (graphs (m,) of the agents, their order (m,) if it counts, steps (a,)).
+        """Groups of like steps of the block: graphs (m,) of the agents, their order (m,) or None, steps (a,).
 
-        Parameters
-        ----------
-        order
-            (b, m) agents of each step, first to last
+        ``order`` (b, m) has the agents of each step, first to last.
         """
         if order is None and (self.graphs == self.modes[:, None]).all():
             for mode in np.unique(self.modes):
@@ -194,19 +130,9 @@ class Reception:
 
 
 def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Receiver, sender, and place of the sender among the receiver's neighbours, of every link of a graph.
+    """Receiver, sender, and place among the receiver's neighbours, (links,) each, of all links of a graph.
 
-    Parameters
-    ----------
-    step
-        wiring
-    mode
-        graph, from 0
-
-    Returns
-    -------
-    tuple[IntArray, IntArray, IntArray]
-        (links,) each, by receiver and then by sender
+    Sorted by receiver and then by sender.
     """
     tables = neighbour_tables(step)
     receiver, which = np.nonzero(np.arange(step.most_neighbours) < tables.count[mode][:, None])
@@ -214,13 +140,7 @@ def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def full_reception_noise(observation: Observation) -> FloatArray:
-    """(n, m, m): covariance of the innovations of a step in which nothing is lost.
-
-    Parameters
-    ----------
-    observation
-        of a run
-    """
+    """(n, m, m): covariance of the innovations of a step in which nothing is lost."""
     step = observation.step
     link = observation.prediction.experiment.noise.link**2 * (neighbour_weights(step) ** 2).sum(axis=2)
     process = step.noise_gain @ step.noise_gain.transpose(0, 2, 1)
@@ -228,61 +148,30 @@ def full_reception_noise(observation: Observation) -> FloatArray:
 
 
 def process_noise(step: StepModel, graphs: IntArray) -> FloatArray:
-    """(m, m): covariance of the process noise of a step in which the agents use these graphs (m,).
-
-    Parameters
-    ----------
-    step
-        compiled experiment
-    graphs
-        (m,) that the agents use, from 0
-    """
+    """(m, m): covariance of the process noise of a step in which the agents use these graphs (m,)."""
     gain = step.noise_gain[graphs, np.arange(step.agents)]
     return np.asarray(gain @ gain.T)
 
 
 class Equalizer:
-    """Innovations of steps of unequal covariance, brought to that of steps in which all is as it should be.
+    """Transforms innovations of steps with different covariances to the covariance of a regular step.
 
-    With N the covariance of a step and M that of a step of the network's graph in which all messages came and everybody
-    knew the graph, M^1/2 N^-1/2 e has the covariance M. Where a step has not as many directions with noise as M (an
-    agent without process noise has heard nobody), it cannot be brought there: then only the total size of all
-    innovations is left to test.
-
-    Parameters
-    ----------
-    step
-        compiled experiment
-    full
-        (n, m, m) of ``full_reception_noise``
-
-    Attributes
-    ----------
-    possible
-        whether every step so far could be brought there
-    chi2, dof
-        sum of e^T N^+ e, and how many numbers have gone into it
-    quiet
-        largest innovation in directions without noise
+    With N the covariance of a step and M that of a step of the network's graph in which all messages arrived and all
+    agents knew the graph, M^1/2 N^-1/2 e has the covariance M. Where N and M differ in their number of noisy directions
+    (an agent without process noise received nothing), that is not possible: then only the total size of all innovations
+    can be tested. ``full`` are the M of all graphs, (n, m, m).
     """
 
     def __init__(self, step: StepModel, full: FloatArray) -> None:
         self._step = step
         self._roots = [_root(matrix, 0.5) for matrix in full]
         self._ranks = [rank for _, rank in self._roots]
-        self.possible = True
+        self.possible = True  # for every step so far
+        # Sum of e^T N^+ e, its degrees of freedom, and the largest innovation in directions without noise.
         self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
 
     def equalize(self, innovations: FloatArray, reception: Reception) -> FloatArray:
-        """(b, m, R) of (b, m, R).
-
-        Parameters
-        ----------
-        innovations
-            (b, m, R) of the steps of a block
-        reception
-            of the same block
-        """
+        """(b, m, R): transformed innovations (b, m, R) of the steps of a block."""
         m = innovations.shape[1]
         keys = np.column_stack([reception.modes, reception.graphs, reception.link_variance])
         patterns, owner = np.unique(keys, axis=0, return_inverse=True)
@@ -305,13 +194,7 @@ class Equalizer:
         return equal
 
     def merge(self, other: Equalizer) -> None:
-        """Take what another one has of another run of the same experiment.
-
-        Parameters
-        ----------
-        other
-            of another run, with another seed
-        """
+        """Add the sums of another run of the same experiment, with another seed."""
         self.possible &= other.possible
         self.chi2, self.dof, self.quiet = self.chi2 + other.chi2, self.dof + other.dof, max(self.quiet, other.quiet)
 
@@ -324,7 +207,7 @@ class Equalizer:
 
 
 def _root(matrix: FloatArray, power: float) -> tuple[FloatArray, int]:
-    """Symmetric power of a covariance on its noisy directions, and how many these are."""
+    """Symmetric power of a covariance on its noisy directions, and their number."""
     if not (matrix - np.diag(np.diag(matrix))).any():
         variances = np.diag(matrix)
         noisy = variances > NO_NOISE * variances.max()

@@ -1,4 +1,4 @@
-"""What the innovations of a run are regressed on where the agents use the states themselves."""
+"""Score test of the gains where the agents use the states themselves."""
 
 from __future__ import annotations
 
@@ -12,48 +12,27 @@ from msg_analysis.model.step import StepModel
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 MAX_REGRESSORS = 400
-ROUNDING = 1e-12
-"""Of the sum of an agent's weights."""
+ROUNDING = 1e-12  # relative to the sum of an agent's weights
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One regressor of the innovations of an agent.
+    """One regressor of the innovations of an agent."""
 
-    Attributes
-    ----------
-    kind
-        "constant"; "link": x_j - x_i; "lead": x_i less the reference; "pull": all that pulls the agent, together
-    agent
-        i
-    graph
-        the graph in whose steps it is not 0; None for all of them
-    sender
-        j of a link
-    weight
-        what multiplies it in the law, so that a gain that is wrong by a share s has the coefficient s * weight
-    """
-
+    # "link": x_j - x_i; "lead": x_i - reference; "pull": the whole pull on the agent
     kind: Literal["constant", "link", "lead", "pull"]
-    agent: int
-    graph: int | None = None
-    sender: int | None = None
-    weight: float = 1.0
+    agent: int  # i
+    graph: int | None = None  # the graph in whose steps it is not 0; None: all
+    sender: int | None = None  # j of a link
+    weight: float = 1.0  # its factor in the law; a gain wrong by a share s has the coefficient s * weight
 
 
 class StateRegression:
-    """Score test: the innovations of row i do not depend on what row i of W_g uses.
+    """Score test: the innovations of row i do not depend on what row i of W_g uses; at most ``most`` terms K.
 
-    The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a
-    phi_b given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated
-    noise too. All regressors are linear in z, the deviations of the agents and a constant 1.
-
-    Parameters
-    ----------
-    observation
-        whose graphs and sizes it is for
-    most
-        largest number of terms; when there would be more, fewer kinds of them are tested
+    The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, and Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a phi_b
+    given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated noise too. All
+    regressors are linear in z, the deviations of the agents and a constant 1.
     """
 
     def __init__(self, observation: Observation, most: int = MAX_REGRESSORS) -> None:
@@ -66,21 +45,11 @@ class StateRegression:
 
     @property
     def numbers_per_step(self) -> int:
-        """Size of the largest temporary array."""
+        """Size of the largest temporary array, per step; 0: not limiting."""
         return 0
 
     def add(self, modes: IntArray, states: FloatArray, innovations: FloatArray) -> None:
-        """Take a block of steps: graphs (b,), states and innovations (b, m, R).
-
-        Parameters
-        ----------
-        modes
-            (b,) graph of each step, from 0
-        states
-            (b, m, R) x(k)
-        innovations
-            (b, m, R) of the steps
-        """
+        """Add a block of steps: graphs (b,) from 0, states x(k) and innovations (b, m, R)."""
         m = self._step.agents
         z = np.ones((len(modes), m + 1, states.shape[2]))
         z[:, :m] = states - (states.mean(axis=1, keepdims=True) if self._centred else self._step.reference)
@@ -111,24 +80,16 @@ class StateRegression:
 
 
 def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[Term]]:
-    """What the innovations are regressed on: phi_a(k) = inputs[g, a] . z(k) for row rows[a].
+    """Regressors of the innovations: phi_a(k) = inputs[g, a] . z(k) for row rows[a].
 
-    One for every graph and difference x_j - x_i that row i uses, every graph and leader (x_i - reference),
-    and every agent (1, which finds a wrong reference or offset). When these are more than ``most``: the
-    whole pull (W_g x - x)_i of a row instead of each of its terms; when that is still too many, without
-    telling graphs apart.
-
-    Parameters
-    ----------
-    step
-        whose law it is
-    most
-        largest number of regressors K
+    One for every graph and difference x_j - x_i that row i uses, for every graph and leader (x_i - reference), and for
+    every agent (1, which finds a wrong reference or offset). Where these are more than ``most``: the whole pull (W_g x
+    - x)_i of a row instead of each of its terms; where that is still too many, without distinguishing graphs.
 
     Returns
     -------
     tuple[IntArray, FloatArray, list[Term]]
-        rows (K,), inputs (n, K, m + 1), and what each of them is
+        rows (K,), inputs (n, K, m + 1), and the terms (K)
     """
     n, m = step.modes, step.agents
     terms = [Term("constant", i) for i in range(m)]

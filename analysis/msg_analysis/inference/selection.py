@@ -1,4 +1,4 @@
-"""Which of many possible single changes of a law explains what was seen: forward selection by score tests."""
+"""Which of many possible single changes of a law explain what was seen: forward selection by score tests."""
 
 from __future__ import annotations
 
@@ -12,48 +12,28 @@ from scipy import stats
 
 from msg_analysis.types import BoolArray, FloatArray
 
-MOST = 6
-"""Causes looked for in one group; what is wrong in more places than this is wrong altogether."""
-SAME = 1e-9
-"""Share of a candidate's information that must be left when what others explain has been taken out."""
+MOST = 6  # causes searched for in one group
+SAME = 1e-9  # share of a candidate's information that must be left after removing what the others explain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A change of the law along one direction.
+    """A change of the law along one direction."""
 
-    Attributes
-    ----------
-    part, what
-        what it is, for those who made it
-    direction
-        (K,) change of the parameters for a change by 1
-    """
-
-    part: str
+    part: str  # with ``what``, the meaning, for the caller
     what: Any
-    direction: FloatArray
+    direction: FloatArray  # (K,) change of the parameters for a change by 1
 
 
 @dataclass(frozen=True, slots=True)
 class Selected:
-    """A change that was found.
+    """A change that was found."""
 
-    Attributes
-    ----------
-    part, what
-        of the candidate
-    estimate, standard_error
-        of the change, with all others that were found
-    log_p
-        logarithm of the p-value, adjusted for all candidates
-    """
-
-    part: str
+    part: str  # of the candidate, as ``what``
     what: Any
-    estimate: float
+    estimate: float  # of the change, given all others that were found
     standard_error: float
-    log_p: float
+    log_p: float  # logarithm of the p-value, adjusted for all candidates
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -65,10 +45,10 @@ class Selected:
 def select(
     score: FloatArray, information: FloatArray, classes: Sequence[Sequence[Candidate]], families: int, level: float
 ) -> tuple[list[Selected], FloatArray]:
-    """Find the changes that explain a score, the clearest first, each given the others.
+    """Find the changes that explain a score, the smallest p-value first, each given the others.
 
     A candidate's p-value is multiplied by the number of candidates of its class and by the number of classes
-    (Bonferroni): so a class of one (all messages alike) is believed sooner than one of many links.
+    (Bonferroni): so a class of one (all messages alike) needs less evidence than one of many links.
 
     Parameters
     ----------
@@ -81,12 +61,12 @@ def select(
     families
         number of classes, those of other scores included
     level
-        chance of finding anything where nothing is wrong
+        probability of finding anything where nothing is wrong, at most
 
     Returns
     -------
     tuple[list[Selected], FloatArray]
-        what was found, and the change (K,) of the parameters that it makes together
+        what was found, and the total change (K,) of the parameters
     """
     candidates, penalties = _distinct(classes, families)
     if not candidates:
@@ -101,7 +81,7 @@ def select(
         if log_p[best] >= math.log(level):
             break
         chosen.append(best)
-        # What a later one explains better is no cause any more.
+        # A cause that later ones explain better is dropped.
         for old in list(chosen[:-1]):
             others = [c for c in chosen if c != old]
             if (_log_p(scores, full, others) + penalties)[old] >= math.log(level):
@@ -121,7 +101,7 @@ def select(
 
 
 def _log_p(scores: FloatArray, full: FloatArray, chosen: list[int]) -> FloatArray:
-    """(C,): of all candidates, given those that were chosen."""
+    """(C,): of all candidates, given the chosen ones."""
     own = np.diag(full).copy()
     rest, left = scores, own.copy()
     if chosen:
@@ -135,7 +115,7 @@ def _log_p(scores: FloatArray, full: FloatArray, chosen: list[int]) -> FloatArra
 
 
 def _distinct(classes: Sequence[Sequence[Candidate]], families: int) -> tuple[list[Candidate], FloatArray]:
-    """Candidates that are not the same as an earlier one, and the logarithm of what each p-value is multiplied by."""
+    """Candidates that differ from all earlier ones, and the logarithm of the factor of each p-value."""
     seen: set[bytes] = set()
     kept: list[Candidate] = []
     penalties = []

@@ -1,4 +1,4 @@
-"""What may be wrong with gains, noise and messages: scores of the parameters, and the single causes looked for.
+"""Scores of the parameters that may be wrong (gains, noise, messages), and the single causes searched for.
 
 Every group has parameters with a score s and its information J, so that a change c of them gives s the mean J c.
 """
@@ -16,56 +16,32 @@ from msg_analysis.inference.regression import Term
 from msg_analysis.inference.selection import Candidate
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
-MIN_SAMPLES = 30
-"""Fewest innovations of which a variance is taken."""
-MAX_PARAMETERS = 600
-"""Most parameters whose information is inverted."""
+MIN_SAMPLES = 30  # fewest innovations for a variance
+MAX_PARAMETERS = 600  # most parameters whose information is inverted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Suspects:
-    """A group of parameters that may be wrong.
+    """A group of parameters that may be wrong."""
 
-    Attributes
-    ----------
-    score
-        (K,)
-    information
-        (K, K)
-    classes
-        candidates, class by class, the more specific ones of equal ones first
-    """
-
-    score: FloatArray
-    information: FloatArray
-    classes: list[list[Candidate]]
+    score: FloatArray  # (K,)
+    information: FloatArray  # (K, K)
+    classes: list[list[Candidate]]  # candidates, class by class; the more specific of equal ones first
 
 
 def frozen(sums: InnovationSums) -> list[tuple[int, int, int]]:
-    """(agent, steps in which it did not move, steps) of agents whose noise cannot have let them stand still.
-
-    Parameters
-    ----------
-    sums
-        of the runs
-    """
+    """(agent, steps in which it did not move, steps) of agents that cannot have stood still with their noise."""
     noisy = np.sqrt(np.diagonal(sums.noises, axis1=1, axis2=2)) > 1e-12 * sums.largest
     still, steps = (sums.still * noisy).sum(axis=0), (sums.steps[:, None] * noisy).sum(axis=0)
-    # Two equal numbers in a row are a coincidence of rounding, of which there may be one.
+    # One or two unmoved steps may be a coincidence of rounding.
     return [(i, int(still[i]), int(steps[i])) for i in np.flatnonzero(still >= 3).tolist()]
 
 
 def gains(sums: InnovationSums, pardoned: Iterable[int]) -> Suspects | None:
-    """Of the regression on what the agents heard; None where it cannot be had.
+    """Parameters of the regression on what the agents heard, without the ``pardoned``; None where it is not available.
 
-    A gain's change is relative to it, that of the reference and of an agent's offset (per step) is not.
-
-    Parameters
-    ----------
-    sums
-        of the innovations
-    pardoned
-        agents that are left out
+    Changes of gains are relative, those of the reference and of offsets (per step) absolute. The score G C^-1 U and the
+    information G C^-1 G follow from the regression's score U, covariance C and gram G.
     """
     if sums.gram is None or len(sums.terms) > MAX_PARAMETERS:
         return None
@@ -117,7 +93,7 @@ def _gain_classes(terms: Sequence[Term]) -> list[list[Candidate]]:
 
 
 def _reference(terms: Sequence[Term]) -> FloatArray:
-    """(K,): what a reference that is larger by 1 changes: leaders are pulled that much higher."""
+    """(K,): effect of a reference that is larger by 1: leaders are pulled that much higher."""
     pulls: dict[int, list[float]] = {}
     for term in terms:
         if term.kind == "lead":
@@ -128,16 +104,9 @@ def _reference(terms: Sequence[Term]) -> FloatArray:
 
 
 def noise(sums: InnovationSums, pardoned: Iterable[int], change: FloatArray) -> Suspects | None:
-    """Of the logarithms of the noise's variances over what they should be, by graph and agent.
+    """Logarithms of the noise variances over their nominal values, by graph and agent; None without usable ones.
 
-    Parameters
-    ----------
-    sums
-        of the innovations
-    pardoned
-        agents that are left out
-    change
-        (K,) coefficients of the regression that were found, whose part of the innovations is no noise
+    Left out are the ``pardoned`` agents, and what the coefficients ``change`` (K,) of the regression explain.
     """
     n, m = sums.still.shape
     out = np.zeros(m, np.bool_)
@@ -152,7 +121,7 @@ def noise(sums: InnovationSums, pardoned: Iterable[int], change: FloatArray) -> 
     graph, agent = cells.T
     ratios = np.log(squares[graph, agent] / (sums.samples[graph] * should[graph, agent]))
     root = np.sqrt(should[graph, agent])
-    # Cells of different graphs have nothing to do with each other, whatever stands here for them.
+    # Cells of different graphs are independent; their entries here are not used.
     correlation = sums.noises[graph[:, None], agent[:, None], agent] / (root[:, None] * root)
     covariance = np.where(graph[:, None] == graph, 2.0 * correlation**2 / sums.samples[graph][:, None], 0.0)
     information = _inverse(covariance)
@@ -166,14 +135,9 @@ def noise(sums: InnovationSums, pardoned: Iterable[int], change: FloatArray) -> 
 
 
 def variances(squares: FloatArray, samples: int) -> Suspects:
-    """Of the logarithms of variances (m,) of independent standard normal numbers, agent by agent.
+    """Logarithms of the variances of m kinds of independent normal numbers, nominally 1.
 
-    Parameters
-    ----------
-    squares
-        (m,) mean squares
-    samples
-        numbers that each is the mean of
+    ``squares`` (m,) are sums of squares of as many numbers as ``samples``.
     """
     information = np.eye(len(squares)) * samples / 2.0
     classes = [
@@ -184,18 +148,9 @@ def variances(squares: FloatArray, samples: int) -> Suspects:
 
 
 def losses(pairs: IntArray, messages: IntArray, lost: IntArray, probability: float) -> Suspects:
-    """Of the log-odds of losing a message, link by link; pairs (links, 2) are receiver and sender.
+    """Log-odds of losing a message, link by link: of ``messages`` (links,), ``lost`` (links,) were lost.
 
-    Parameters
-    ----------
-    pairs
-        (links, 2) receiver and sender, from 0
-    messages
-        (links,) that were due
-    lost
-        (links,) of them
-    probability
-        that the experiment says
+    ``pairs`` (links, 2) are receiver and sender, from 0; ``probability`` is the nominal one.
     """
     identity = np.eye(len(pairs))
     classes = [
@@ -209,7 +164,7 @@ def losses(pairs: IntArray, messages: IntArray, lost: IntArray, probability: flo
 
 
 def _explained(sums: InnovationSums, change: FloatArray) -> FloatArray:
-    """(n, m): how much less the sum of squares is with this change of the law."""
+    """(n, m): how much smaller the sums of squares are with this change of the law."""
     n, m = sums.still.shape
     explained = np.zeros((n, m))
     touched = np.flatnonzero(change)

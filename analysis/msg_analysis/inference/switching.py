@@ -1,4 +1,4 @@
-"""The logged transitions of the graph against P: a wrong switching rate shows nowhere else."""
+"""Test of the logged graph transitions against P: a wrong switching rate shows in no other test."""
 
 from __future__ import annotations
 
@@ -11,80 +11,40 @@ from msg_analysis.model.chain import stationary_law
 from msg_analysis.types import FloatArray, IntArray
 
 PATHS = 9999
-MAX_JUMPS = 10_000_000
-"""Jumps simulated at most; longer runs make do with fewer paths."""
-MIN_EXPECTED = 25.0
-"""Expected count of every possible transition from which on the chi-square law is used."""
+MAX_JUMPS = 10_000_000  # simulated jumps; longer runs use fewer paths, but at least 199
+MIN_EXPECTED = 25.0  # smallest expected count of every possible transition for the chi-square law
 SEED = 20_240_229
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SwitchingTest:
-    """Counts of the N - 1 transitions.
+    """Test of the N - 1 transitions."""
 
-    Attributes
-    ----------
-    counts
-        (n, n) observed
-    expected
-        (n, n) visits of the row times P
-    p
-        None where the chain leaves nothing to test; 0 if a transition happened that P forbids
-    """
-
-    counts: IntArray
-    expected: FloatArray
-    p: float | None
+    counts: IntArray  # (n, n) observed
+    expected: FloatArray  # (n, n) visits of the row times P
+    p: float | None  # None where there is nothing to test; 0 if a transition happened that P forbids
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transitions:
-    """What the paths of the graphs of runs of one experiment add up to.
+    """Transition counts of the runs of one experiment."""
 
-    Attributes
-    ----------
-    counts
-        (n, n) of all runs
-    paths
-        first graph and number of transitions of each run
-    """
-
-    counts: IntArray
-    paths: tuple[tuple[int, int], ...]
+    counts: IntArray  # (n, n) of all runs
+    paths: tuple[tuple[int, int], ...]  # first graph and number of transitions of each run
 
     @classmethod
     def of(cls, modes: IntArray, graphs: int) -> Transitions:
-        """Of one run with the graphs (N,), from 0.
-
-        Parameters
-        ----------
-        modes
-            (N,) from 0
-        graphs
-            n
-        """
+        """Counts of one run with the graphs ``modes`` (N,), from 0; ``graphs`` is their number n."""
         counts = np.zeros((graphs, graphs), dtype=np.int64)
         np.add.at(counts, (modes[:-1], modes[1:]), 1)
         return cls(counts, ((int(modes[0]), len(modes) - 1),) if len(modes) else ())
 
     def merged(self, other: Transitions) -> Transitions:
-        """With those of other runs.
-
-        Parameters
-        ----------
-        other
-            of runs with the same graphs
-        """
+        """With those of other runs."""
         return Transitions(self.counts + other.counts, self.paths + other.paths)
 
     def test(self, transition: FloatArray) -> SwitchingTest:
-        """See ``switching_test``.
-
-        Parameters
-        ----------
-        transition
-            (n, n) predicted P
-        """
+        """See ``switching_test``; ``transition`` is P (n, n)."""
         counts = self.counts
         visits = counts.sum(axis=1)
         expected = visits[:, None] * transition
@@ -94,7 +54,7 @@ class Transitions:
             return SwitchingTest(counts, expected, 0.0)
         if dof == 0:
             return SwitchingTest(counts, expected, None)
-        # Judged by what the chain leads to expect, not by what happened: a choice made from the data is a bias.
+        # Decided by the expectation of the chain, not by the data: a choice made from the data would be a bias.
         usual = counts.sum() * stationary_law(transition)[:, None] * transition
         if usual[transition > 0.0].min() >= MIN_EXPECTED:
             chi2 = float(likelihood_ratio(counts, transition))
@@ -111,7 +71,7 @@ class Transitions:
             total += simulate_counts(transition, first, transitions, number, random)
         drawn = likelihood_ratio(total, transition)
         observed = float(likelihood_ratio(counts, transition))
-        # Ties (few jumps leave few possible values) count as at least as extreme.
+        # Ties (with few jumps there are few possible values) count as at least as extreme.
         above = int((drawn >= observed * (1 - 1e-12)).sum())
         if above or drawn.std() == 0.0:
             return (above + 1) / (number + 1)
@@ -120,12 +80,12 @@ class Transitions:
 
 
 def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
-    """Test a path of the graph against its chain.
+    """Test a path of the graph against its chain, by the likelihood-ratio statistic G.
 
-    Likelihood-ratio statistic G. Its law is chi-square when every possible transition is expected often
-    enough; else it is simulated: paths of the same length from the same first graph (fixed seed), with a
-    gamma fit where none of them is as extreme. With two graphs and 6 expected switches each way, 2.3 % of
-    Pearson's p-values would be below 0.01 and 0.7 % below 0.001; of these, 0.9 % and 0.15 % (20 000 paths).
+    Its law is chi-square when every possible transition is expected often enough; else it is simulated: paths of the
+    same length from the same first graph (fixed seed), with a gamma fit where none of them is as extreme. With two
+    graphs and 6 expected switches each way, 2.3 % of Pearson's p-values would be below 0.01 and 0.7 % below 0.001; of
+    these, 0.9 % and 0.15 % (20 000 paths).
 
     Parameters
     ----------
@@ -138,19 +98,19 @@ def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
 
 
 def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
-    """(...): G = 2 sum c log(c / e) of (..., n, n) counts.
+    """G = 2 sum c log(c / e) of counts c, e being the visits of a row times P.
 
     Parameters
     ----------
     counts
         (..., n, n) of transitions
     transition
-        (n, n) predicted P
+        (n, n) P
 
     Returns
     -------
     FloatArray
-        of the shape of ``counts`` without its last two axes
+        (...)
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = counts * np.log(counts / (counts.sum(axis=-1, keepdims=True) * transition))
@@ -160,21 +120,7 @@ def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
 def simulate_counts(
     transition: FloatArray, first: int, transitions: int, paths: int, random: np.random.Generator
 ) -> IntArray:
-    """(paths, n, n): transition counts of independent paths, drawn sojourn by sojourn.
-
-    Parameters
-    ----------
-    transition
-        (n, n) P
-    first
-        first graph
-    transitions
-        of every path
-    paths
-        how many
-    random
-        generator, whose numbers are used up
-    """
+    """(paths, n, n): transition counts of independent paths from the graph ``first``, drawn sojourn by sojourn."""
     n = len(transition)
     leaving = 1.0 - np.diag(transition)
     jumps = transition - np.diag(np.diag(transition))

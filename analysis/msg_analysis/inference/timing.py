@@ -1,4 +1,4 @@
-"""How well a run in real time kept its time: lateness, missed deadlines, jitter, and how old was what was used."""
+"""Timing of a run in real time: lateness, missed deadlines, jitter, and the age of the values used."""
 
 from __future__ import annotations
 
@@ -19,19 +19,7 @@ BINS = 60
 
 @dataclass(frozen=True, slots=True)
 class Quantiles:
-    """How a measure is spread; None where there was nothing to measure.
-
-    Attributes
-    ----------
-    p50
-        median
-    p95
-        95th percentile
-    p99
-        99th percentile
-    max
-        the largest
-    """
+    """Quantiles of a measure; None where there was nothing to measure."""
 
     p50: float | None
     p95: float | None
@@ -40,13 +28,7 @@ class Quantiles:
 
     @classmethod
     def of(cls, values: AnyArray) -> Quantiles:
-        """Of all entries.
-
-        Parameters
-        ----------
-        values
-            of any shape
-        """
+        """Of all entries of an array of any shape."""
         if not values.size:
             return cls(None, None, None, None)
         return cls(*(float(value) for value in (*np.quantile(values, (0.5, 0.95, 0.99)), values.max())))
@@ -54,51 +36,24 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timing:
-    """How well a run in real time kept its time.
+    """Timing of a run in real time.
 
     Times in ms are those of the agents' clock: simulated time over the speed of the run.
-
-    Attributes
-    ----------
-    period_ms
-        between two steps of an agent, as it should be
-    lateness_ms
-        of a step after it was due
-    steps, missed
-        steps of all agents, and how many of them were made more than a period after they were due
-    jitter_ms
-        how far the time between two successive steps of an agent is from the period, either way
-    staleness_ms
-        age of the values that were used, when they were used
-    staleness_steps
-        the same, in steps of the new state less that of the value; 0 or 1 with ideal timers
-    uses
-        values of neighbours that were used
-    ideal_uses
-        how many of them were the ones that ideal timers would have used
-    never_heard
-        how often nothing had been heard yet of a neighbour
-    outdated_graphs
-        steps for which an agent used another graph than the network's of that time
-    histogram
-        of lateness: edges [ms] (BINS + 1,) and counts (BINS,); beyond the last edge there is nothing
-    ages
-        the same of the age of the values used: edges [ms] (BINS + 1,) and counts (BINS,)
     """
 
-    period_ms: float
-    lateness_ms: Quantiles
-    steps: int
-    missed: int
-    jitter_ms: Quantiles
-    staleness_ms: Quantiles
-    staleness_steps: Quantiles
-    uses: int
-    ideal_uses: int
-    never_heard: int
-    outdated_graphs: int
-    histogram: tuple[FloatArray, AnyArray]
-    ages: tuple[FloatArray, AnyArray]
+    period_ms: float  # nominal time between two steps of an agent
+    lateness_ms: Quantiles  # of a step after it was due
+    steps: int  # of all agents
+    missed: int  # steps made more than a period after they were due
+    jitter_ms: Quantiles  # |time between two successive steps of an agent - period|
+    staleness_ms: Quantiles  # age of the values at the time of use
+    staleness_steps: Quantiles  # step of the new state - step of the value; 0 or 1 with ideal timers
+    uses: int  # neighbours' values that steps needed, those never heard included
+    ideal_uses: int  # uses of the value that ideal timers would have used
+    never_heard: int  # uses in which nothing had been heard yet of the neighbour
+    outdated_graphs: int  # steps made with another graph than the network's at that time
+    histogram: tuple[FloatArray, AnyArray]  # of lateness: edges [ms] (BINS + 1,) and counts (BINS,); covers all values
+    ages: tuple[FloatArray, AnyArray]  # the same of ``staleness_ms``
 
     @property
     def missed_share(self) -> float:
@@ -107,7 +62,7 @@ class Timing:
 
     @property
     def ideal_share(self) -> float:
-        """Of all uses, those that ideal timers would have made; 1 where nobody hears anybody."""
+        """Of all uses, those that ideal timers would have made; 1 where no agent hears another."""
         return self.ideal_uses / self.uses if self.uses else 1.0
 
     @property
@@ -116,7 +71,7 @@ class Timing:
         return self.outdated_graphs / max(self.steps, 1)
 
     def to_json(self) -> dict[str, Any]:
-        """The document."""
+        """The JSON document."""
         (edges, counts), (age_edges, age_counts) = self.histogram, self.ages
         return {
             "period_ms": self.period_ms,
@@ -138,13 +93,7 @@ class Timing:
 
 
 def measure_timing(observation: Observation) -> Timing:
-    """Measure the timing of a run in real time.
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    """
+    """Measure the timing of a run in real time."""
     timers, step = observation.timers, observation.step
     assert timers is not None
     experiment = observation.prediction.experiment
