@@ -2,8 +2,7 @@
 
     from msg_analysis import Experiment, compare, read_bag
 
-What can be imported from here is that of ``msg_analysis.api``, and is imported when it is first asked for, so that a
-program that needs only one part does not wait for the others.
+The names are those of ``msg_analysis.api``. Each is imported on first access: a program loads only what it uses.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 try:
     __version__ = version("msg_analysis")
-except PackageNotFoundError:  # run from a source tree that nobody installed
+except PackageNotFoundError:  # run from a source tree that is not installed
     __version__ = "0.0.0"
 
 __all__ = [

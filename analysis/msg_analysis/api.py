@@ -1,7 +1,7 @@
 """The Python API: experiments, runs and comparisons for scripts and notebooks.
 
-Everything here can be imported from ``msg_analysis`` itself, and the command line stands on it. Agents and graphs count
-from 0 in arrays and arguments, and from 1 in files and texts.
+All names can be imported from ``msg_analysis`` itself. Agents and graphs count from 0 in arrays and arguments, and from
+1 in files and texts.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ __all__ = [
 
 
 class Experiment(model.Experiment):
-    """A Markov switching network and a run of it, with what can be done with it.
+    """A Markov-switching network and one run of it.
 
-    Make one with :meth:`load` (a file) or :meth:`parse` (a dictionary); change its run with :meth:`with_run`.
+    Make one with :meth:`load` (a file) or :meth:`parse` (a dictionary); :meth:`with_run` changes its run.
     """
 
     __slots__ = ()
@@ -67,45 +67,46 @@ class Experiment(model.Experiment):
         Parameters
         ----------
         experiment
-            checked already, such as that of a recorded run
+            already checked, such as that of a recorded run
 
         Returns
         -------
         Experiment
-            the same object where it is one already
+            ``experiment`` itself if it is of this class already
         """
         return experiment if isinstance(experiment, cls) else cls(**_fields(experiment))
 
     def predict(self) -> Prediction:
-        """The steady second moments, exactly; see :func:`msg_analysis.theory.prediction.predict`.
+        """The exact steady second moments; see :func:`msg_analysis.theory.prediction.predict`.
 
         Returns
         -------
         Prediction
-            ``emulated`` (what the run's steps do), ``continuous`` (the paper's law) and ``static`` (the graphs held for
-            ever), each with ``system_error``, ``node_errors`` (m,), ``node_certainty`` (m,) and ``covariance`` (m, m)
+            ``emulated`` (the steps of the run), ``continuous`` (the paper's law) and ``static`` (each graph held
+            fixed); the last two are None where they do not exist. Each has ``system_error``, ``node_errors`` (m,),
+            ``node_certainty`` (m,) and ``covariance`` (m, m)
 
         Raises
         ------
         NotAvailableError
-            the experiment asks for what cannot be predicted
+            the experiment asks for something that cannot be predicted
         InputError
-            too large, or no steady errors
+            too large, or without finite steady errors
         """
         self.require_available("predict")
         return predict(self)
 
     def transient(self, times: ArrayLike, *, law: TransientLaw = "emulated", unreduced: bool = False) -> Transient:
-        """The moments over time from the experiment's own start, exactly.
+        """The exact moments over time from the experiment's own start.
 
         Parameters
         ----------
         times
-            (T,) ascending [units of simulated time]; whole steps of ``run.dt`` in the emulated law
+            (T,) ascending, >= 0 [units of simulated time]; multiples of ``run.dt`` in the emulated law
         law
-            "emulated" (the steps of the run), or "continuous" (the paper's)
+            "emulated" (the steps of the run) or "continuous" (the paper's)
         unreduced
-            consensus: of the states themselves, whose second moments grow, not of the disagreement
+            consensus only: moments of the states themselves, which grow without bound, not of the disagreement
 
         Returns
         -------
@@ -115,9 +116,9 @@ class Experiment(model.Experiment):
         Raises
         ------
         NotAvailableError
-            the experiment asks for what cannot be predicted
+            the experiment asks for something that cannot be predicted
         InputError
-            times that are no whole steps, a law that does not exist here, or too large
+            invalid times, a law or ``unreduced`` that does not exist here, too large, or no finite steady errors
         """
         self.require_available("predict")
         given = np.asarray(times, dtype=float)
@@ -131,25 +132,25 @@ class Experiment(model.Experiment):
         Parameters
         ----------
         seed
-            instead of ``run.seed``
+            replaces ``run.seed``
         duration
-            instead of ``run.duration`` [units of simulated time]
+            replaces ``run.duration`` [units of simulated time]
         record
-            of the run to repeat; a new one by default. With it, ``seed`` and ``duration`` are those of the record
+            of a run to repeat; its experiment, seed and duration are then used instead of these. By default a new run
 
         Returns
         -------
         Run
-            the same, to the last bit, as a network run in lockstep
+            equal, to the last bit, to a network run in lockstep; in real time, to one with ideal timers and no delay
 
         Raises
         ------
         ExperimentError
             the seed or the duration is not valid
         NotAvailableError
-            the experiment asks for what runs do not have yet
+            the experiment asks for something that runs do not have yet
         InputError
-            no stationary start, since there is no prediction
+            the stationary start cannot be computed: too large, or no finite steady errors
         """
         changes = {key: value for key, value in {"seed": seed, "duration": duration}.items() if value is not None}
         experiment = self.with_run(**changes) if changes else self
@@ -166,22 +167,25 @@ class Experiment(model.Experiment):
         top: int = 10,
         watch: Watch = ignore,
     ) -> Selection:
-        """The best leaders for the network, by joint robustness centrality; leaders that it has do not count.
+        """The sets of leaders with the least system error; the experiment's own leaders are ignored.
+
+        At infinite gain these are the sets of largest joint robustness centrality.
 
         Parameters
         ----------
         count
             number of leaders
         method
-            "auto" (exhaustive where there are few sets, else swap), "exhaustive", "greedy" or "swap"
+            "exhaustive" (every set), "greedy" or "swap" (good sets), or "auto": exhaustive up to 1000 sets, else swap
         law
-            "continuous" (the paper's), "emulated" or "discrete"; by default the paper's where there is one
+            "continuous" (the paper's), "emulated" (the steps of the run) or "discrete"; by default the paper's where
+            there is one, else that of the steps
         gain
             pull of the leaders [1 / unit of simulated time]; inf holds them at the reference
         top
-            how many sets to keep
+            most sets in the result
         watch
-            is told how far the search is
+            called during the search with its stage, evaluations done, of how many, and the least system error so far
 
         Returns
         -------
@@ -191,9 +195,9 @@ class Experiment(model.Experiment):
         Raises
         ------
         NotAvailableError
-            the experiment asks for what cannot be predicted
+            the experiment asks for something that cannot be predicted
         InputError
-            an impossible count, gain or law, too many sets, or none that reaches everybody
+            an impossible count, gain or law, too many sets, or no set from which all agents can be reached
         """
         self.require_available("predict")
         return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch)
@@ -201,10 +205,10 @@ class Experiment(model.Experiment):
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Run(Trajectory):
-    """A run of an experiment, of a network or of the twin: states and graphs of every step.
+    """A run of an experiment, by a network or by the twin: states and graphs of every step.
 
-    Its arrays are those of :class:`msg_analysis.model.trajectory.Trajectory`; NaN and -1 stand where something is
-    missing, of which ``completeness`` keeps the account.
+    The arrays are those of :class:`msg_analysis.model.trajectory.Trajectory`. A missing state is NaN, a missing graph
+    -1; ``completeness`` counts them.
     """
 
     @classmethod
@@ -214,13 +218,13 @@ class Run(Trajectory):
         Parameters
         ----------
         trajectory
-            of a bag or of the twin; the arrays are shared, not copied
+            of a bag or of the twin; its arrays are shared, not copied
         """
         return trajectory if isinstance(trajectory, cls) else cls(**_fields(trajectory))
 
     @property
     def experiment(self) -> Experiment:
-        """What was run."""
+        """The experiment that was run."""
         return Experiment.of(self.record.experiment)
 
     @property
@@ -229,17 +233,17 @@ class Run(Trajectory):
         return np.asarray(np.arange(len(self.states)) * self.record.experiment.step_length, dtype=float)
 
     def compare(self, *, level: float = 0.01) -> Comparison:
-        """Compare the run with what theory predicts for it; see :func:`compare`.
+        """Compare the run with its prediction; see :func:`compare`.
 
         Parameters
         ----------
         level
-            chance of a false "disagrees", all tests together
+            probability of a false "disagrees", all tests together; above 0, at most 0.5
 
         Raises
         ------
         InputError
-            the level is no chance, or there is no prediction (too large, or without bounds)
+            an invalid level, or no prediction (too large, or without finite steady errors)
         """
         return compare(self, level=level)
 
@@ -268,7 +272,7 @@ class Run(Trajectory):
 
 
 def read_bag(path: str | Path) -> Run:
-    """The run that a bag holds, whoever recorded it: whole, torn or damaged.
+    """Read the run in a bag of msg-agents, the twin or ``ros2 bag``; torn and damaged bags as far as possible.
 
     Parameters
     ----------
@@ -283,7 +287,7 @@ def read_bag(path: str | Path) -> Run:
     Raises
     ------
     BagError
-        no bag, a bag without the run record, or with several runs
+        not a bag, a bag without the run record, or with several runs
     InputError
         the run record in it is not valid
     """
@@ -296,10 +300,10 @@ def compare(*runs: Trajectory | str | Path, level: float = 0.01) -> Comparison:
     Parameters
     ----------
     *runs
-        runs, or paths of their bags, which are read one after the other; several need different seeds, and get one
+        runs, or paths of their bags, which are read one after the other; several runs need different seeds and get one
         verdict together
     level
-        chance of a false "disagrees", all tests together; above 0, 0.5 at most
+        probability of a false "disagrees", all tests together; above 0, at most 0.5
 
     Returns
     -------
@@ -309,10 +313,10 @@ def compare(*runs: Trajectory | str | Path, level: float = 0.01) -> Comparison:
     Raises
     ------
     InputError
-        no run, a level that is no chance, runs that do not belong together, or no prediction (too large, or without
-        bounds)
+        no run, an invalid level, runs that do not belong together, or no prediction (too large, or without finite
+        steady errors)
     BagError
-        a path that holds no run
+        a path without a readable run
     """
     if not runs:
         raise InputError("no run: give at least one, or the path of its bag")
@@ -328,16 +332,17 @@ def compare(*runs: Trajectory | str | Path, level: float = 0.01) -> Comparison:
 
 
 def write_report(comparison: Comparison, file: str | Path, **options: Any) -> Path:
-    """Write a comparison as one HTML page that needs nothing else.
+    """Write a comparison as one self-contained HTML page.
 
     Parameters
     ----------
     comparison
         of :func:`compare`
     file
-        to be written; replaced where it exists
+        path of the page; replaced if it exists
     **options
-        see :func:`msg_analysis.report.html.write_report`
+        what the network reported, if known: ``restarts``, a line per process that was restarted, and ``strangers``, a
+        mapping with ``node``, ``topic``, ``reason`` and ``count`` per kind of refused message
 
     Returns
     -------
@@ -349,7 +354,7 @@ def write_report(comparison: Comparison, file: str | Path, **options: Any) -> Pa
     InputError
         the file cannot be written
     """
-    from msg_analysis.report.html import write_report as write_html  # here: it draws, and few want that
+    from msg_analysis.report.html import write_report as write_html  # imported here: it loads the plotting libraries
 
     require_place(Path(file))
     write_html(comparison, comparison.trajectory, Path(file), **options)

@@ -1,7 +1,7 @@
-"""The command line ``msg-analysis``: plain functions of the other rooms, one a command.
+"""The command line ``msg-analysis``: each command parses, calls one function and prints.
 
 Results go to stdout, everything else to stderr. Exit codes: 0 fine or agrees, 1 disagrees, 2 bad usage or
-input, 3 data incomplete. What takes long to import is imported by the command that needs it.
+input, 3 data incomplete. Slow imports are made inside the commands that need them.
 """
 
 from __future__ import annotations

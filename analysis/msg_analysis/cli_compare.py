@@ -1,4 +1,4 @@
-"""Commands of ``msg-analysis`` about runs: ``compare`` bags with the prediction, ``tabulate`` what came out."""
+"""Commands of ``msg-analysis`` about runs: ``compare`` (bags with the prediction) and ``tabulate`` (saved results)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands' arguments and options have in common: one name, one metavar, one way to be completed each."""
+"""Arguments and options that commands share: one name, one metavar and one shell completion each."""
 
 from __future__ import annotations
 
@@ -11,18 +11,13 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-_PLAIN = re.compile(r"[\w./~+,:@%=-]*")  # what a shell takes as it stands
+_PLAIN = re.compile(r"[\w./~+,:@%=-]*")  # characters that a shell needs no quotes for
 
 
 class InputPath(click.Path):
-    """The path of a file of ours; a shell completes it to such files and to directories.
+    """Path of a file with one of the suffixes, or of a directory with one of ``holds`` (names or patterns) in it.
 
-    Parameters
-    ----------
-    *suffixes
-        of the files, such as ".yaml"
-    holds
-        a directory with one of these in it (names or patterns) counts as a file
+    A shell completes it to such paths, and to directories on the way to them.
     """
 
     def __init__(self, *suffixes: str, holds: Sequence[str] = ()) -> None:
@@ -31,11 +26,11 @@ class InputPath(click.Path):
         self._holds = tuple(holds)
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        """See click.ParamType."""
+        """Complete to wanted files and directories; see click.ParamType."""
         del ctx, param
         found = _paths(incomplete, self._is_wanted)
         if not all(_PLAIN.fullmatch(path) for path in found):
-            return [CompletionItem(incomplete, type="file")]  # the shell itself knows best how to quote
+            return [CompletionItem(incomplete, type="file")]  # the shell completes, and quotes, by itself
         return [CompletionItem(path) for path in found]
 
     def _is_wanted(self, path: Path) -> bool:
@@ -45,7 +40,7 @@ class InputPath(click.Path):
 
 
 def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:
-    """What begins like this; an only answer, which a shell puts a blank behind, is no directory if it can be helped."""
+    """Wanted paths with this beginning; a lone directory is entered, since shells end a lone answer with a blank."""
     begin = incomplete.rfind("/") + 1
     head, start = incomplete[:begin], incomplete[begin:]
     found = []
@@ -57,7 +52,7 @@ def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:
                 found.append(head + entry.name)
             elif entry.is_dir():
                 found.append(f"{head}{entry.name}/")
-    except (OSError, RuntimeError):  # not ours to read; a home that nobody has
+    except (OSError, RuntimeError):  # not readable, or ~name of an unknown user
         return []
     return found + _paths(found[0], wanted) if len(found) == 1 and found[0].endswith("/") else found
 
@@ -84,21 +79,15 @@ class PositiveFloat(click.FloatRange):
         super().__init__(min=0, min_open=True)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """See click.ParamType."""
+        """Refuse NaN and infinity, too; see click.ParamType."""
         number = float(super().convert(value, param, ctx))
-        if not math.isfinite(number):  # a range lets nan through
+        if not math.isfinite(number):  # FloatRange accepts nan
             self.fail(f"{number}: expected a positive number", param, ctx)
         return number
 
 
 def level_option(what: str) -> Callable[..., Any]:
-    """The option ``--level``.
-
-    Parameters
-    ----------
-    what
-        is held to that chance
-    """
+    """The option ``--level``, a probability above 0 and at most 0.5; ``what`` is its help text."""
 
     def checked(_context: click.Context, _option: click.Parameter, value: float) -> float:
         if not 0.0 < value <= 0.5:
@@ -109,11 +98,5 @@ def level_option(what: str) -> Callable[..., Any]:
 
 
 def suggest(*words: str) -> Callable[..., list[CompletionItem]]:
-    """For ``shell_complete``: words that a shell offers, among others that are allowed.
-
-    Parameters
-    ----------
-    *words
-        to offer
-    """
+    """A ``shell_complete`` function that offers these words; the option takes others, too."""
     return lambda _context, _option, incomplete: [CompletionItem(w) for w in words if w.startswith(incomplete)]

@@ -9,17 +9,11 @@ import click
 from msg_analysis.bags.storage import COMPRESSIONS, DEFAULT, MEGABYTE, Compression, Storage
 from msg_analysis.errors import InputError
 
-SMALLEST_SPLIT = 0.1  # MB; of the order of a chunk
+SMALLEST_SPLIT = 0.1  # MB; about the size of a chunk
 
 
 def storage_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the arguments ``compression`` and ``split_size`` [MB]; see :func:`storage`.
-
-    Parameters
-    ----------
-    command
-        function of the command, below ``click.command``
-    """
+    """Add the arguments ``compression`` and ``split_size`` [MB, 10^6 bytes] to a command; see :func:`storage`."""
     for option in (
         click.option(
             "--compression",
@@ -39,20 +33,7 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def storage(compression: Compression, split_size: float | None) -> Storage:
-    """What these options say.
-
-    Parameters
-    ----------
-    compression
-        of the chunks
-    split_size
-        of a file of the bag [MB, 10^6 bytes]; None: one file
-
-    Raises
-    ------
-    InputError
-        no size
-    """
+    """The storage that these options ask for; ``split_size`` [MB, 10^6 bytes] is None for one file."""
     try:
         size = None if split_size is None else round(split_size * MEGABYTE)
     except (ValueError, OverflowError) as error:  # nan, inf

@@ -1,4 +1,4 @@
-"""Command of ``msg-analysis`` about many runs or predictions: ``sweep``."""
+"""The command ``sweep`` of ``msg-analysis``, and the networks of ``figures --emulate``: many runs or predictions."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def sweep(
 
 
 class _EndedBySignal(KeyboardInterrupt):
-    """As by Ctrl-C, with another exit code."""
+    """A signal that ends the program as Ctrl-C does, with another exit code."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -143,7 +143,7 @@ def _end(number: int, _: object) -> None:
 
 
 def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Store, **how: Any) -> Conducted:
-    """Do all jobs, with progress on stderr; if that is interrupted, say what is kept."""
+    """Do all jobs, with progress on stderr; if interrupted, say what is kept and exit."""
     from msg_analysis.progress import SweepProgress
     from msg_analysis.sweep.conduct import conduct
     from msg_analysis.sweep.workers import ENDING, WorkersLostError
@@ -160,7 +160,7 @@ def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Sto
         there = sum(job.id in store.outcomes for job in jobs)
         kept = f"{there} of {len(jobs)} points are kept in {store.directory}: the same command goes on"
         if isinstance(error, KeyboardInterrupt):
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # we are leaving
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the exit
             click.echo(f"\ninterrupted: {kept}", err=True)
             if isinstance(error, _EndedBySignal):
                 context.exit(128 + error.number)
@@ -178,23 +178,7 @@ def emulate(
     *,
     as_json: bool,
 ) -> int:
-    """``msg-analysis figures --emulate``: run the networks, write the figures; the exit code.
-
-    Parameters
-    ----------
-    context
-        of the command
-    numbers
-        of the examples
-    out
-        directory of the figures
-    formats
-        of the drawings
-    other_software
-        what becomes of results that other versions made
-    as_json
-        whether stdout is one JSON object
-    """
+    """``msg-analysis figures --emulate``: run the networks, write the figures; returns the exit code."""
     from msg_analysis.report.emulation import disagreeing, measured, runs_of, summary
     from msg_analysis.report.paper_figures import write_figures
     from msg_analysis.sweep.network import options
@@ -228,5 +212,5 @@ def emulate(
 
 
 def _number(agent: int | None) -> int | None:
-    """Of an agent, for people: from 1."""
+    """Number of an agent in texts and JSON, from 1; None for the system."""
     return None if agent is None else agent + 1

@@ -1,4 +1,4 @@
-"""Commands of ``msg-analysis`` about the theory beyond the steady state: ``transient`` and ``facts``."""
+"""Commands of ``msg-analysis`` for theory beyond the steady state: ``transient`` and ``facts``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the command lines have in common: how errors, JSON and examples look."""
+"""What the command lines share: streams, errors and exit codes, JSON, and the examples in help pages."""
 
 from __future__ import annotations
 
@@ -27,13 +27,7 @@ NOT_WRITTEN = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF}
 
 
 class CommandGroup(click.Group):
-    """The one place where errors of the user become messages and exit codes, and what all help pages have in common.
-
-    Parameters
-    ----------
-    *args, **attributes
-        see click.Group
-    """
+    """A click group that turns errors of the user into messages and exit codes; all help pages share its settings."""
 
     def __init__(self, *args: Any, **attributes: Any) -> None:
         attributes["context_settings"] = {"help_option_names": ["-h", "--help"], "show_default": True}
@@ -45,7 +39,7 @@ class CommandGroup(click.Group):
         return super().main(*args, **extra)
 
     def make_context(self, *args: Any, **extra: Any) -> click.Context:
-        """Read the command line, answer ``--help`` and ``--version``; see click.Command."""
+        """Parse the command line, answer ``--help`` and ``--version``; see click.Command."""
         with _exit_codes():
             return super().make_context(*args, **extra)
 
@@ -80,15 +74,15 @@ def _exit_codes() -> Iterator[None]:
 
 
 def _open_closed_streams() -> None:
-    """Keep the numbers of closed standard streams from being given to files and sockets, which prints would spoil.
+    """Occupy the numbers of closed standard streams, so that no file or socket gets them and receives what is printed.
 
-    What is printed to a closed stdout then fails as it would with any program; a closed stderr swallows it.
+    Printing to a closed stdout then fails, as in other programs; what is printed to a closed stderr is dropped.
     """
     for number, mode in ((0, os.O_WRONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, mode)  # the least number that is free
+            os.open(os.devnull, mode)  # takes the lowest free number
             if number == 1:
                 sys.stdout = os.fdopen(1, "w")
             elif number == 2:
@@ -96,7 +90,7 @@ def _open_closed_streams() -> None:
 
 
 def _stdout_can_fail() -> bool:
-    """Whether an error without a name is that of stdout: our files have names, pipes and terminals are never full."""
+    """Whether an error without a file name is that of stdout: our files have names; pipes, terminals are never full."""
     try:
         number = sys.stdout.fileno()
         return stat.S_ISREG(os.fstat(number).st_mode) or (
@@ -107,33 +101,19 @@ def _stdout_can_fail() -> bool:
 
 
 def _drop_stdout() -> None:
-    """Leave nothing to flush at exit, which would complain again."""
+    """Redirect stdout to /dev/null, so that the flush at exit does not fail again."""
     with suppress(OSError, ValueError):  # a stream without a file, in tests
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def complain(text: str, label: str = "error:") -> None:
-    """One error on stderr.
-
-    Parameters
-    ----------
-    text
-        says what is wrong
-    label
-        before it, in red on a terminal
-    """
+    """Print one error on stderr, behind a label that is red on a terminal."""
     color = False if os.environ.get("NO_COLOR") else None
     click.echo(f"{click.style(label, fg='red', bold=True)} {text}", err=True, color=color)
 
 
 def examples(*lines: str) -> str:
-    """Epilog of a command's help.
-
-    Parameters
-    ----------
-    *lines
-        commands, as a user would type them
-    """
+    """Epilog of a command's help: commands as a user would type them."""
     return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
 
 
@@ -143,31 +123,19 @@ def result_console() -> Console:
 
     class ResultConsole(Console):
         def on_broken_pipe(self) -> None:
-            # Rich would exit with 1, which says that a run disagrees with the prediction.
+            # Rich exits with 1, which means "disagrees" here.
             raise BrokenPipeError
 
     return ResultConsole(highlight=False, markup=False)
 
 
 def print_json(document: dict[str, Any]) -> None:
-    """One JSON object on stdout; infinite and undefined numbers, which JSON does not have, become null.
-
-    Parameters
-    ----------
-    document
-        what json.dumps takes
-    """
+    """Print one JSON object on stdout; infinite numbers and NaN become null."""
     click.echo(json.dumps(finite(document), allow_nan=False))
 
 
 def finite(value: Any) -> Any:
-    """The same document with None in place of infinite and undefined numbers.
-
-    Parameters
-    ----------
-    value
-        document, or part of one
-    """
+    """A copy of the document with None in place of infinite numbers and NaN; tuples become lists."""
     if isinstance(value, dict):
         return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

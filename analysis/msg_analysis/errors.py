@@ -1,13 +1,13 @@
-"""What can go wrong through the user's input: one base class, so that every command has one place to catch it."""
+"""Errors caused by the user's input; all commands catch the base class in one place."""
 
 
 class InputError(Exception):
-    """Bad input. The text names the key or file, the value, what was expected and what to do. Exit code 2."""
+    """Bad input. The message names the key or file, the value, what was expected and what to do. Exit code 2."""
 
 
 class NotAvailableError(InputError):
-    """The file asks for something that the format has but this version does not do yet."""
+    """The experiment asks for something that the file format has but this version cannot do."""
 
 
 class BagError(InputError):
-    """A bag that cannot be written, or a file that is no bag of this network."""
+    """A bag that cannot be read or written, or that does not hold one run of a network."""

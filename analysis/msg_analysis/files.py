@@ -1,4 +1,4 @@
-"""Files that are written at the end of long work: a place for them, and never in part."""
+"""Files written at the end of long work: checked before it, and never written in part."""
 
 from __future__ import annotations
 
@@ -10,17 +10,9 @@ from msg_analysis.errors import InputError
 
 
 def require_place(file: Path | None) -> None:
-    """Refuse a place where no file can be put, before anything is computed.
+    """Refuse, before long work, a path where no file can be put: its directory is missing, or it is not a regular file.
 
-    Parameters
-    ----------
-    file
-        to be written, whole, in place of what is there; None: nothing is
-
-    Raises
-    ------
-    InputError
-        its directory is not there, or what is there is no file (a device would be replaced by one)
+    None stands for no file. Raises InputError; permissions are not checked.
     """
     if file is None:
         return
@@ -31,30 +23,12 @@ def require_place(file: Path | None) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> Path:
-    """Write a file under another name first, then give it its own.
-
-    Parameters
-    ----------
-    path
-        replaced if it is there
-    content
-        all of it
-
-    Returns
-    -------
-    Path
-        The path.
-
-    Raises
-    ------
-    OSError
-        it cannot be written; what was there is as it was
-    """
+    """Write under a temporary name and rename; after an OSError, what was at ``path`` is unchanged."""
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
         temporary = Path(stream.name)
         try:
             stream.write(content)
-            stream.flush()  # a full disk shows here
+            stream.flush()  # a full disk is noticed here
             mask = os.umask(0)
             os.umask(mask)
             temporary.chmod(0o666 & ~mask)

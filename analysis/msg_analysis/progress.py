@@ -1,4 +1,4 @@
-"""Progress of long work on stderr: a bar on a terminal, elsewhere a line now and then."""
+"""Progress of long work on stderr: a bar on a terminal, otherwise a line every ten seconds at most."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _LINE_PERIOD = 10.0  # s between two lines where there is no terminal
 
 
 class _Progress:
-    """How far something is, to be used with ``with``."""
+    """Progress display, a context manager."""
 
     def __init__(self, title: str, *, time_left: bool) -> None:
         from rich.console import Console
@@ -57,58 +57,28 @@ class _Progress:
 
 
 class SweepProgress(_Progress):
-    """How far a sweep is, to be used with ``with``.
-
-    Parameters
-    ----------
-    title
-        what is being worked on
-    """
+    """Progress of a sweep, a context manager."""
 
     def __init__(self, title: str) -> None:
         super().__init__(title, time_left=True)
 
     def checked(self, done: int, total: int) -> None:
-        """So many of the points have been checked.
-
-        Parameters
-        ----------
-        done
-            how many
-        total
-            of how many
-        """
+        """Show how many of the points have been checked."""
         self.done(done, total, 0)
 
     def done(self, done: int, total: int, failed: int) -> None:
-        """So many points are done, and so many of these failed; see ``Watch`` of ``msg_analysis.sweep.conduct``.
-
-        Parameters
-        ----------
-        done
-            how many
-        total
-            of how many
-        failed
-            how many have no result
-        """
+        """Show how many points are done, and how many of these failed; a ``Watch`` of ``sweep.conduct``."""
         without = f"{failed} without a result" if failed else ""
         self._show(self._title, done, total, without, without)
 
 
 class SolveProgress(_Progress):
-    """How far a search is: a ``Watch`` of ``msg_analysis.theory.leader_search``, to be used with ``with``.
-
-    Parameters
-    ----------
-    title
-        what is being worked on
-    """
+    """Progress of a search: a ``Watch`` of ``msg_analysis.theory.leader_search``, and a context manager."""
 
     def __init__(self, title: str) -> None:
         super().__init__(title, time_left=False)
 
     def __call__(self, stage: str, done: int, total: int, best: float) -> None:
-        """Show a new state; see ``Watch``."""
+        """Show stage, evaluations done and to do, and the least system error so far; see ``Watch``."""
         found = f"{best:.6g}"
         self._show(f"{self._title}: {stage}", done, total, f"least system error {found}", f"E {found}")

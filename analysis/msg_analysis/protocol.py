@@ -1,15 +1,15 @@
-"""Laws of agents from other packages: what such a package implements, and nothing else.
+"""The interface for laws of agents in other packages.
 
 A package offers a law under the entry-point group ``msg_agents.protocols``; an experiment asks for it by
 ``protocol: {name: ..., ...}``. There are two kinds:
 
 * ``LinearProtocol`` declares the matrix of a step under every graph. It runs as fast as the built-in law, and is
   predicted and tested like it.
-* ``Protocol`` is any step from an agent's own state and what it has heard. It runs, is recorded and measured, without a
+* ``Protocol`` is any step from an agent's own state and what it has heard. It is run, recorded and measured, without a
   prediction.
 
-The law of a step must be a function of what it is given. Whatever is to be remembered belongs into the state: only that
-is kept for an agent whose process has been killed, and only then does the offline twin make the same steps.
+A step must depend on its arguments only. What is to be remembered belongs in the state: only the state is kept for an
+agent whose process was killed, and only then does the offline twin make the same steps.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ENTRY_POINTS = "msg_agents.protocols"
 
 
 class Parameters(BaseModel):
-    """What an experiment may say about a protocol besides its name; derive from it, with a default for every field.
+    """Parameters of a protocol in the experiment file, beside its name; derive from it, with a default for every field.
 
     Unknown keys and values of a wrong type are errors of the experiment file, reported with all others.
     """
@@ -52,11 +52,11 @@ class Network:
     dt
         simulated time of a step; 1 in discrete time
     noise_gain
-        (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I); sqrt(dt) F, as the file has it
+        (n, m, m) B_g = sqrt(dt) F, with F of the experiment: the process noise of a step is B_g v with v ~ N(0, I)
     tracking
-        whether the agents should follow leaders to ``reference``, instead of agreeing with each other
+        whether the agents should follow leaders to ``reference`` instead of agreeing with each other
     leader_gains
-        (m,) kappa [1 / unit of time]; 0 for followers, inf for leaders that are to be held
+        (m,) kappa [1 / unit of simulated time]; 0 for followers, inf for leaders held at the reference
     reference
         what is tracked; 0 without leaders
     """
@@ -77,22 +77,22 @@ class Network:
 class LinearProtocol(ABC):
     """x(k+1) = W_g x(k) + B_g v(k): one object for the whole network.
 
-    Leaders are the network's own matter, as in the built-in law: dt kappa (reference - x_i) is added to what a leader
-    does, and leaders of infinite gain are held at the reference.
+    Leaders are added as in the built-in law: dt kappa (reference - x_i) is added to the step of a leader; leaders of
+    infinite gain are held at the reference instead, in discrete time plus their process noise.
 
-    ``Parameters`` is the model of the parameters.
+    ``Parameters`` is the class of the parameters.
 
     Parameters
     ----------
     network
         the whole network
     parameters
-        of this protocol, checked by its model
+        an instance of ``Parameters``, checked
 
     Raises
     ------
     ValueError
-        the parameters do not go with this network; the text is shown to the user
+        the parameters do not fit this network; the text is shown to the user
     """
 
     Parameters: ClassVar[type[BaseModel]] = Parameters
@@ -103,7 +103,7 @@ class LinearProtocol(ABC):
 
     @abstractmethod
     def weights(self, mode: int) -> FloatArray:
-        """W_g of a graph, (m, m): rows sum to 1, and agent i uses only itself and whom it hears in this graph.
+        """W_g of a graph, (m, m): rows sum to 1, and agent i uses only itself and the agents that it hears there.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class LinearProtocol(ABC):
         """
 
     def noise_gain(self, mode: int) -> FloatArray:
-        """B_g of a graph, (m, m). By default what the experiment says.
+        """B_g of a graph, (m, m); by default that of the experiment.
 
         Parameters
         ----------
@@ -124,14 +124,14 @@ class LinearProtocol(ABC):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Heard:
-    """What an agent has heard for one step, of d neighbours.
+    """What an agent has heard for one step, from d neighbours.
 
-    With loss, messages that did not come are not in it; broadcast and link noise are in the values.
+    Lost messages are not in it; broadcast and link noise are in the values.
 
     Attributes
     ----------
     agents
-        (d,) who they are, from 0, ascending
+        (d,) the neighbours, from 0, ascending
     weights
         (d,) of the links, as in the graph's adjacency
     values
@@ -143,9 +143,9 @@ class Heard:
     values: FloatArray
 
     def weighted_sum(self, terms: FloatArray) -> FloatArray:
-        """Sum over the neighbours of weights[d] * terms[d], (R,); 0 where nobody was heard.
+        """Sum over the neighbours of weights[d] * terms[d], (R,); 0 if none was heard.
 
-        One term after the other, so that the same bits come out everywhere; of products of matrices they may not.
+        Adds one term after the other, which gives the same bits on every machine; a matrix product may not.
 
         Parameters
         ----------
@@ -158,26 +158,26 @@ class Heard:
 
 
 class Protocol(ABC):
-    """One agent that does as it likes: one object for each.
+    """Any law of an agent: one object for each agent.
 
     The state is (S, R): S numbers for each of R replicas, which are independent copies and must not mix. Its first row
     is the agent's value: what an experiment's ``start`` gives, and what errors are measured on.
 
-    ``Parameters`` is the model of the parameters.
+    ``Parameters`` is the class of the parameters.
 
     Attributes
     ----------
     tracking
-        whether this protocol knows leaders; otherwise experiments with ``problem: tracking`` are refused
+        whether this protocol handles leaders; otherwise experiments with ``problem: tracking`` are refused
     states
         S; may be set in the constructor, to the same number for all agents
     network, parameters, agent
-        as given
+        as given; the agent counts from 0
 
     Raises
     ------
     ValueError
-        (constructor) the parameters do not go with this network; the text is shown to the user
+        (constructor) the parameters do not fit this network; the text is shown to the user
     """
 
     Parameters: ClassVar[type[BaseModel]] = Parameters
@@ -190,19 +190,19 @@ class Protocol(ABC):
         self.agent = agent
 
     def start(self, value: FloatArray) -> FloatArray:
-        """State (S, R) at step 0 from the value (R,) that the experiment gives. By default all else is 0.
+        """State (S, R) at step 0. By default the value in the first row, and 0 elsewhere.
 
         Parameters
         ----------
         value
-            (R,) the experiment's start of this agent
+            (R,) the agent's start in the experiment
         """
         state = np.zeros((self.states, len(value)))
         state[0] = value
         return state
 
     def publish(self, state: FloatArray) -> FloatArray:
-        """What others hear (R,) of a state (S, R). By default its first row.
+        """What others hear of a state, (R,). By default its first row.
 
         Parameters
         ----------
@@ -222,11 +222,12 @@ class Protocol(ABC):
         mode
             graph of the step, from 0
         state
-            (S, R) before; read-only
+            (S, R) before the step; read-only
         heard
-            what others published of their states of step k
+            what the neighbours published of their states of step k
         noise
-            (R,) this agent's process noise of the step, N(0, (B_g B_g^T)_ii), correlated as F says
+            (R,) this agent's process noise of the step, N(0, (B_g B_g^T)_ii), correlated between agents as F says;
+            read-only
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Array types used in every signature."""
+"""Array types of signatures."""
 
 from typing import Any
 

@@ -1,1 +1,1 @@
-"""Results for people: tables in a terminal, and a report in a browser."""
+"""Results for people and scripts: terminal tables, the HTML report, figures, and the documents of ``--json``."""

@@ -1,4 +1,4 @@
-"""Bags and what was salvaged of them, as text."""
+"""Terminal tables of what a bag holds, and of what was salvaged from one."""
 
 from __future__ import annotations
 
@@ -13,19 +13,11 @@ from msg_analysis.model.words import counted
 from msg_analysis.report.tables import fact_table, number_text
 from msg_analysis.report.text import add_protocol, gaps
 
-_TOPICS = 12  # listed; --json has all
+_TOPICS = 12  # most topics listed; --json has all
 
 
 def print_bag(document: dict[str, Any], console: Console) -> None:
-    """What a bag holds.
-
-    Parameters
-    ----------
-    document
-        of ``msg_analysis.report.info.describe_bag``
-    console
-        where to print
-    """
+    """Print what a bag holds: a document of ``msg_analysis.report.info.describe_bag``."""
     facts = fact_table(console, document["bag"])
     if document["recording"]:
         facts.add_row("recording", f"process {document['recording']} is still writing it")
@@ -64,7 +56,7 @@ def _add_run(facts: Table, document: dict[str, Any]) -> None:
 
 
 def _state_of(file: dict[str, Any]) -> str:
-    """What is to say of a file of the bag, behind its size."""
+    """Text behind the size of a file: messages, compression, damage; "" for a file that is not part of the bag."""
     if "messages" not in file:
         return ""
     words = [counted(file["messages"], "message")]
@@ -81,15 +73,7 @@ def _state_of(file: dict[str, Any]) -> str:
 
 
 def print_salvage(document: dict[str, Any], console: Console) -> None:
-    """What was saved of a torn bag, and what was not.
-
-    Parameters
-    ----------
-    document
-        of ``msg_analysis.report.info.describe_salvage``
-    console
-        where to print
-    """
+    """Print what was saved of a torn bag and what was dropped: a document of ``info.describe_salvage``."""
     facts = fact_table(console, document["bag"])
     facts.add_row("kept", counted(document["kept_messages"], "message"))
     dropped = [f"{amount(document['dropped_bytes'])} behind the last whole record"] if document["dropped_bytes"] else []

@@ -1,4 +1,4 @@
-"""The graphs and the chain between them, drawn as SVG within the page: nothing to run, and sharp on paper."""
+"""The graphs and the chain as SVG inside the page: no scripts, and sharp in print."""
 
 from __future__ import annotations
 
@@ -15,22 +15,16 @@ from msg_analysis.report.palette import GREY, INK, mode_colour, shorten
 from msg_analysis.types import FloatArray
 
 MOST_GRAPHS = 8
-"""Graphs that are drawn."""
+"""Most graphs that are drawn."""
 MOST_MODES = 6
-"""Graphs between which the rates are drawn; more make a table."""
-_LABELLED = 40  # agents up to which the drawings show their numbers
+"""Most graphs whose chain is drawn; with more, the report has a table of the rates."""
+_LABELLED = 40  # most agents whose numbers are shown
 _SIDE = 200.0
-_WEIGHTS = 5  # widths of lines that can be told apart
+_WEIGHTS = 5  # different line widths
 
 
 def graph_drawings(experiment: Experiment) -> list[Markup]:
-    """The first graphs, with the same places for the agents; leaders are squares.
-
-    Parameters
-    ----------
-    experiment
-        whose graphs are drawn (the first eight)
-    """
+    """The first ``MOST_GRAPHS`` graphs, each agent at the same place in all of them; leaders are squares."""
     where = _scaled(places(experiment.graph_list), experiment.agents)
     leaders = set(experiment.leaders.agents) if experiment.leaders else set()
     return [
@@ -40,7 +34,7 @@ def graph_drawings(experiment: Experiment) -> list[Markup]:
 
 
 def _scaled(where: Mapping[int, FloatArray], agents: int) -> FloatArray:
-    """(m, 2) within the square, y downwards."""
+    """(m, 2) positions within the square, y downwards."""
     points = np.array([where[agent] for agent in range(agents)], dtype=float).reshape(agents, 2)
     low, high = points.min(axis=0), points.max(axis=0)
     room = _SIDE - 44.0
@@ -82,7 +76,7 @@ def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int]) -> M
 def _links(
     links: list[tuple[int, int, float]], where: FloatArray, colour: str, radius: float, *, directed: bool
 ) -> list[str]:
-    """One path for each width of the lines: dense graphs have thousands of links."""
+    """One path per line width, since dense graphs have thousands of links."""
     heaviest = max((weight for _, _, weight in links), default=1.0)
     lines: dict[int, list[str]] = {}
     heads: list[str] = []
@@ -90,7 +84,7 @@ def _links(
         a, b = where[source - 1], where[target - 1]
         step = (b - a) / max(float(np.hypot(*(b - a))), 1e-9)
         across = np.array([-step[1], step[0]])
-        if directed:  # aside, so that two of opposite directions do not lie on each other
+        if directed:  # moved aside, so that opposite arcs do not overlap
             a, b = a + 2 * across, b + 2 * across - radius * step
             left, right = b - 6 * step + 3 * across, b - 6 * step - 3 * across
             heads.append(f"M{_at(b)}L{_at(left)}L{_at(right)}Z")
@@ -109,12 +103,9 @@ def _at(point: FloatArray) -> str:
 
 
 def chain_drawing(experiment: Experiment) -> Markup | None:
-    """The chain: a circle for each graph, an arrow for each rate (or probability) from one to another.
+    """The chain: a circle per graph, an arrow per rate (or probability) from one to another.
 
-    Parameters
-    ----------
-    experiment
-        whose chain is drawn; None is returned for one graph, and for more than six
+    None for a single graph, and for more than ``MOST_MODES``.
     """
     chain, modes = experiment.chain, len(experiment.graph_list)
     if not 1 < modes <= MOST_MODES:
@@ -156,7 +147,7 @@ def chain_drawing(experiment: Experiment) -> Markup | None:
 
 
 def _jump(a: FloatArray, b: FloatArray, radius: float, label: str, title: str) -> str:
-    """A bent arrow from one circle to another, on the left of the way there."""
+    """A bent arrow from one circle to another, on the left of the straight line."""
     step = (b - a) / float(np.hypot(*(b - a)))
     across = np.array([step[1], -step[0]])
     bend = (a + b) / 2 + across * min(0.28 * float(np.hypot(*(b - a))), 60.0)

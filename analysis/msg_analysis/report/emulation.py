@@ -1,4 +1,4 @@
-"""Real networks on the paper's curves: which runs are made, and what they say about the three examples."""
+"""Real networks on the paper's curves: which runs are made, and how their results compare with theory."""
 
 from __future__ import annotations
 
@@ -18,45 +18,31 @@ from msg_analysis.sweep.plan import own_seed
 from msg_analysis.sweep.point import DONE, Job, Outcome
 
 DT = 0.025
-"""Simulated time of a step: the errors of the steps are then some 2 % above those of continuous time."""
+"""Simulated time of a step: its errors are about 2 % above those of continuous time."""
 
 REPLICAS = 32
 DURATION = 100.0
 CYCLES = 30
-"""Times, on average, that a run returns to a graph at least: with fewer, intervals are not to be relied on."""
+"""Least length of a run, in sums of the mean holding times of all graphs: intervals of shorter runs are unreliable."""
 
 LEVEL = 0.01
-"""Chance that any point at all is said to disagree, where all networks follow their law."""
+"""Probability that any point is said to disagree although all networks follow their law."""
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One run of a network.
+    """One run of a network, in lockstep, with ``REPLICAS`` replicas."""
 
-    Attributes
-    ----------
-    example
-        1, 2 or 3
-    network
-        name of the set of graphs
-    epsilon, r12, r21
-        rates, as the curves have them
-    leader
-        who leads, from 0, held at the reference; None: consensus
-    duration
-        in units of simulated time; by default ``DURATION``, or ``CYCLES`` returns to a graph
-    """
-
-    example: int
-    network: str
-    epsilon: float
+    example: int  # 1, 2 or 3
+    network: str  # key of _NETWORKS
+    epsilon: float  # [1 / unit of simulated time], scales r12 and r21
     r12: float
     r21: float
-    leader: int | None = None
-    duration: float | None = None
+    leader: int | None = None  # from 0, held at the reference; None: consensus
+    duration: float | None = None  # [units of simulated time]; None: DURATION, or CYCLES if longer
 
     def job(self) -> Job:
-        """What a worker is to do."""
+        """The run as a job for a sweep worker."""
         graphs, generator = _NETWORKS[self.network]
         rates = generator(self.epsilon, self.r12, self.r21)
         least = CYCLES * float(np.sum(-1.0 / np.diag(rates)))
@@ -74,7 +60,7 @@ class Run:
 
     @property
     def quantities(self) -> list[tuple[str, int | None]]:
-        """What of it is drawn: quantity, and agent from 0 (None: the system)."""
+        """What is drawn of the run: quantity, and agent from 0 (None: the system)."""
         if self.leader is not None:
             return [(CENTRALITY, self.leader)]
         nodes: list[tuple[str, int | None]] = [(NODE, agent) for agent in range(5)]
@@ -93,13 +79,7 @@ _NETWORKS: dict[str, tuple[dict[str, Any], paper.Generator]] = {
 
 
 def runs_of(example: int) -> list[Run]:
-    """The runs for an example: values at which the paper's curves are drawn.
-
-    Parameters
-    ----------
-    example
-        1, 2 or 3
-    """
+    """The runs for an example (1, 2 or 3), at rates that the paper's curves go through."""
     if example == 1:
         # Each of these is on one curve over r12 and on one over r21.
         levels = [level for level in paper.LEVELS if level >= 0.5]
@@ -117,46 +97,22 @@ def runs_of(example: int) -> list[Run]:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A measured certainty beside what is expected of it.
-
-    Attributes
-    ----------
-    run
-        that it is of
-    quantity, agent
-        see ``paper.Curve``
-    value, low, high
-        1 / E [1 / variance], and the ends of its 95 % interval
-    predicted
-        what is exact for the steps of the run
-    z, p
-        of the measured error
-    p_holm
-        adjusted over all points of all examples
-    """
+    """A measured certainty beside its prediction."""
 
     run: Run
-    quantity: str
-    agent: int | None
-    value: float
-    low: float
+    quantity: str  # SYSTEM, NODE or CENTRALITY
+    agent: int | None  # from 0; None: the system
+    value: float  # 1 / E [1 / variance]
+    low: float  # to high: the 95 % interval of the value
     high: float
-    predicted: float
-    z: float
+    predicted: float  # exact for the steps of the run
+    z: float  # of the error E, like p
     p: float
-    p_holm: float = 1.0
+    p_holm: float = 1.0  # adjusted over all points that were measured together
 
 
 def measured(runs: Sequence[Run], outcomes: Sequence[Outcome]) -> list[Measured]:
-    """All points that are drawn; the runs that failed have none.
-
-    Parameters
-    ----------
-    runs
-        Sequence[Run] that were made
-    outcomes
-        Sequence[Outcome] of each of them
-    """
+    """The points that are drawn, of all runs that did not fail; Holm's adjustment is over all of them."""
     found = []
     for run, outcome in zip(runs, outcomes, strict=True):
         if outcome.status != DONE:
@@ -191,15 +147,7 @@ COLUMNS = (
 
 
 def csv_text(number: int, points: Sequence[Measured]) -> str:
-    """The points of an example as a table: comment lines that begin with ``#``, a header, one row each.
-
-    Parameters
-    ----------
-    number
-        1, 2 or 3
-    points
-        Sequence[Measured] of all examples
-    """
+    """The points of one example as CSV: comment lines that begin with ``#``, a header, a row per point."""
     text = io.StringIO()
     text.write(
         f"# Example {number}: networks of ROS 2 processes in lockstep, dt = {DT:g}, {REPLICAS} replicas, F = I\n"
@@ -220,17 +168,7 @@ def csv_text(number: int, points: Sequence[Measured]) -> str:
 
 
 def summary(points: Sequence[Measured], runs: int, level: float = LEVEL) -> str:
-    """Whether all points agree with theory, in a sentence.
-
-    Parameters
-    ----------
-    points
-        Sequence[Measured] of all examples
-    runs
-        how many networks were run
-    level
-        chance of a false "disagrees" anywhere
-    """
+    """One sentence: whether all points agree with theory; ``runs`` is the number of networks."""
     apart = disagreeing(points, level)
     within = np.mean([point.low <= point.predicted <= point.high for point in points])
     least = min(point.p_holm for point in points)
@@ -242,13 +180,5 @@ def summary(points: Sequence[Measured], runs: int, level: float = LEVEL) -> str:
 
 
 def disagreeing(points: Sequence[Measured], level: float = LEVEL) -> list[Measured]:
-    """The points that cannot be reconciled with theory.
-
-    Parameters
-    ----------
-    points
-        Sequence[Measured] of all examples
-    level
-        see ``summary``
-    """
+    """The points whose adjusted p is below ``level``."""
     return [point for point in points if point.p_holm < level]

@@ -1,4 +1,4 @@
-"""An experiment explained back, in sentences."""
+"""An experiment in sentences, for the HTML report."""
 
 from __future__ import annotations
 
@@ -11,29 +11,14 @@ from msg_analysis.report.info import algebraic_connectivity, holding_times
 
 
 def explain(experiment: Experiment) -> list[str]:
-    """What the agents do, what switches, what is random, and what was run: a sentence or two each.
-
-    Parameters
-    ----------
-    experiment
-        that is explained
-    """
+    """What the agents do, what switches, what is random, and what was run: a short paragraph each."""
     return [_task(experiment), _switching(experiment), _noise(experiment), _run(experiment)]
 
 
 def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
-    """What there is to know of every graph.
+    """Of every graph: ``name``, ``links``, ``directed``, ``connectivity``, ``share`` (predicted, of time), ``held``.
 
-    Parameters
-    ----------
-    experiment
-        whose graphs they are
-
-    Returns
-    -------
-    list[dict[str, Any]]
-        of each: ``name``, ``links``, ``directed``, ``connectivity``, ``share`` (of the time, predicted) and
-        ``held`` (mean time at a stretch; None where it is never left)
+    ``held`` is the mean holding time [units of simulated time]; None for a graph that is never left.
     """
     rows = zip(experiment.graph_list, experiment.chain.stationary, holding_times(experiment), strict=True)
     return [

@@ -1,4 +1,4 @@
-"""Style of the paper's figures, and graphs drawn with matplotlib."""
+"""matplotlib style of the figures, and drawings of graphs."""
 
 from __future__ import annotations
 
@@ -28,35 +28,19 @@ STYLE = {
     "legend.frameon": False,
     "svg.hashsalt": "msg_analysis",
 }
-_LABELLED = 40  # agents up to which the drawings show their numbers
+_LABELLED = 40  # most agents whose numbers are shown
 
 
 def draw_graph(
     axes: Axes,
     graph: Graph,
-    places: Mapping[int, FloatArray],
+    places: Mapping[int, FloatArray],  # (2,) of every agent, from 0
     colour: str,
     *,
-    leaders: Set[int] = frozenset(),
-    size: float | None = None,
+    leaders: Set[int] = frozenset(),  # from 0
+    size: float | None = None,  # area of an agent [points^2]; None: by the number of agents
 ) -> None:
-    """Draw one graph; leaders are squares.
-
-    Parameters
-    ----------
-    axes
-        where
-    graph
-        what
-    places
-        Mapping[int, FloatArray] (2,) of every agent, from 0
-    colour
-        of the links, and of the agents
-    leaders
-        Set[int] agents from 0
-    size
-        area of an agent [points^2]; by default what fits the number of agents
-    """
+    """Draw one graph; leaders are squares."""
     agents = graph.agents
     size = size or (float(min(4200 / agents, 260)) if agents <= _LABELLED else 14.0)
     network = nx.DiGraph() if not graph.symmetric else nx.Graph()
@@ -77,6 +61,6 @@ def draw_graph(
     if agents <= _LABELLED:
         names = {i: str(i + 1) for i in range(agents)}
         nx.draw_networkx_labels(network, places, names, ax=axes, font_size=8 if agents <= 20 else 5.5)
-    axes.set_title(shorten(graph.name).replace("$", r"\$"), color=BLACK)  # matplotlib takes $ for mathematics
+    axes.set_title(shorten(graph.name).replace("$", r"\$"), color=BLACK)  # matplotlib reads $ as mathematics
     axes.margins(0.12)
     axes.set_aspect("equal")

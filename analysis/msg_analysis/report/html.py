@@ -1,4 +1,4 @@
-"""The report: one HTML file that needs nothing else, not even a network."""
+"""The HTML report: one file that loads nothing else."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _HEADLINES = {
     "incomplete": "No verdict: the data are incomplete.",
     "unpredicted": "No verdict: there is no prediction.",
 }
-_OPEN_TABLE = 12  # agents up to which the table of the nodes is open from the start
-_SMALL_CHAIN = 8  # graphs up to which all transitions are listed
+_OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
+_SMALL_CHAIN = 8  # most graphs whose transitions are listed
 _FIRST_LINES = 5
-_NODE_TEST = "error of agent "  # how the tests of the nodes begin
+_NODE_TEST = "error of agent "  # beginning of the names of the tests of the nodes
 
 
 def write_report(
@@ -48,24 +48,7 @@ def write_report(
     restarts: Sequence[str] = (),
     strangers: Sequence[Mapping[str, Any]] = (),
 ) -> None:
-    """Write the report of a comparison, whole or not at all.
-
-    Parameters
-    ----------
-    comparison
-        the result
-    trajectory
-        what was compared
-    path
-        of the HTML file; replaced where it exists
-    restarts, strangers
-        of the network, see ``render``
-
-    Raises
-    ------
-    InputError
-        the file cannot be written
-    """
+    """Write the report of a comparison, whole or not at all; InputError if that fails. Arguments as in ``render``."""
     path = Path(path)
     html = render(comparison, trajectory, restarts=restarts, strangers=strangers)
     try:
@@ -78,22 +61,10 @@ def render(
     comparison: Comparison,
     trajectory: Trajectory,
     *,
-    restarts: Sequence[str] = (),
-    strangers: Sequence[Mapping[str, Any]] = (),
+    restarts: Sequence[str] = (),  # one line per process that was restarted
+    strangers: Sequence[Mapping[str, Any]] = (),  # refused messages: node, topic, reason, count
 ) -> str:
-    """The report as HTML text.
-
-    Parameters
-    ----------
-    comparison
-        the result
-    trajectory
-        what was compared
-    restarts
-        Sequence[str] processes that were started again during the run, a line each
-    strangers
-        Sequence[Mapping[str, Any]] messages that the nodes refused: ``node``, ``topic``, ``reason``, ``count``
-    """
+    """The report as HTML text."""
     document = comparison.to_json()
     experiment = trajectory.record.experiment
     environment = jinja2.Environment(
@@ -149,7 +120,7 @@ def render(
 def _models(
     document: dict[str, Any], comparison: Comparison, trajectory: Trajectory
 ) -> tuple[dict[str, UIElement], tuple[int, int]]:
-    """The figures that there are, and how many sojourns are in that of the path, of how many."""
+    """The figures that exist, by name; sojourns in the figure of the active graph, and in the run."""
     experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
     models: dict[str, UIElement | None] = {
@@ -180,14 +151,14 @@ def _models(
 
 
 def _furthest(document: dict[str, Any]) -> list[int]:
-    """The agents whose convergence is drawn at first: those furthest off, in the order of their numbers."""
+    """The agents (from 1, ascending) whose convergence is drawn at first: those with the largest abs(z)."""
     distances = [abs(node["z"] or 0.0) for node in document["node_errors"]]
     most = min(len(distances), _FIRST_LINES)
     return sorted(sorted(range(1, len(distances) + 1), key=lambda agent: -distances[agent - 1])[:most])
 
 
 def _explanation(document: dict[str, Any]) -> str:
-    """The verdict in a sentence or two."""
+    """The verdict in a few sentences."""
     tests, completeness, level = document["tests"], document["completeness"], document["level"]
     if document["verdict"] == "incomplete":
         lost = [
@@ -225,7 +196,7 @@ def _order(document: dict[str, Any]) -> list[str]:
 
 
 def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
-    """The tests of all nodes in one line."""
+    """The tests of all nodes as one row; None where there are none."""
     tests = [test for test in document["tests"] if test["name"].startswith(_NODE_TEST)]
     if not tests:
         return None
@@ -240,7 +211,7 @@ def _number(value: float | None, digits: int = 4) -> str:
 
 
 def _distance(z: float | None) -> str:
-    """In standard errors."""
+    """A distance in standard errors."""
     return "–" if z is None else f"{z:+.2f}".replace("-", "−")
 
 

@@ -1,4 +1,4 @@
-"""Experiments and bags explained back, as documents for ``msg-analysis info``."""
+"""Experiments and bags as documents, for ``msg-analysis info``."""
 
 from __future__ import annotations
 
@@ -21,22 +21,9 @@ if TYPE_CHECKING:
 
 
 def describe_experiment(experiment: Experiment) -> dict[str, Any]:
-    """What an experiment says, with what follows from it.
+    """The document of ``msg-analysis info EXPERIMENT --json``; the experiment need not be one that can be run.
 
-    Parameters
-    ----------
-    experiment
-        checked; it need not be one that can be run
-
-    Returns
-    -------
-    dict[str, Any]
-        ``name``, ``problem``, ``time``, ``agents``, ``leaders``, ``protocol`` (``name``, ``package``, ``version``,
-        ``linear``, ``states``, ``hidden``, ``parameters``, ``absent``), ``noise``, ``run`` (with ``steps``),
-        ``switching`` (``matrix``, ``initial``), ``graphs`` (each ``name``, ``edges`` or ``arcs``,
-        ``algebraic_connectivity``, ``stationary``, ``mean_holding_time``, ``stability_limit``), ``stability_limit``,
-        ``predicted_system_error``, ``memory`` [bytes], ``unavailable``. None stands for what is infinite or cannot be
-        computed, or, for the stability limits, is not known (with a delay or a protocol).
+    None: infinite or not computable; a stability limit with a delay or a protocol is not known. Memory in bytes.
     """
     document = experiment.to_document()
     chain = experiment.chain
@@ -81,28 +68,11 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
 
 
 def describe_bag(path: Path) -> dict[str, Any]:
-    """What a bag holds: whole or torn, of a run of ours or not.
+    """The document of ``msg-analysis info BAG --json``, for a whole or a torn bag; keys in docs/commands.md.
 
-    Parameters
-    ----------
-    path
-        bag directory or MCAP file
-
-    Returns
-    -------
-    dict[str, Any]
-        ``bag``, ``recording`` (process that is writing it, or None), ``problem`` (why no run can be made of it; then
-        what is said of the run is None), ``run``, ``experiment``, ``seed``, ``agents``, ``replicas``, ``steps``,
-        ``simulated_time``, ``completeness``, ``prefix``, ``topics`` (each ``name``, ``type``, ``messages``), ``files``
-        (each ``name``, ``size`` [bytes]; those of the bag also ``messages``, ``start``, ``end`` [ns], ``compression``,
-        ``torn``, ``damaged_chunks``, ``lost_messages``, ``problem``), ``protocol`` (as of an experiment), ``versions``
-
-    Raises
-    ------
-    InputError
-        nothing of it can be read
+    InputError if no file of it can be read; a bag that is not a run has a ``problem``, and None for the run's keys.
     """
-    from msg_analysis.bags.inventory import Inventory  # here: an experiment does not need it
+    from msg_analysis.bags.inventory import Inventory  # imported here: experiments do not need it
     from msg_analysis.bags.metadata import total_channels
     from msg_analysis.bags.writer import recording_pid
 
@@ -172,27 +142,14 @@ def _describe_file(entry: FileInventory) -> dict[str, Any]:
 
 
 def describe_salvage(out: Path, report: SalvageReport) -> dict[str, Any]:
-    """What was salvaged, and what run is in it: the new bag is read for that.
-
-    Parameters
-    ----------
-    out
-        the new bag
-    report
-        of :func:`msg_analysis.bags.salvage.salvage`
-
-    Returns
-    -------
-    dict[str, Any]
-        ``bag``, the report's fields, and of the run what :func:`describe_bag` says
-    """
+    """The document of ``msg-analysis salvage --json``: the report's fields, and the run read from the new bag."""
     from msg_analysis.bags.inventory import Inventory
 
     return {"bag": str(out), **dataclasses.asdict(report), **_describe_run(out, Inventory())}
 
 
 def _protocol(experiment: Experiment) -> dict[str, Any] | None:
-    """What the agents do instead of the built-in law; None for that."""
+    """The protocol of the agents; None for the built-in law."""
     protocol = experiment.protocol
     if protocol is None:
         return None
@@ -204,13 +161,7 @@ def _protocol(experiment: Experiment) -> dict[str, Any] | None:
 
 
 def algebraic_connectivity(graph: Graph) -> float:
-    """Second smallest real part of the Laplacian's eigenvalues: how fast agreement comes with this graph.
-
-    Parameters
-    ----------
-    graph
-        directed or not
-    """
+    """Second smallest real part of the Laplacian's eigenvalues, at least 0: the rate of agreement under this graph."""
     laplacian = graph.laplacian
     values = np.linalg.eigvalsh(laplacian) if graph.symmetric else np.linalg.eigvals(laplacian)
     return max(float(np.sort(values.real)[1]), 0.0)
@@ -224,13 +175,7 @@ def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
 
 
 def holding_times(experiment: Experiment) -> list[float | None]:
-    """Mean time [units of simulated time] in each graph at a stretch; None where it is never left.
-
-    Parameters
-    ----------
-    experiment
-        whose chain it is
-    """
+    """Mean time in each graph before it is left [units of simulated time]; None where it is never left."""
     matrix = experiment.chain.matrix
     leaving = (matrix - np.diag(np.diag(matrix))).sum(axis=1)
     return [1.0 / rate if rate > 0 else None for rate in leaving.tolist()]
@@ -240,5 +185,5 @@ def _predicted_system_error(experiment: Experiment) -> float | None:
     try:
         experiment.require_available("predict")
         return predict(experiment).emulated.system_error
-    except InputError:  # what cannot be predicted can be explained all the same
+    except InputError:  # experiments without a prediction are described, too
         return None

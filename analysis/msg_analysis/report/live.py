@@ -1,4 +1,4 @@
-"""A network while it runs: one line, a table for a terminal, or a JSON document."""
+"""A running network as one line, as a terminal table or as a JSON document."""
 
 from __future__ import annotations
 
@@ -13,19 +13,11 @@ from msg_analysis.inference.online import LiveReport
 from msg_analysis.model.record import RunRecord
 
 MOST_ROWS = 20
-"""Agents in the table; of more, those whose errors are furthest off."""
+"""Most agents in the table; of more, those with the largest abs(z)."""
 
 
 def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
-    """The document of ``msg-agents live --json``; keys as in that of ``compare``.
-
-    Parameters
-    ----------
-    report
-        newest
-    record
-        of the run that is watched
-    """
+    """The document of ``msg-agents live --json``; keys as in that of ``compare`` where both have them."""
     dt = record.experiment.step_length
     return {
         "run": str(record.run),
@@ -43,33 +35,13 @@ def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
 
 
 def live_line(report: LiveReport, record: RunRecord, rate: float) -> str:
-    """One line.
-
-    Parameters
-    ----------
-    report
-        the numbers
-    record
-        of the run
-    rate
-        steps per second
-    """
+    """Step, system error and missing steps in one line; ``rate`` in steps per second."""
     parts = [f"step {max(report.newest, 0)} of {record.experiment.steps}", f"system error {_beside(report.system)}"]
     return ", ".join(parts + _account(report, rate))
 
 
 def live_table(report: LiveReport, record: RunRecord, rate: float) -> RenderableType:
-    """A table of the errors; arguments as in ``live_line``.
-
-    Parameters
-    ----------
-    report
-        newest
-    record
-        of the run that is watched
-    rate
-        steps per second
-    """
+    """A table of the errors, and below it what ``live_line`` counts; ``rate`` in steps per second."""
     experiment = record.experiment
     time = max(report.newest, 0) * experiment.step_length
     table = Table(

@@ -1,4 +1,4 @@
-"""Colours of Okabe and Ito, which the colour-blind can tell apart; shapes and line styles go with them."""
+"""The Okabe-Ito colours, which colour-blind readers can tell apart; shapes and line styles differ as well."""
 
 from __future__ import annotations
 
@@ -11,24 +11,10 @@ GREY, PALE, INK = "#6b7280", "#e5e7eb", "#374151"
 
 
 def mode_colour(mode: int) -> str:
-    """Of a graph.
-
-    Parameters
-    ----------
-    mode
-        index from 0
-    """
+    """Colour of a graph, from 0; repeats after eight."""
     return MODE_COLOURS[mode % len(MODE_COLOURS)]
 
 
 def shorten(name: str, length: int = 18) -> str:
-    """Short enough for a label.
-
-    Parameters
-    ----------
-    name
-        of a graph, or of anything
-    length
-        characters that there is room for
-    """
+    """The name cut to ``length`` characters, the last of which is then an ellipsis."""
     return name if len(name) <= length else name[: length - 1] + "…"

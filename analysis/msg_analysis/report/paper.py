@@ -1,7 +1,7 @@
 """The three numerical examples of the paper as numbers: certainty over the switching rates.
 
-The paper's pictures of the graphs of examples 2 and 3 are not part of its text. Those used here are reconstructions,
-and say so wherever they are shown.
+The paper's pictures of the graphs of examples 2 and 3 are not part of its text: those used here are reconstructions,
+and are marked as such wherever they are shown.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ THREE_LINES = {
     "line_2": {"path": [1, 2, 3, 4, 5]},
     "line_3": {"path": [5, 1, 2, 3, 4]},
 }
-"""Each is the ring without one edge. Fits every statement of the paper about example 2; not the only choice."""
+"""Each is the ring without one edge. They fit every statement of the paper about example 2, as other graphs would."""
 
 KNIFE_EDGE = {
     "first": {"edges": [[1, 2], [1, 3], [1, 5], [3, 4], [4, 5]]},
@@ -49,31 +49,15 @@ SMALLEST = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """One curve: a certainty [1 / variance] along a path of rates. F = I throughout.
+    """One curve: a certainty along a path of rates, with F = I; all arrays are (points,)."""
 
-    Attributes
-    ----------
-    network
-        name of the set of graphs
-    quantity
-        ``SYSTEM``, ``NODE`` or ``CENTRALITY`` (of this agent as the only leader)
-    agent
-        from 0; None for the system
-    epsilon
-        (points,) scale of all rates [1 / unit of time]
-    r12, r21
-        (points,) rates before scaling, so that q_ij = epsilon r_ij
-    value
-        (points,)
-    """
-
-    network: str
-    quantity: str
-    agent: int | None
-    epsilon: FloatArray
+    network: str  # name of the set of graphs
+    quantity: str  # SYSTEM, NODE or CENTRALITY (of this agent as the only leader)
+    agent: int | None  # from 0; None: the system
+    epsilon: FloatArray  # scale of all rates [1 / unit of time]: q_ij = epsilon r_ij
     r12: FloatArray
     r21: FloatArray
-    value: FloatArray
+    value: FloatArray  # [1 / variance]
 
     @property
     def peak(self) -> int:
@@ -83,27 +67,13 @@ class Curve:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Example:
-    """One example of the paper.
+    """One example of the paper."""
 
-    Attributes
-    ----------
-    number
-        1, 2 or 3
-    title
-        what it is about
-    networks
-        graphs by network's name
-    curves
-        all that is drawn
-    remarks
-        lines for the head of the table; what is a reconstruction says so
-    """
-
-    number: int
+    number: int  # 1, 2 or 3
     title: str
-    networks: dict[str, tuple[Graph, ...]]
+    networks: dict[str, tuple[Graph, ...]]  # by name of the network
     curves: list[Curve]
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  # comment lines of the table; they say what is a reconstruction
 
     @property
     def reconstructed(self) -> bool:
@@ -111,15 +81,7 @@ class Example:
         return any("reconstruct" in line for line in self.remarks)
 
     def select(self, network: str, quantity: str) -> list[Curve]:
-        """The curves of one network and quantity.
-
-        Parameters
-        ----------
-        network
-            its name in the paper
-        quantity
-            what is drawn, such as "node certainty"
-        """
+        """The curves of one network and one quantity."""
         return [curve for curve in self.curves if (curve.network, curve.quantity) == (network, quantity)]
 
 
@@ -128,48 +90,18 @@ Generator = Callable[[float, float, float], FloatArray]
 
 
 def two_graphs(epsilon: float, r12: float, r21: float) -> FloatArray:
-    """The paper's generator of examples 1 and 3.
-
-    Parameters
-    ----------
-    epsilon
-        scale of all rates
-    r12
-        rate from graph 1 to 2, before scaling
-    r21
-        rate from graph 2 to 1
-
-    Returns
-    -------
-    FloatArray
-        (2, 2) generator
-    """
+    """Generator (2, 2) of examples 1 and 3: q12 = epsilon r12, q21 = epsilon r21."""
     return epsilon * np.array([[-r12, r12], [r21, -r21]])
 
 
 def three_graphs(epsilon: float, r12: float, r21: float) -> FloatArray:
-    """The paper's generator of example 2: r32 = r12, and r21 = r23 = r2j; no jumps between graphs 1 and 3.
-
-    Parameters
-    ----------
-    epsilon
-        scale of all rates
-    r12
-        rate from graph 1 to 2, and from 3 to 2, before scaling
-    r21
-        rate from graph 2 to 1, and to 3
-
-    Returns
-    -------
-    FloatArray
-        (3, 3) generator
-    """
+    """Generator (3, 3) of example 2: r32 = r12 and r21 = r23, before scaling; no jumps between graphs 1 and 3."""
     return epsilon * np.array([[-r12, r12, 0.0], [r21, -2.0 * r21, r21], [0.0, r12, -r12]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Network:
-    """Graphs that are checked once and then seen under many chains."""
+    """Graphs that are checked once, then used with many chains."""
 
     name: str
     base: Experiment
@@ -185,7 +117,7 @@ class _Network:
         return dataclasses.replace(self.base, chain=chain)
 
     def certainties(self, epsilon: float, r12: float, r21: float) -> FloatArray:
-        """(1 + m,) of the system and of every node."""
+        """(1 + m,) certainty of the system and of every node."""
         system = systems.continuous(self.at(epsilon, r12, r21))
         moments = Moments(system.lifted(MomentSolver(system).steady().sum(axis=0)))
         return 1.0 / np.append(moments.system_error, moments.node_errors)
@@ -201,7 +133,7 @@ class _Network:
         *,
         quantities: Sequence[str],
     ) -> list[Curve]:
-        """All curves of some quantities along a path of (epsilon, r12, r21)."""
+        """All curves of some quantities along a path of (epsilon, r12, r21), each (points,)."""
         points = list(zip(*rates, strict=True))
         found: list[Curve] = []
         if SYSTEM in quantities or NODE in quantities:
@@ -217,15 +149,9 @@ class _Network:
 
 
 def example_1(points: int = 60) -> Example:
-    """Consensus on line and ring, epsilon = 0.5: certainty over r12 and over r21.
-
-    Parameters
-    ----------
-    points
-        per curve
-    """
+    """Consensus on line and ring, epsilon = 0.5: certainty over r12 and over r21, at ``points`` rates and 0.1 and 1."""
     network = _Network.of("line_ring", LINE_RING, two_graphs)
-    swept = np.unique(np.append(5.0 * np.linspace(0.04, 1.0, points) ** 2, [0.1, 1.0]))  # dense where it is steep
+    swept = np.unique(np.append(5.0 * np.linspace(0.04, 1.0, points) ** 2, [0.1, 1.0]))  # dense where curves are steep
     epsilon = np.full_like(swept, 0.5)
     curves: list[Curve] = []
     for other in LEVELS:
@@ -251,17 +177,11 @@ SCALES = (0.5, 1.0, 5.0, 10.0)
 """Example 2: values of epsilon."""
 
 NODE_SCALES = (0.5, 10.0)
-"""Example 2: values of epsilon whose node certainties are drawn."""
+"""Example 2: values of epsilon with drawn node certainties."""
 
 
 def example_2(points: int = 60) -> Example:
-    """Consensus on three lines: certainty over r12 = r32, with its largest values.
-
-    Parameters
-    ----------
-    points
-        per curve
-    """
+    """Consensus on three lines: certainty over r12 = r32, at ``points`` rates, 0.2, 0.5 and the largest value."""
     network = _Network.of("three_lines", THREE_LINES, three_graphs)
     curves: list[Curve] = []
     for scale in SCALES:
@@ -281,10 +201,7 @@ def example_2(points: int = 60) -> Example:
 def example_3(points: int = 60) -> Example:
     """One leader held at the reference, two graphs, q12 = q21 = epsilon: centrality and certainty over epsilon.
 
-    Parameters
-    ----------
-    points
-        per curve
+    At ``points`` values of epsilon and 0.1, 1 and 10.
     """
     curves: list[Curve] = []
     networks: dict[str, tuple[Graph, ...]] = {}
@@ -323,13 +240,7 @@ COLUMNS = (
 
 
 def table(example: Example) -> Iterable[tuple[str | int | float, ...]]:
-    """Every point of every curve, one row each, in the order of ``COLUMNS``; agents from 1, 0 for the system.
-
-    Parameters
-    ----------
-    example
-        of the paper
-    """
+    """A row per point of every curve, in the order of ``COLUMNS``; agents from 1, 0 for the system."""
     for curve in example.curves:
         agent = 0 if curve.agent is None else curve.agent + 1
         columns = (curve.epsilon, curve.r12, curve.r21, curve.epsilon * curve.r12, curve.epsilon * curve.r21)
@@ -338,21 +249,13 @@ def table(example: Example) -> Iterable[tuple[str | int | float, ...]]:
 
 
 def order(curves: Sequence[Curve], point: int) -> list[int]:
-    """Agents, from 0, by decreasing value of their curves at one point.
-
-    Parameters
-    ----------
-    curves
-        one for each agent
-    point
-        index of the point
-    """
+    """Agents, from 0, by decreasing value of their curves (one per agent) at the point with this index."""
     ranked = sorted(curves, key=lambda curve: -curve.value[point])
     return [curve.agent for curve in ranked if curve.agent is not None]
 
 
 def _argmax(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function with one maximum has it; found on a logarithmic axis."""
+    """Where a function with one maximum has it, between ``low`` and ``high`` > 0; the search is logarithmic."""
     bounds = (np.log(low), np.log(high))
     found = scipy.optimize.minimize_scalar(lambda u: -function(np.exp(u)), bounds=bounds, options={"xatol": 1e-6})
     return float(np.exp(found.x))

@@ -1,4 +1,4 @@
-"""The three examples of the paper as figures for print, with the numbers behind them."""
+"""The three examples of the paper as figures for print, with their numbers as CSV."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _STYLE = STYLE | {
     "pdf.fonttype": 42,  # TrueType: text stays text
     "svg.fonttype": "path",  # looks the same where the font is missing
 }
-# Colour, dashes and marker of the first, second ... curve of a panel: any one of the three tells them apart.
+# Colour, dashes and marker of the first, second ... curve of a panel; each of the three alone is distinctive.
 _LOOKS = (
     (BLUE, "-", "o"),
     (VERMILLION, (0, (5, 1.5)), "s"),
@@ -61,8 +61,8 @@ _LOOKS = (
 )
 _MARKERS = 5  # on a curve
 _GREY = "#4b5563"
-_LINE = 0.125  # inches from one label to the next
-_SIDE = 0.05  # inches between points that belong to the same place
+_LINE = 0.125  # inches between labels
+_SIDE = 0.05  # inches between points at the same rate
 _NOTE = (
     "Curves: continuous time.  Points: networks of ROS 2 processes, 95 % intervals.  "
     f"Dashes: exact for their steps (dt = {emulation.DT:g})."
@@ -75,33 +75,9 @@ def write_figures(
     formats: Sequence[str] = FORMATS,
     measured: Sequence[Measured] = (),
 ) -> list[Path]:
-    """Write examples of the paper: ``example_<number>`` in every format, and the numbers as CSV.
+    """Write ``example_<number>`` in every format and as CSV; with measured points, ``example_<number>_emulated``.
 
-    With measured points these are on the curves, and ``_emulated`` is appended to the names.
-
-    Files of these names are replaced, whole or not at all; nothing else in the directory is touched. The same
-    versions of the packages write the same bytes.
-
-    Parameters
-    ----------
-    numbers
-        Sequence[int] 1, 2, 3
-    directory
-        made where it does not exist
-    formats
-        Sequence[str] "png", "svg", "pdf"
-    measured
-        Sequence[Measured] of networks that were run
-
-    Returns
-    -------
-    list[Path]
-        the files
-
-    Raises
-    ------
-    InputError
-        a file cannot be written
+    Each file is whole or not written (InputError). The same versions of the packages write the same bytes.
     """
     directory = Path(directory)
     written = []
@@ -123,13 +99,7 @@ def write_figures(
 
 
 def csv_text(example: Example) -> str:
-    """The numbers: comment lines that begin with ``#``, a header with units, one row per point.
-
-    Parameters
-    ----------
-    example
-        of the paper
-    """
+    """The curves as CSV: comment lines that begin with ``#``, a header with units, a row per point."""
     text = io.StringIO()
     for line in (f"Example {example.number}: {example.title}", "agent 0 is the system", *example.remarks):
         text.write(f"# {line}\n")
@@ -140,15 +110,7 @@ def csv_text(example: Example) -> str:
 
 
 def draw(example: Example, measured: Sequence[Measured] = ()) -> Figure:
-    """The figure of an example; the caller sets the style.
-
-    Parameters
-    ----------
-    example
-        of ``msg_analysis.report.paper``
-    measured
-        Sequence[Measured] points that are drawn on its curves
-    """
+    """The figure of an example, with measured points on its curves; the caller sets the style."""
     figure = {1: _draw_1, 2: _draw_2, 3: _draw_3}[example.number](example, measured)
     if measured:
         figure.supxlabel(_NOTE, size=7.5, color=_GREY)
@@ -267,23 +229,22 @@ def _plot(
     height: float,
     measured: Sequence[Measured] = (),
 ) -> None:
-    """Curves over one of their rates, their labels at the right end under a heading; set the limits before.
+    """Curves over one of their rates, with labels at the right end under a heading; set the limits before.
 
-    Measured points that are on them, if any, are what has markers then.
-
-    ``height`` is that of the axes, roughly [inches]: the layout is not known yet.
+    Measured points, if any, have the markers instead of the curves. ``height`` of the axes [inches] is approximate: the
+    layout is not known yet.
     """
     logarithmic = axes.get_xscale() == "log"
     points = [_on_curve(label, curve, swept, measured) for label, curve in curves]
     ends = [end for found in points for point in found for end in (point.low, point.high)]
     axes.set_ylim(min([axes.get_ylim()[0], *ends]), max([axes.get_ylim()[1], *ends]))
-    if ends and not logarithmic:  # points at the end of the curves are whole
+    if ends and not logarithmic:  # room for points at the end of the curves
         axes.set_xlim(right=1.03 * max(curve_x.max() for curve_x in (getattr(curve, swept) for _, curve in curves)))
     for look, (_, curve) in enumerate(curves):
         colour, dashes, marker = _LOOKS[look]
         x = getattr(curve, swept)
         place = np.log(x) if logarithmic else x
-        places = (np.arange(_MARKERS) + (look + 0.2) / len(_LOOKS)) / _MARKERS  # no markers on top of each other
+        places = (np.arange(_MARKERS) + (look + 0.2) / len(_LOOKS)) / _MARKERS  # markers do not overlap
         marked = sorted({int(np.abs(place - target).argmin()) for target in place[0] + places * np.ptp(place)})
         axes.plot(
             x,
@@ -306,7 +267,7 @@ def _plot(
 
 
 def _on_curve(label: str, curve: Curve, swept: str, measured: Sequence[Measured]) -> list[Measured]:
-    """The points that a curve, which may stand for several agents, goes through."""
+    """The measured points on a curve, which may stand for several agents: ``label`` has their numbers."""
     held = [name for name in ("epsilon", "r12", "r21") if name != swept]
     agents = {None} if curve.agent is None else {int(number) - 1 for number in label.split(", ") if number.isdigit()}
     return [
@@ -319,7 +280,7 @@ def _on_curve(label: str, curve: Curve, swept: str, measured: Sequence[Measured]
 
 
 def _plot_points(axes: Axes, swept: str, points: Sequence[Measured], colour: str, marker: str, beside: float) -> None:
-    """Measured points with their intervals, and what is exact for the steps of their runs; ``beside`` in inches."""
+    """Measured points with their intervals, and dashes for their predictions; shifted by ``beside`` [inches]."""
     for point in points:
         x = getattr(point.run, swept)
         # Side by side where several agents share a curve.
@@ -333,14 +294,14 @@ def _plot_points(axes: Axes, swept: str, points: Sequence[Measured], colour: str
 
 
 def _beside(axes: Axes, text: str, height: float, raised: float, colour: str, align: str) -> None:
-    """A text to the right of the axes, at a share of their height and some points above that."""
+    """A text to the right of the axes, at a share of their height, ``raised`` by some points."""
     axes.annotate(
         text, (1, height), (4, raised), xycoords="axes fraction", textcoords="offset points", color=colour, va=align
     )
 
 
 def _apart(heights: Sequence[float], gap: float) -> list[float]:
-    """Heights moved as little as it takes to be a gap apart: neighbours that are too close share their mean."""
+    """Heights moved as little as possible to be ``gap`` apart: neighbours that are too close keep their mean."""
     order = sorted(range(len(heights)), key=lambda i: heights[i])
     blocks: list[tuple[float, list[int]]] = []  # (middle, members)
     for i in order:
@@ -358,7 +319,7 @@ def _apart(heights: Sequence[float], gap: float) -> list[float]:
 
 
 def _note_reconstruction(axes: Axes) -> None:
-    """Under the last of some graphs."""
+    """Write below the axes that the graphs are reconstructed."""
     axes.annotate(
         "reconstructed", (0.5, 0.0), (0, -5), xycoords="axes fraction", textcoords="offset points", size=7,
         color=_GREY, style="italic", ha="center", va="top",
@@ -366,7 +327,7 @@ def _note_reconstruction(axes: Axes) -> None:
 
 
 def _settle(figure: Figure) -> None:
-    """Make the layout, and round it: its last digits depend on the order in which a set is walked through."""
+    """Make the layout, and round it: its last digits depend on the iteration order of a set."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for axes in figure.axes:
@@ -385,7 +346,7 @@ def _draw_network(axes: Axes, graph: Graph, title: str) -> None:
 
 
 def _coinciding(curves: Sequence[Curve]) -> list[tuple[str, Curve]]:
-    """Curves that are the same by symmetry are drawn once, under the names of all their agents."""
+    """Curves that are equal by symmetry, once, under the numbers of all their agents."""
     groups: list[tuple[list[str], Curve]] = []
     for curve in curves:
         for agents, other in groups:
@@ -398,7 +359,7 @@ def _coinciding(curves: Sequence[Curve]) -> list[tuple[str, Curve]]:
 
 
 def _agent(curve: Curve) -> str:
-    """Its number, from 1."""
+    """Number of a curve's agent, from 1."""
     assert curve.agent is not None
     return str(curve.agent + 1)
 

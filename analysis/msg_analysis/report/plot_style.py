@@ -1,4 +1,4 @@
-"""How figures of the report look."""
+"""Style of the report's Bokeh figures."""
 
 from __future__ import annotations
 
@@ -16,17 +16,7 @@ SANS = "system-ui, -apple-system, 'Segoe UI', 'Noto Sans', 'DejaVu Sans', sans-s
 
 
 def new_figure(height: int, tools: str = "box_zoom,pan,wheel_zoom,reset,save", **options: Any) -> Any:
-    """An empty figure in the report's style. It does not take the wheel from who scrolls the page.
-
-    Parameters
-    ----------
-    height
-        in pixels
-    tools
-        of Bokeh
-    options
-        of Bokeh's ``figure``
-    """
+    """An empty figure in the report's style, ``height`` in pixels; the wheel scrolls the page unless zoom is chosen."""
     settings = {"sizing_mode": "stretch_width", "active_scroll": None} | options
     plot = figure(height=height, tools=tools, **settings)
     plot.toolbar.logo = None
@@ -44,13 +34,7 @@ def new_figure(height: int, tools: str = "box_zoom,pan,wheel_zoom,reset,save", *
 
 
 def place_legend(plot: Any) -> None:
-    """Put the legend above the figure, in one row.
-
-    Parameters
-    ----------
-    plot
-        a figure
-    """
+    """Move the legend, if any, above the figure, into one row."""
     if plot.legend:
         legend = plot.legend[0]
         plot.add_layout(legend, "above")
@@ -59,13 +43,7 @@ def place_legend(plot: Any) -> None:
 
 
 def plain_legend(legend: Any) -> None:
-    """A legend in the report's style.
-
-    Parameters
-    ----------
-    legend
-        of a figure
-    """
+    """Give a legend the report's style."""
     legend.border_line_color = legend.background_fill_color = None
     legend.label_text_font, legend.label_text_font_size, legend.label_text_color = SANS, "12px", INK
     legend.margin = legend.padding = 0

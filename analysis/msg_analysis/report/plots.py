@@ -34,23 +34,15 @@ from msg_analysis.report.palette import (
 from msg_analysis.report.plot_style import SANS, new_figure, place_legend, plain_legend
 from msg_analysis.types import FloatArray
 
-HALF = 1.959963984540054  # standard errors to either side of a 95 % interval
+HALF = 1.959963984540054  # standard errors on each side of a 95 % interval
 MOST_LINES = 8
-"""Agents whose convergence is drawn at once."""
-_NUMBERED = 8  # agents up to which heat maps show their numbers
-_POINTS = 200  # of the convergence of an agent
+"""Most agents whose convergence is drawn at once."""
+_NUMBERED = 8  # most agents with which heat maps show numbers
+_POINTS = 200  # at most, on the line of an agent
 
 
 def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> UIElement:
-    """The measured system error as it converges to the predicted one.
-
-    Parameters
-    ----------
-    running
-        Mapping[str, FloatArray] "time", "system_error" and "standard_error", (points,) each
-    predicted
-        system error
-    """
+    """The running system error, of ``Comparison.running`` with (points,) each, beside the predicted one."""
     time, mean, error = running["time"], running["system_error"], running["standard_error"]
     centre = predicted if predicted is not None else mean[-1]
     low, high = centre - HALF * error, centre + HALF * error
@@ -64,7 +56,7 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
         rows += [("predicted", f"{predicted:.4g}"), ("95 % band", "@low{0.0000} … @high{0.0000}"), ("z", "@z{+0.00}")]
     line = plot.line("time", "mean", source=source, color=BLUE, line_width=2, legend_label="mean up to this time")
     plot.add_tools(HoverTool(renderers=[line], mode="vline", tooltips=rows, line_policy="nearest"))
-    # The first moments are noise: they would flatten everything after them.
+    # The earliest values are mostly noise, and would flatten the rest.
     late = time >= time[-1] / 50
     bottom, top = min(mean[late].min(), low[late].min()), max(mean[late].max(), high[late].max())
     margin = 0.08 * (top - bottom) or 1.0
@@ -74,15 +66,7 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
 
 
 def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
-    """Node errors with their 95 % intervals beside the predicted ones; agents can be chosen in it.
-
-    Parameters
-    ----------
-    nodes
-        Sequence[Mapping[str, Any]] ``node_errors`` of a comparison
-    level
-        below which an adjusted p counts as a disagreement
-    """
+    """Node errors with 95 % intervals beside the predicted ones; marked if p < ``level``; agents can be chosen."""
     agents = np.arange(1, len(nodes) + 1)
     measured, predicted, error = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
     apart = np.nan_to_num(_column(nodes, "p_holm"), nan=1.0) < level
@@ -136,7 +120,7 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
     name = "measured" if np.isnan(error).all() else "measured, 95 % interval"
     for chosen, label in ((~apart, name), (apart, "measured, disagrees")):
         there = np.flatnonzero(chosen & ~np.isnan(measured))
-        if len(there):  # of the points, some have another shape
+        if len(there):  # takes shape and colour of one such point
             legend.items.append(LegendItem(label=label, renderers=[points], index=int(there[0])))
     if not plot.legend:
         plot.add_layout(legend)
@@ -145,32 +129,21 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
 
 
 def agent_convergence(
-    states: FloatArray, reference: float | None, dt: float, nodes: Sequence[Mapping[str, Any]]
+    states: FloatArray,  # (steps, m, replicas), without gaps
+    reference: float | None,
+    dt: float,  # [units of simulated time]
+    nodes: Sequence[Mapping[str, Any]],
 ) -> UIElement | None:
-    """Measured node errors, as parts of the predicted ones, as they converge; of the agents that are chosen.
+    """Measured node errors of the chosen agents over time, relative to the predicted ones.
 
-    Parameters
-    ----------
-    states
-        (steps, m, replicas) of a run without gaps
-    reference
-        what errors are distances from; None: the mean of the agents
-    dt
-        length of a step [units of simulated time]
-    nodes
-        Sequence[Mapping[str, Any]] ``node_errors`` of the comparison
-
-    Returns
-    -------
-    UIElement | None
-        None where nothing is predicted, or nothing was measured
+    None where nothing is predicted or measured. A reference of None stands for the mean of the agents.
     """
     predicted, error = _column(nodes, "predicted"), _column(nodes, "standard_error")
     if len(states) < 2 or not (np.nan_to_num(predicted) > 0).any():
         return None
     ends = np.unique(np.rint(np.geomspace(1, len(states), _POINTS)).astype(np.int64))
     sums, total, done = np.empty((len(ends), states.shape[1])), np.zeros(states.shape[1]), 0
-    for place, end in enumerate(ends.tolist()):  # piece by piece: a run may be long
+    for place, end in enumerate(ends.tolist()):  # in pieces: a run may be long
         piece = states[done:end]
         middle = piece.mean(axis=1, keepdims=True) if reference is None else reference
         total = total + np.square(piece - middle).mean(axis=2).sum(axis=0)
@@ -196,24 +169,13 @@ def agent_convergence(
     plain_legend(plot.legend[0])
     rows = [("", "@agent"), ("time", "$data_x{0.[00]}"), ("measured / predicted", "$data_y{0.000}")]
     plot.add_tools(HoverTool(renderers=[drawn], tooltips=rows, line_policy="nearest"))
-    # Sources that no glyph uses travel as tags.
+    # Sources that no glyph uses reach the page as tags.
     plot.tags = [everything, times, widths]
     return plot
 
 
 def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> UIElement | None:
-    """Heat maps of one scale, which zoom together: measured, predicted and their difference; what there is of these.
-
-    Parameters
-    ----------
-    measured, predicted
-        (m, m) each
-
-    Returns
-    -------
-    UIElement | None
-        None where there is neither
-    """
+    """Heat maps of the matrices (m, m) that exist and of their difference, of one scale; None without any."""
     known = {key: value for key, value in (("measured", measured), ("predicted", predicted)) if value is not None}
     if measured is not None and predicted is not None:
         known["difference"] = measured - predicted
@@ -267,16 +229,11 @@ def _write_numbers(panel: Any, matrix: FloatArray, limit: float) -> None:
     )
 
 
-def innovation_sizes(ratios: FloatArray, samples: int) -> UIElement:
-    """Variance of each agent's innovations over what it should be, with where 95 % of such ratios lie.
-
-    Parameters
-    ----------
-    ratios
-        (m,); NaN where an agent has no noise
-    samples
-        innovations of each agent
-    """
+def innovation_sizes(
+    ratios: FloatArray,  # (m,); NaN for an agent without noise
+    samples: int,  # innovations per agent
+) -> UIElement:
+    """Variance of each agent's innovations relative to the predicted one, and where 95 % of such ratios lie."""
     agents = np.arange(1, len(ratios) + 1)
     half = HALF * np.sqrt(2.0 / max(samples, 1))
     inside = np.abs(ratios - 1.0) <= half
@@ -307,25 +264,13 @@ def innovation_sizes(ratios: FloatArray, samples: int) -> UIElement:
 
 
 def lateness(timing: Mapping[str, Any]) -> UIElement:
-    """Histogram of how late the steps of a run in real time were.
-
-    Parameters
-    ----------
-    timing
-        Mapping[str, Any] ``timing`` of a comparison
-    """
+    """Histogram of how late the steps of a run in real time were; ``timing`` of a comparison."""
     histogram = timing["histogram"]
     return _histogram(histogram["lateness_ms"], histogram["steps"], "late by [ms]", "steps", timing["period_ms"])
 
 
 def staleness(timing: Mapping[str, Any]) -> UIElement:
-    """Histogram of how old the values of neighbours were that the steps of a run in real time used.
-
-    Parameters
-    ----------
-    timing
-        Mapping[str, Any] ``timing`` of a comparison
-    """
+    """Histogram of the age of the neighbours' values that a run in real time used; ``timing`` of a comparison."""
     histogram, label = timing["histogram"], "age of the values used [ms]"
     return _histogram(histogram["staleness_ms"], histogram["uses"], label, "values used", timing["period_ms"])
 
@@ -336,7 +281,7 @@ def _histogram(
     left, right, count = np.array(edges[:-1]), np.array(edges[1:]), np.array(counts)
     beyond = (left >= period) & (what == "steps")
     plot = new_figure(250, x_axis_label=label, y_axis_label=what, min_border_right=12)
-    # A logarithm has no place for none: bars are one and a bit at least, or not there.
+    # log10(count + 1): an empty bar has height 0.
     data = {
         "left": left,
         "right": right,

@@ -1,4 +1,4 @@
-"""Saved results side by side, and which of their system errors can be told apart."""
+"""Saved results side by side, and which of their system errors differ significantly."""
 
 from __future__ import annotations
 
@@ -27,63 +27,28 @@ RESULT_FILE = "result.json"
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A row: what was saved of a comparison; None where it has none.
-
-    Attributes
-    ----------
-    file
-        where it came from
-    experiment, seeds
-        of the run, or of all runs: "1 2"
-    bags
-        number of runs it is about
-    leaders
-        numbers of the leaders, "3" or "1 4"; empty without
-    verdict
-        of the comparison
-    simulated_time
-        of all runs [units of simulated time]
-    measured, standard_error, low, high, predicted, z
-        of the system error; low to high is the 95 % interval
-    least_p
-        least adjusted p of the tests
-    blame
-        what is wrong, in words; empty where nothing is
-    identity
-        the same for runs of the same law
-    """
+    """A row: one saved comparison; None where it has no such number."""
 
     file: str
     experiment: str
-    seeds: str
-    bags: int
-    leaders: str
+    seeds: str  # of all runs: "1 2"
+    bags: int  # number of runs
+    leaders: str  # numbers from 1: "3" or "1 4"; empty without
     verdict: str
-    simulated_time: float
-    measured: float | None
+    simulated_time: float  # of all runs [units of simulated time]
+    measured: float | None  # system error, like the next five
     standard_error: float | None
-    low: float | None
+    low: float | None  # to high: the 95 % interval
     high: float | None
     predicted: float | None
     z: float | None
-    least_p: float | None
-    blame: str
-    identity: str | None
+    least_p: float | None  # least adjusted p of the tests
+    blame: str  # causes, separated by "; "; empty where nothing is wrong
+    identity: str | None  # equal for runs of the same law
 
 
 def read_result(path: Path) -> Result:
-    """Read a saved result.
-
-    Parameters
-    ----------
-    path
-        file, or directory of a run with such a file in it
-
-    Raises
-    ------
-    InputError
-        not there, or not a result of a comparison
-    """
+    """Read a saved result, from a file or the directory of a run; InputError if it is not there or not a result."""
     file = path / RESULT_FILE if path.is_dir() else path
     wanted = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
     try:
@@ -139,24 +104,12 @@ def _number(document: Any, key: str, file: Path) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """Results of the same law, as one.
+    """Results of the same law as one; every unit of simulated time has the same weight."""
 
-    Attributes
-    ----------
-    experiment
-        name of the first
-    files
-        where they came from
-    simulated_time
-        of all [units of simulated time]
-    measured, standard_error, predicted, z, p
-        of the system error; every unit of time counts the same
-    """
-
-    experiment: str
+    experiment: str  # name in the first
     files: tuple[str, ...]
-    simulated_time: float
-    measured: float
+    simulated_time: float  # of all [units of simulated time]
+    measured: float  # system error, like the next four
     standard_error: float
     predicted: float
     z: float
@@ -164,12 +117,9 @@ class Merged:
 
 
 def merge_results(rows: Sequence[Result]) -> list[Merged]:
-    """System errors of results of the same law, as one; without those that have no number, or an earlier one's seed.
+    """Results of the same law as one, where there are two or more.
 
-    Parameters
-    ----------
-    rows
-        results, whose order decides which of two with one seed counts
+    Left out: those without a number, and those with the seed of an earlier row.
     """
     groups: dict[str, list[Result]] = {}
     for row in rows:
@@ -195,17 +145,10 @@ def merge_results(rows: Sequence[Result]) -> list[Merged]:
 
 
 def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
-    """Which system errors are smaller than which; numbers are places in ``rows``, from 1.
+    """Which system errors of independent runs are smaller than which; numbers are places in ``rows``, from 1.
 
-    Where every row has a leader, or leaders, of infinite gain, that is the order of their joint robustness centrality.
-    None where not all rows have a measured error, or there is only one.
-
-    Parameters
-    ----------
-    rows
-        results of independent runs
-    level
-        chance of telling any two apart wrongly
+    With leaders of infinite gain in every row, that is the order of their joint robustness centrality. None unless
+    every row has a measured error with a standard error, and where ``order_of`` has no order.
     """
     errors = [(row.measured, row.standard_error) for row in rows]
     known = [(measured, error) for measured, error in errors if measured is not None and error is not None]
@@ -219,15 +162,7 @@ def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
 
 
 def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
-    """The document: ``results``, ``merged``, and ``order``, whose numbers are places among the results, from 1.
-
-    Parameters
-    ----------
-    rows
-        results
-    level
-        chance of telling any two apart wrongly
-    """
+    """The document: ``results``, ``merged``, and ``order``, whose numbers are places among the results, from 1."""
     order = order_of_results(rows, level)
     return {
         "results": [asdict(row) for row in rows],
@@ -237,13 +172,7 @@ def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
 
 
 def to_csv(rows: Sequence[Result]) -> str:
-    """A line for each result, under the names of the columns; all digits.
-
-    Parameters
-    ----------
-    rows
-        results
-    """
+    """A line per result under the names of the columns, with all digits."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([field.name for field in fields(Result)])
@@ -253,29 +182,13 @@ def to_csv(rows: Sequence[Result]) -> str:
 
 
 def to_markdown(rows: Sequence[Result]) -> str:
-    """A table for a text.
-
-    Parameters
-    ----------
-    rows
-        results
-    """
+    """The results as a Markdown table."""
     heads, body = _shown(rows)
     return markdown_table(heads, body, names=4)
 
 
 def print_results(rows: Sequence[Result], level: float, console: Console) -> None:
-    """A table for a terminal, and which system errors can be told apart.
-
-    Parameters
-    ----------
-    rows
-        results
-    level
-        chance of telling any two apart wrongly
-    console
-        where to print
-    """
+    """Print the results as a table, and which system errors differ at ``level`` (all pairs together)."""
     heads, body = _shown(rows)
     kept = [
         place for place, head in enumerate(heads) if head not in ("experiment", "seed", "time", "least p")

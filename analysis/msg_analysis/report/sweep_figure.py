@@ -23,21 +23,11 @@ FORMATS = ("svg", "png")
 _SIZE = (7.2, 4.2)  # inches
 _MARKERS = "os^Dv<>p"
 _NAMED = 8
-"""Most series in the legend; where there are more, colours go from dark to light and the legend has some of them."""
+"""Most series in the legend; of more, it has some, and colours go from dark to light."""
 
 
 def write_figure(picture: Picture, title: str, directory: Path) -> list[Path]:
-    """Write ``figure.svg`` and ``figure.png``, each whole or not at all.
-
-    Parameters
-    ----------
-    picture
-        what is drawn
-    title
-        of the figure
-    directory
-        where
-    """
+    """Write ``figure.svg`` and ``figure.png``, each whole or not at all."""
     with mpl.rc_context(STYLE):
         figure = draw(picture, title)
         written = []
@@ -50,15 +40,7 @@ def write_figure(picture: Picture, title: str, directory: Path) -> list[Path]:
 
 
 def draw(picture: Picture, title: str) -> Figure:
-    """The figure; the caller sets the style.
-
-    Parameters
-    ----------
-    picture
-        what is drawn
-    title
-        of the figure
-    """
+    """The figure; the caller sets the style."""
     figure = Figure(figsize=_SIZE, layout="constrained")
     axes = figure.subplots()
     labels = list(dict.fromkeys(show(place.x) for series in picture.series for place in series.places))
@@ -98,7 +80,7 @@ def _draw_series(axes: Axes, picture: Picture, series: Series, x: Any, colour: A
 
 
 def _mark_failures(axes: Axes, picture: Picture, labels: Sequence[str], numbers: bool) -> None:
-    """A cross at the foot of the axes wherever there is no result."""
+    """A cross at the foot of the axes for every place without a result."""
     lost = [place.x for series in picture.series for place in series.places if place.value is None]
     if lost:
         x = [float(place) if numbers else labels.index(show(place)) for place in lost]
@@ -108,7 +90,7 @@ def _mark_failures(axes: Axes, picture: Picture, labels: Sequence[str], numbers:
 
 
 def _legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[Any]) -> None:
-    """Above the axes: what lines and points are; beside them: which series has which colour."""
+    """Above the axes: what lines and points mean; beside them: the colours of the series."""
     grey = "#4b5563"
     entries: list[tuple[Line2D, str]] = []
     if picture.measured:

@@ -1,4 +1,4 @@
-"""A sweep for a terminal, and as a document."""
+"""A sweep as a terminal table, and as a document."""
 
 from __future__ import annotations
 
@@ -17,15 +17,7 @@ from msg_analysis.sweep.table import Row
 
 
 def describe_sweep(sweep: Sweep, done: Conducted, judgement: Judgement, rows: Sequence[Row]) -> dict[str, Any]:
-    """The document of ``msg-analysis sweep --json``, without the names of the files.
-
-    Parameters
-    ----------
-    sweep, done, judgement
-        what was done
-    rows
-        of ``rows_of``
-    """
+    """The document of ``msg-analysis sweep --json``, without the names of the files; ``rows`` of ``rows_of``."""
     failed = sum(outcome.status == FAILED for outcome in done.outcomes)
     return {
         "sweep": sweep.name,
@@ -42,19 +34,7 @@ def describe_sweep(sweep: Sweep, done: Conducted, judgement: Judgement, rows: Se
 
 
 def print_sweep(sweep: Sweep, document: dict[str, Any], picture: Picture, console: Console) -> None:
-    """A table of what the figure shows, what failed, and the verdict.
-
-    Parameters
-    ----------
-    sweep
-        the sweep
-    document
-        of ``describe_sweep``
-    picture
-        what the figure shows
-    console
-        where to print
-    """
+    """Print a table of what the figure shows, what failed, and the verdict; ``document`` of ``describe_sweep``."""
     heads = ["measured", "± (95 %)", "predicted"] if picture.measured else [picture.y, "in continuous time"]
     several = len(picture.series) > 1
     first = [picture.x] if several else []

@@ -24,26 +24,15 @@ from msg_analysis.report.palette import (
 from msg_analysis.report.plot_style import SANS, new_figure
 from msg_analysis.types import FloatArray, IntArray
 
-FIRST_SOJOURNS, _MOST_SOJOURNS = 120, 4000  # shown at first; kept
+FIRST_SOJOURNS, _MOST_SOJOURNS = 120, 4000  # visible at first; in the figure at most
 
 
-def active_graph(modes: IntArray, names: Sequence[str], dt: float) -> tuple[UIElement, int, int]:
-    """Which graph was active when.
-
-    Parameters
-    ----------
-    modes
-        (steps,) index of the graph; -1 where not known
-    names
-        Sequence[str] of the graphs
-    dt
-        length of a step [units of simulated time]
-
-    Returns
-    -------
-    tuple[UIElement, int, int]
-        the figure, the number of sojourns in it, and that of the run
-    """
+def active_graph(
+    modes: IntArray,  # (steps,) from 0; -1 where not known
+    names: Sequence[str],
+    dt: float,  # [units of simulated time]
+) -> tuple[UIElement, int, int]:
+    """Which graph was active when; with the figure, the number of sojourns in it and in the run."""
     starts = np.flatnonzero(np.diff(modes, prepend=-2))
     ends = np.append(starts[1:], len(modes))
     kept = min(len(starts), _MOST_SOJOURNS)
@@ -71,23 +60,13 @@ def active_graph(modes: IntArray, names: Sequence[str], dt: float) -> tuple[UIEl
     rows = [("graph", "@name"), ("from", "@left{0.[00]} to @right{0.[00]}"), ("held for", "@held{0.[00]}")]
     path.add_tools(HoverTool(renderers=[bars], tooltips=rows))
     _name_graphs(path, names)
-    # Names are texts, not mathematics, for which the page would ask the network.
+    # As plain text: for mathematics, the page would load a library from the network.
     path.yaxis.major_label_overrides = {g: PlainText(text=shorten(name)) for g, name in enumerate(names)}
     return path, kept, len(starts)
 
 
 def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> UIElement:
-    """The share of the time of every graph, beside the stationary law; in the order of ``active_graph``.
-
-    Parameters
-    ----------
-    modes
-        (steps,) index of the graph; -1 where not known
-    names
-        Sequence[str] of the graphs
-    stationary
-        (n,) predicted shares
-    """
+    """Share of the time of every graph beside the stationary law (n,), in the order of ``active_graph``."""
     present = modes[modes >= 0]
     share = np.bincount(present, minlength=len(names)) / max(len(present), 1)
     places = np.arange(len(names))

@@ -1,4 +1,4 @@
-"""Tables for a terminal: what all of them have in common."""
+"""What all terminal tables share: layout, and numbers as text."""
 
 from __future__ import annotations
 
@@ -16,19 +16,7 @@ ROWS = 30
 
 
 def number_table(console: Console, title: str, first: str, *numbers: str) -> Table:
-    """A table under its heading: one column of names, the others of numbers.
-
-    Parameters
-    ----------
-    console
-        where the heading goes
-    title
-        of the table
-    first
-        head of the column of names
-    *numbers
-        heads of the other columns
-    """
+    """Print the heading, and make a table with one column of names and further ones of numbers."""
     console.print(Text(title, style="bold"))
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column(Text(first))
@@ -38,15 +26,7 @@ def number_table(console: Console, title: str, first: str, *numbers: str) -> Tab
 
 
 def fact_table(console: Console, title: str) -> Table:
-    """A table of names and what they are, under its heading.
-
-    Parameters
-    ----------
-    console
-        where the heading goes
-    title
-        of the table
-    """
+    """Print the heading, and make a table of names and values."""
     console.print(Text(title, style="bold"))
     table = Table(box=box.SIMPLE, show_header=False)
     table.add_column(style="dim", no_wrap=True)
@@ -55,51 +35,23 @@ def fact_table(console: Console, title: str) -> Table:
 
 
 def note_cut(table: Table, total: int, what: str) -> None:
-    """Say how many rows of the total are not shown.
-
-    Parameters
-    ----------
-    table
-        that shows the first ``ROWS``
-    total
-        number of rows
-    what
-        the rows are
-    """
+    """Caption a table, of the first ``ROWS`` of ``total`` rows, with how many rows (``what``) are left out."""
     if total > ROWS:
         table.caption = f"{total - ROWS} more {what}: use --json"
 
 
 def z_text(value: float | None) -> str:
-    """With its sign.
-
-    Parameters
-    ----------
-    value
-        z, if there is one
-    """
+    """A z with its sign; "-" for None."""
     return "-" if value is None else f"{value:+.2f}"
 
 
 def p_text(value: float | None) -> str:
-    """Three digits.
-
-    Parameters
-    ----------
-    value
-        p, if there is one
-    """
+    """Three significant digits; "-" for None."""
     return "-" if value is None else f"{value:.3g}"
 
 
 def interval_text(interval: Sequence[float | None] | None) -> str:
-    """Low .. high.
-
-    Parameters
-    ----------
-    interval
-        low and high, if known
-    """
+    """Low .. high; "-" if either is not known."""
     if not interval or None in interval:
         return "-"
     return f"{number_text(interval[0])} .. {number_text(interval[1])}"

@@ -1,4 +1,4 @@
-"""Results as tables for a terminal. Every function takes the document that ``--json`` would print."""
+"""Results as terminal tables. Every function takes the document that ``--json`` prints."""
 
 from __future__ import annotations
 
@@ -55,15 +55,7 @@ _METHODS = {
 
 
 def print_prediction(document: dict[str, Any], console: Console) -> None:
-    """Steady errors of every law that the prediction has, and the share of time of every graph.
-
-    Parameters
-    ----------
-    document
-        of ``Prediction.to_json()``
-    console
-        where to print
-    """
+    """Print the steady errors of every predicted law, and the share of time of every graph."""
     laws = {
         "steps in turn" if document[key].get("law") == "sequential" else title: document[key]
         for key, title in _LAWS.items()
@@ -87,15 +79,7 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
 
 
 def print_comparison(document: dict[str, Any], console: Console) -> None:
-    """Verdict, errors measured and predicted, tests, and what came and what did not.
-
-    Parameters
-    ----------
-    document
-        of ``Comparison.to_json()``; with ``strangers`` of a run's result where there are some
-    console
-        where to print
-    """
+    """Print verdict, errors measured and predicted, tests and what is missing; a run's ``strangers``, if any."""
     verdict, style = _VERDICTS[document["verdict"]]
     console.print(verdict_line(verdict, document), style=style)
     count = document["completeness"]
@@ -128,13 +112,7 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
 
 
 def gaps(count: dict[str, Any]) -> list[str]:
-    """Where the gaps of a log are, and what was refused; nothing of a whole log.
-
-    Parameters
-    ----------
-    count
-        ``completeness`` of ``Comparison.to_json()``
-    """
+    """Where the gaps of a log are, and what was refused, of ``completeness`` of a comparison; empty for a whole log."""
     lines = []
     if count["missing"]:
         first, last = count.get("stretch") or (None, None)
@@ -194,15 +172,7 @@ def _print_errors(document: dict[str, Any], console: Console) -> None:
 
 
 def verdict_line(verdict: str, document: dict[str, Any]) -> str:
-    """The verdict, of one run or of several; in real time with missed deadlines, which are no disagreement.
-
-    Parameters
-    ----------
-    verdict
-        a sentence
-    document
-        of ``Comparison.to_json()``
-    """
+    """The verdict on one run or several; in real time with missed deadlines, which are not a disagreement."""
     if document.get("bags"):
         verdict = verdict.replace("The run agrees", "The runs agree").replace("The run disagrees", "The runs disagree")
     deadlines = (document.get("timing") or {}).get("deadlines")
@@ -213,7 +183,7 @@ def verdict_line(verdict: str, document: dict[str, Any]) -> str:
 
 
 def _print_timing(document: dict[str, Any], console: Console) -> None:
-    """How a run in real time kept its time, and which laws that supports."""
+    """How well a run in real time kept its time, and which laws it supports."""
     timing, laws = document.get("timing"), document.get("laws")
     if not timing or not laws:
         return
@@ -236,13 +206,7 @@ def _print_timing(document: dict[str, Any], console: Console) -> None:
 
 
 def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:
-    """Counts of a run in real time: what was counted, and the numbers.
-
-    Parameters
-    ----------
-    timing
-        of ``Comparison.to_json()``
-    """
+    """Counts of a run in real time, ``timing`` of a comparison: what was counted, and the numbers."""
     deadlines, uses, graphs = timing["deadlines"], timing["ideal_uses"], timing["outdated_graph"]
     facts = [
         ("period", f"{number_text(timing['period_ms'])} ms"),
@@ -261,7 +225,7 @@ def _print_tests(document: dict[str, Any], console: Console) -> None:
         return
     title = f"Tests, together at level {number_text(document.get('level'))}"
     table = number_table(console, title, "test", "p", "p adjusted", "")
-    # With many agents the table is cut: what rejects comes first.
+    # Rejected tests first: with many agents the table is cut.
     shown = [test for test in tests if test["rejected"]] + [test for test in tests if not test["rejected"]]
     for test in shown[:ROWS]:
         table.add_row(Text(str(test["name"])), p_text(test["p"]), p_text(test["p_adjusted"]), _mark(test))
@@ -270,15 +234,7 @@ def _print_tests(document: dict[str, Any], console: Console) -> None:
 
 
 def print_experiment(document: dict[str, Any], console: Console) -> None:
-    """An experiment explained back.
-
-    Parameters
-    ----------
-    document
-        of ``msg_analysis.report.info.describe_experiment``
-    console
-        where to print
-    """
+    """Print a document of ``msg_analysis.report.info.describe_experiment``."""
     run = document["run"]
     facts = fact_table(console, document["name"])
     facts.add_row("problem", f"{document['problem']} of {document['agents']} agents in {document['time']} time")
@@ -325,15 +281,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
 
 
 def add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
-    """Rows for what the agents do instead of the built-in law.
-
-    Parameters
-    ----------
-    facts
-        gets the rows
-    protocol
-        ``protocol`` of a document of ``msg_analysis.report.info``; None adds nothing
-    """
+    """Add rows for the protocol of a document of ``report.info``; none for the built-in law (None)."""
     if protocol is None:
         return
     kind = "linear" if protocol["linear"] else "not linear, no prediction"
@@ -345,15 +293,7 @@ def add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
 
 
 def print_leaders(document: dict[str, Any], console: Console) -> None:
-    """The best sets of leaders, and how good the first is.
-
-    Parameters
-    ----------
-    document
-        of ``Selection.to_json()``
-    console
-        where to print
-    """
+    """Print a document of ``Selection.to_json()``: the best sets of leaders, and how good the first is."""
     gain = "held at the reference" if document["gain"] == "inf" else f"gain {document['gain']:g}"
     law = _LAWS[document["law"]]
     what = "Single leaders" if document["count"] == 1 else f"Sets of {document['count']} leaders"
@@ -385,7 +325,7 @@ def _mark(test: dict[str, Any]) -> Text:
 
 
 def _short(value: Any) -> str:
-    """A number or word as it is, a list by its size, a mapping entry by entry."""
+    """A number or word as it is, a list by its entries, a matrix by its size, a mapping entry by entry."""
     if isinstance(value, dict):
         return "; ".join(f"{key}: {_short(item)}" for key, item in value.items())
     if isinstance(value, list):
@@ -401,6 +341,6 @@ def _names(values: Sequence[Any], longest: int = 12) -> str:
 
 
 def _links(graph: dict[str, Any]) -> str:
-    """``1-2, 2-3 (0.5)`` of edges, ``1>2`` of arcs (2 listens to 1)."""
+    """``1-2, 2-3 (0.5)`` for edges, ``1>2`` for arcs (2 hears 1)."""
     sign, links = ("-", graph["edges"]) if graph["edges"] is not None else (">", graph["arcs"])
     return _names([f"{i}{sign}{j}" + (f" ({weight:g})" if weight != 1 else "") for i, j, weight in links]) or "none"

@@ -1,4 +1,4 @@
-"""What ``msg-analysis transient`` and ``msg-analysis facts`` say, as documents for JSON."""
+"""Documents of ``msg-analysis transient`` and ``msg-analysis facts``."""
 
 from __future__ import annotations
 
@@ -29,23 +29,7 @@ Result = TypeVar("Result")
 
 
 def parse_times(text: str) -> FloatArray:
-    """Times from ``START:STOP:STEP`` (STOP included) or ``t1,t2,...``.
-
-    Parameters
-    ----------
-    text
-        as on the command line
-
-    Returns
-    -------
-    FloatArray
-        (T,) [units of simulated time]
-
-    Raises
-    ------
-    InputError
-        neither of them
-    """
+    """Times (T,) from ``START:STOP:STEP`` (STOP included if met) or ``t1,t2,...``; InputError for anything else."""
     wanted = "expected START:STOP:STEP or t1,t2,..., ascending numbers >= 0: for example 0:10:0.5"
     try:
         parts = [float(part) for part in text.replace(":", ",").split(",")]
@@ -64,34 +48,16 @@ def parse_times(text: str) -> FloatArray:
 
 def describe_transient(
     experiment: Experiment,
-    times: FloatArray,
+    times: FloatArray,  # (T,) ascending [units of simulated time]
     *,
     law: TransientLaw = "emulated",
     unreduced: bool = False,
     moments: bool = False,
-    fraction: float = 0.05,
+    fraction: float = 0.05,  # of the steady system error, for the settling time
 ) -> dict[str, Any]:
-    """Moments over time from the experiment's start, the settling time and the asymptotic rates.
+    """The document of ``msg-analysis transient``: moments, settling time, rates; arguments of ``solve_transient``.
 
-    Parameters
-    ----------
-    experiment
-        with its start in ``run.start`` and ``switching.initial``
-    times
-        (T,) ascending [units of time]
-    law
-        "emulated" (the steps of the run; "discrete" in discrete time) or "continuous"
-    unreduced
-        consensus only: the states themselves, whose second moments grow without bound
-    moments
-        whether nu(t) and c(t) of every mode are in the document too
-    fraction
-        of the steady system error, for the settling time
-
-    Raises
-    ------
-    InputError
-        times that are no whole steps, a law that does not exist here, or too large
+    In discrete time its law is "discrete". With ``moments``, nu(t) and c(t) of every mode are in it, too.
     """
     solved = solve_transient(experiment, times, law=law, unreduced=unreduced)
     found = solved.course
@@ -116,46 +82,24 @@ def describe_transient(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedTransient:
-    """Moments over time, and what they were computed with.
-
-    Attributes
-    ----------
-    course
-        the moments
-    system
-        the reduced system of the law
-    steady
-        (n, d, d) its steady second moments
-    unit
-        time of a step [units of simulated time]; None in continuous time
-    """
+    """Moments over time, and what they were computed with."""
 
     course: Transient
-    system: JumpSystem
-    steady: FloatArray
-    unit: float | None
+    system: JumpSystem  # reduced, also where the course is not
+    steady: FloatArray  # (n, d, d) steady second moments of the system
+    unit: float | None  # [units of simulated time] of a step; None in continuous time
 
 
 def solve_transient(
-    experiment: Experiment, times: FloatArray, *, law: TransientLaw = "emulated", unreduced: bool = False
+    experiment: Experiment,
+    times: FloatArray,  # (T,) ascending [units of simulated time]
+    *,
+    law: TransientLaw = "emulated",
+    unreduced: bool = False,
 ) -> SolvedTransient:
-    """Moments over time from the experiment's start.
+    """Moments over time from the experiment's start; ``unreduced`` (consensus only): those of the states, which grow.
 
-    Parameters
-    ----------
-    experiment
-        with its start in ``run.start`` and ``switching.initial``
-    times
-        (T,) ascending [units of simulated time]
-    law
-        "emulated" (the steps of the run) or "continuous"
-    unreduced
-        consensus only: the states themselves, whose second moments grow without bound
-
-    Raises
-    ------
-    InputError
-        times that are no whole steps, a law that does not exist here, or too large
+    InputError: times or a law that do not fit, too large, or no finite steady errors.
     """
     system, unit = _system(experiment, law)
     steady = MomentSolver(system).steady()
@@ -189,7 +133,7 @@ def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, floa
 
 
 def _steps(times: FloatArray, unit: float | None) -> FloatArray:
-    """Times in the unit of the system: whole steps for the laws of steps."""
+    """Times in the unit of the system: steps in the emulated law, which must be whole."""
     if unit is None:
         return times
     steps = np.round(times / unit)
@@ -205,7 +149,7 @@ def _steps(times: FloatArray, unit: float | None) -> FloatArray:
 def _settling(
     experiment: Experiment, system: JumpSystem, steady: FloatArray, unit: float, fraction: float
 ) -> dict[str, Any]:
-    """Keys ``steady_system_error``, ``settling`` and ``rates``, all in units of time."""
+    """Keys ``steady_system_error``, ``settling`` [units of simulated time] and ``rates`` [1 / unit]."""
     error = float(np.trace(system.lifted(steady.sum(axis=0))))
     starts = {
         "from_start": start_of(experiment, system, steady),
@@ -231,19 +175,10 @@ def _settling(
 
 
 def describe_facts(experiment: Experiment) -> dict[str, Any]:
-    """The lemmas on eigenvalues checked, bounds of the error, indices of the graphs, two graphs in closed form.
+    """The document of ``msg-analysis facts``: lemmas, bounds, indices of the graphs, two graphs in closed form.
 
-    Parameters
-    ----------
-    experiment
-        to check
-
-    Returns
-    -------
-    dict[str, Any]
-        ``facts`` (list), ``bounds``, ``graphs`` (list; None for directed or disconnected graphs), ``two_topology``
-        (``continuous``, ``emulated`` or ``discrete``; None unless there are two graphs that can each be held for ever).
-        What the network is too large for is None, and ``notes`` say so.
+    None: a graph that is directed or disconnected; the closed form unless two graphs can each be held fixed; what the
+    network is too large for, with the reason in ``notes``.
     """
     prediction = predict(experiment)
     laws = {"discrete" if experiment.time == "discrete" else "emulated": prediction.system}
@@ -274,20 +209,7 @@ def describe_facts(experiment: Experiment) -> dict[str, Any]:
 
 
 def write_transient_csv(document: dict[str, Any], path: Path) -> None:
-    """One row per time: the law of the graph, means and mean squares of the agents. Replaces the file at the end.
-
-    Parameters
-    ----------
-    document
-        of ``describe_transient``
-    path
-        of the CSV file
-
-    Raises
-    ------
-    InputError
-        the file cannot be written
-    """
+    """Write a row per time: the law of the graph, means and mean squares of the agents; whole or not at all."""
     system, nodes = _mean_squares(document)
     agents = range(1, document["agents"] + 1)
     header = ["time", *(f"probability of {name}" for name in document["modes"])]

@@ -1,4 +1,4 @@
-"""Transients and facts as tables for a terminal. Every function takes the document that ``--json`` would print."""
+"""Transients and facts as terminal tables. Every function takes the document that ``--json`` prints."""
 
 from __future__ import annotations
 
@@ -14,15 +14,7 @@ _LAWS = {"continuous": "continuous time", "emulated": "steps of the run", "discr
 
 
 def print_transient(document: dict[str, Any], console: Console) -> None:
-    """System error over time, with the law of the graph; settling time and rates.
-
-    Parameters
-    ----------
-    document
-        of ``msg_analysis.report.theory.describe_transient``
-    console
-        where to print
-    """
+    """Print the system error over time with the law of the graph; settling time and rates."""
     key = "system_second_moment" if document["unreduced"] else "system_error"
     title = f"Transient from the start of the run, {_LAWS[document['law']]}"
     columns = [key.replace("_", " ")]
@@ -49,15 +41,7 @@ def print_transient(document: dict[str, Any], console: Console) -> None:
 
 
 def print_facts(document: dict[str, Any], console: Console) -> None:
-    """The lemmas checked, bounds, indices of the graphs, and the two-topology form.
-
-    Parameters
-    ----------
-    document
-        of ``msg_analysis.report.theory.describe_facts``
-    console
-        where to print
-    """
+    """Print the lemmas, the bounds, the indices of the graphs, and the closed form of two graphs."""
     if document["facts"]:
         _print_lemmas(document["facts"], console)
     bounds = document["bounds"]
@@ -106,7 +90,7 @@ def _print_form(law: str, form: dict[str, Any], console: Console) -> None:
     keys = ("static", "switching", "error", "fast")
     table.add_row("system", *(number_text(form["system"][key]) for key in keys), end_section=True)
     rows = [
-        # Where nothing changes for an agent, rounding leaves something.
+        # Rounding errors, for agents for which nothing changes.
         [0.0 if abs(value) < 1e-14 * abs(row[0]) else value for value in row]
         for row in zip(*(form["nodes"][key] for key in keys), strict=True)
     ]

@@ -1,4 +1,4 @@
-"""What a comparison says beyond its numbers: what is wrong, which runs it is about, and what can be told apart."""
+"""What a comparison says beyond its numbers: causes, the runs of a pool, and which agents differ."""
 
 from __future__ import annotations
 
@@ -12,45 +12,23 @@ from msg_analysis.report.tables import ROWS, note_cut, number_table, number_text
 
 
 def print_blame(document: dict[str, Any], console: Console) -> None:
-    """What is wrong, a sentence each.
-
-    Parameters
-    ----------
-    document
-        of ``Comparison.to_json()``
-    console
-        where to print
-    """
+    """Print what is wrong, a sentence each."""
     for cause in (document.get("blame") or [])[:ROWS]:
         console.print(Text(f"{sentence(cause['words'])}"), style="bold red")
 
 
 def sentence(words: str) -> str:
-    """With a capital letter and a full stop.
-
-    Parameters
-    ----------
-    words
-        without them
-    """
+    """The words with a capital letter and a full stop."""
     return f"{words[:1].upper()}{words[1:]}."
 
 
 def _agents_first(words: str) -> str:
-    """A sentence; what begins with the name of a file, which is not "agent", keeps its letters."""
+    """A sentence; one that begins with the name of a file keeps its first letter."""
     return sentence(words) if words.startswith("agent ") else f"{words}."
 
 
 def print_bags(document: dict[str, Any], console: Console) -> None:
-    """The runs of a pooled comparison.
-
-    Parameters
-    ----------
-    document
-        of ``Comparison.to_json()``
-    console
-        where to print
-    """
+    """Print the runs of a pooled comparison; nothing for a single run."""
     bags = document.get("bags") or []
     if not bags:
         return
@@ -74,15 +52,7 @@ def print_bags(document: dict[str, Any], console: Console) -> None:
 
 
 def print_order(document: dict[str, Any], console: Console) -> None:
-    """Which agents are more certain than which.
-
-    Parameters
-    ----------
-    document
-        of ``Comparison.to_json()``
-    console
-        where to print
-    """
+    """Print which agents are more certain than which."""
     order = document.get("order")
     if order:
         agents = len(document["node_errors"])
@@ -92,19 +62,7 @@ def print_order(document: dict[str, Any], console: Console) -> None:
 
 
 def order_statements(order: dict[str, Any], names: Sequence[str], relation: str, most: int = 12) -> list[str]:
-    """Which can be told apart, in sentences.
-
-    Parameters
-    ----------
-    order
-        of ``Order.to_json()``
-    names
-        of what is in order
-    relation
-        what the better one does, "is more certain than"
-    most
-        largest number of pairs named one by one
-    """
+    """Which of ``names`` differ, in sentences with the ``relation`` of the better one; ``most`` pairs one by one."""
 
     def named(pair: dict[str, Any]) -> str:
         sure = pair["confidence"]
@@ -116,7 +74,7 @@ def order_statements(order: dict[str, Any], names: Sequence[str], relation: str,
         f"{order['distinguished']} of {order['pairs']} pairs can be told apart, all together at level "
         f"{order['level']:g}."
     ]
-    # Of each, the next one that is told apart from it; what is further down is hardly news.
+    # Of each, only the nearest one below it that can be told apart: those further down add little.
     places = {number: place for place, number in enumerate(order["ranking"])}
     nearest: dict[int, dict[str, Any]] = {}
     for pair in sorted(order["distinctions"], key=lambda pair: places[pair["worse"]]):
