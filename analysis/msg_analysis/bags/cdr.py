@@ -1,8 +1,7 @@
-"""The network's messages as CDR bytes, without ROS: see :mod:`msg_analysis.bags.cdr_stream` for what those are.
+"""The network's messages as CDR bytes, without ROS; the encoding is described in :mod:`msg_analysis.bags.cdr_stream`.
 
-Two ways in: the message classes read and write anything that is valid; :class:`StateCodec` and
-:class:`StateFrame` do the one layout that the agents themselves send (empty ``frame_id``), which without
-``heard`` has a fixed length, in half a microsecond.
+The message classes read and write every valid message. :class:`StateCodec` and :class:`StateFrame` are faster and
+handle only the layout that the agents send: little-endian, empty ``frame_id``.
 """
 
 from __future__ import annotations
@@ -21,31 +20,19 @@ from msg_analysis.model.steptime import SECOND, StepClock
 from msg_analysis.types import AnyArray, FloatArray
 
 _STAMP = {b"\x00\x01": struct.Struct("<4xiI"), b"\x00\x00": struct.Struct(">4xiI")}
-# Encapsulation, sec, nanosec, frame_id (1, NUL), run, agent, step, mode, len(heard) (0), len(state).
+# Encapsulation, sec, nanosec, frame_id (length 1, NUL), run, agent, step, mode, len(heard), len(state).
 _STATE = struct.Struct("<4siIIB16s3xI4xQIII4x")
-# The same bytes for reading: without the stamp, frame_id and run in one piece.
+# The same bytes for reading: the stamp is skipped, frame_id and run are one field.
 _STATE_FIXED = struct.Struct("<4s8x21s3xI4xQIII4x")
-# The steps in ``heard`` stand between its length and that of the state, eight bytes each, without any padding.
+# The entries of ``heard`` (uint64) lie between its length and that of the state, without padding.
 _HEARD = struct.Struct("<I")
 _HEARD_START = _STATE.size - 8
-_LENGTH = struct.Struct("<I4x")  # of the state, before it
-STATE_MODE = _STATE.size - 16
-"""Where ``mode`` stands in the bytes of a state."""
+_LENGTH = struct.Struct("<I4x")  # of the state, with the padding before it
+STATE_MODE = _STATE.size - 16  # byte offset of ``mode`` in a state message
 
 
 def stamp_ns(data: bytes) -> int:
-    """Time stamp [ns] of any message that begins with a std_msgs/Header.
-
-    Parameters
-    ----------
-    data
-        CDR bytes of the message
-
-    Raises
-    ------
-    CdrError
-        too short, or of an unknown encapsulation
-    """
+    """Time stamp [ns] of a message that begins with a std_msgs/Header, of either byte order; CdrError: it has none."""
     try:
         seconds, nanoseconds = _STAMP[data[:2]].unpack_from(data)
     except (KeyError, struct.error) as error:
@@ -54,24 +41,7 @@ def stamp_ns(data: bytes) -> int:
 
 
 class StateCodec:
-    """Writes the states of one agent.
-
-    Parameters
-    ----------
-    run
-        the 16 bytes of the run id
-    agent
-        number of the agent, from 1
-    replicas
-        length of every state
-    dt
-        length of a step [units of simulated time]
-
-    Raises
-    ------
-    ValueError
-        a run id that is not 16 bytes
-    """
+    """Writes the states (``replicas`` float64) of one agent (from 1); ``run``: 16 bytes, ``dt`` in simulated time."""
 
     def __init__(self, run: bytes, agent: int, replicas: int, dt: float) -> None:
         if len(run) != RUN_SIZE:
@@ -81,37 +51,18 @@ class StateCodec:
         self._shape = (replicas,)
 
     def encode(self, step: int, mode: int, state: FloatArray) -> bytes:
-        """One AgentState.
+        """One AgentState of x(k), float64 (replicas,); ``mode``: graph of the step that led here, from 1; 0 at step 0.
 
-        Parameters
-        ----------
-        step, mode, state
-            int, int, FloatArray k; graph of the step that led here, from 1 (0 at step 0); (replicas,) x(k), float64
-
-        Raises
-        ------
-        ValueError
-            state of another shape or type (its bytes would be a different message)
+        ValueError for a state of another shape or type: its bytes would be a different message.
         """
         if state.shape != self._shape or state.dtype != np.float64:
             raise ValueError(f"state: {state.dtype} of shape {state.shape}, expected float64 of shape {self._shape}")
         return self.wrap(step, mode, to_payload(state))
 
     def wrap(self, step: int, mode: int, payload: bytes, heard: Sequence[int] = (), stamp: int | None = None) -> bytes:
-        """One AgentState of a state that is bytes already, of the right length; by default stamped k dt [ns].
+        """One AgentState of a state that is bytes already, 8 for each replica; the length is not checked.
 
-        Parameters
-        ----------
-        step
-            k
-        mode
-            graph used in the step that led here, from 1; 0 at step 0
-        payload
-            the state, 8 bytes for each replica
-        heard
-            steps of the neighbours' values; empty: all of k - 1
-        stamp
-            of the header [ns]; None: that of step k
+        ``heard`` holds the steps of the neighbours' values; empty: all of k - 1. ``stamp`` is in ns; None: k dt.
         """
         seconds, nanoseconds = divmod(self._nanoseconds(step) if stamp is None else stamp, SECOND)
         fixed = (1, 0, self._run, self._agent, step, mode, len(heard), self._replicas)
@@ -123,23 +74,9 @@ class StateCodec:
 
 
 class StateFrame:
-    """Reads states in the layout that :class:`StateCodec` writes, of one run.
+    """Reads states of one run (16 bytes of its id) in the layout that :class:`StateCodec` writes.
 
-    Parameters
-    ----------
-    run
-        the 16 bytes of the run id
-    replicas
-        length of every state
-    most_heard
-        largest length of ``heard``
-
-    Attributes
-    ----------
-    replicas
-        as given
-    size
-        bytes of the longest message
+    ``size`` is the number of bytes of the longest message: of one with ``most_heard`` entries in ``heard``.
     """
 
     def __init__(self, run: bytes, replicas: int, most_heard: int = 0) -> None:
@@ -151,12 +88,7 @@ class StateFrame:
     def unwrap(self, data: bytes) -> tuple[int, int, int, bytes] | None:
         """(agent, step, mode, state as a payload), or None where the bytes are not of this run and layout.
 
-        None means: ask :meth:`AgentState.decode`, which tells what it is.
-
-        Parameters
-        ----------
-        data
-            CDR bytes of an AgentState
+        After None, :meth:`AgentState.decode` finds out whether they are a valid message at all.
         """
         if len(data) != self._least:
             return self._unwrap_heard(data)
@@ -166,7 +98,7 @@ class StateFrame:
         return agent, step, mode, data[_STATE.size :]
 
     def _unwrap_heard(self, data: bytes) -> tuple[int, int, int, bytes] | None:
-        """The same of a message whose ``heard`` is not empty: take that out, and it is one of fixed length."""
+        """The same of a message with a non-empty ``heard``: without those entries it has the fixed length."""
         if not self._least < len(data) <= self.size:
             return None
         length = len(data) - self._least
@@ -177,15 +109,7 @@ class StateFrame:
 
 
 def with_state(data: bytes, payload: bytes, size: int | None = None) -> bytes:
-    """The same AgentState, as :class:`StateCodec` writes it, with another state.
-
-    Parameters
-    ----------
-    data, payload
-        the message, and the bytes of the new state
-    size
-        bytes of the old state; as many as those of the new one if not given
-    """
+    """A message of :class:`StateCodec` with another state; ``size``: bytes of the old one, None: as many as the new."""
     if size is None or size == len(payload):
         return data[: len(data) - len(payload)] + payload
     return data[: len(data) - size - _LENGTH.size] + _LENGTH.pack(len(payload) // 8) + payload
@@ -193,26 +117,27 @@ def with_state(data: bytes, payload: bytes, size: int | None = None) -> bytes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgentState:
-    """msg_agents_interfaces/msg/AgentState: x(k) of one agent.
+    """msg_agents_interfaces/msg/AgentState: the state x(k) of one agent.
 
     Attributes
     ----------
     stamp
-        simulated time of the step [ns]
+        simulated time of the step, k dt [ns]; in real time, that at which the state was made
     run
-        16 bytes
+        the 16 bytes of the run id
     agent
-        from 1
+        number of the agent, from 1
     step
         k
     mode
-        from 1; 0 at step 0
+        graph of the step that led to this state, from 1; 0 at step 0
     state
-        (replicas,)
+        (replicas,) float64; of a protocol, its state row by row
     heard
-        (neighbours,) steps of the values used; empty: all of k - 1
+        (neighbours,) uint64, steps of the values used, neighbours ascending; 2^64 - 1: none was received; empty: all
+        are of step k - 1
     frame_id
-        of the header
+        of the header; empty in messages of the agents
     """
 
     stamp: int
@@ -225,7 +150,20 @@ class AgentState:
     frame_id: str = ""
 
     def encode(self) -> bytes:
-        """As CDR."""
+        """Encode the message as little-endian CDR.
+
+        Returns
+        -------
+        bytes
+            the message with its 4-byte encapsulation header
+
+        Raises
+        ------
+        ValueError
+            ``run`` is not 16 bytes
+        struct.error
+            a number does not fit into its field
+        """
         out = CdrWriter()
         out.header(self.stamp, self.frame_id, self.run)
         out.number("I", self.agent)
@@ -237,17 +175,22 @@ class AgentState:
 
     @classmethod
     def decode(cls, data: bytes) -> AgentState:
-        """From CDR.
+        """Decode a message from CDR of either byte order.
 
         Parameters
         ----------
         data
-            CDR bytes
+            the message with its 4-byte encapsulation header
+
+        Returns
+        -------
+        AgentState
+            with arrays of its own
 
         Raises
         ------
         CdrError
-            they are no such message
+            the bytes are not an AgentState; the text names the field
         """
         reader = CdrReader(data, "AgentState")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
@@ -260,40 +203,20 @@ class AgentState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActiveGraph:
-    """msg_agents_interfaces/msg/ActiveGraph: one sojourn of the switching graph.
+    """msg_agents_interfaces/msg/ActiveGraph: one sojourn of the switching graph."""
 
-    Attributes
-    ----------
-    stamp
-        simulated time at which it begins [ns]
-    run
-        16 bytes
-    sequence
-        number of the sojourn, from 0
-    mode
-        from 1
-    name
-        of the graph
-    first_step, last_step
-        the steps k -> k+1 with first_step <= k <= last_step use it
-    arcs
-        (source, target, weight), agents from 1: target listens to source
-    frame_id
-        of the header
-    """
-
-    stamp: int
-    run: bytes
-    sequence: int
-    mode: int
+    stamp: int  # simulated time at which it begins [ns]
+    run: bytes  # 16 bytes
+    sequence: int  # number of the sojourn, from 0
+    mode: int  # from 1
     name: str
-    first_step: int
+    first_step: int  # the steps k -> k+1 with first_step <= k <= last_step use this graph
     last_step: int
-    arcs: Sequence[tuple[int, int, float]] = ()
+    arcs: Sequence[tuple[int, int, float]] = ()  # (source, target, weight), from 1: target listens to source
     frame_id: str = ""
 
     def encode(self) -> bytes:
-        """As CDR."""
+        """As little-endian CDR."""
         out = CdrWriter()
         out.header(self.stamp, self.frame_id, self.run)
         out.number("I", self.sequence)
@@ -308,18 +231,7 @@ class ActiveGraph:
 
     @classmethod
     def decode(cls, data: bytes) -> ActiveGraph:
-        """From CDR.
-
-        Parameters
-        ----------
-        data
-            CDR bytes
-
-        Raises
-        ------
-        CdrError
-            they are no such message, or its three lists of arcs are not equally long
-        """
+        """From CDR; CdrError where it is not an ActiveGraph, or its three lists of arcs differ in length."""
         reader = CdrReader(data, "ActiveGraph")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run, sequence = reader.raw(RUN_SIZE, "run"), reader.number("I", "sequence")
@@ -327,14 +239,14 @@ class ActiveGraph:
         first, last = reader.number("Q", "first_step"), reader.number("Q", "last_step")
         arcs, rest = None, reader.rest()
         if len(rest) <= _MAX_KNOWN:
-            with contextlib.suppress(CdrError):  # which would count bytes from the wrong beginning
+            with contextlib.suppress(CdrError):  # `_read_arcs` below raises it with the right places
                 arcs = _known_arcs(data[:HEADER_SIZE] + bytes(8) + rest)
         if arcs is None:
             arcs = _read_arcs(reader)
         return cls(stamp, run, sequence, mode, name, first, last, arcs, frame_id)
 
 
-_MAX_KNOWN = 2**18  # bytes of the arcs of one graph
+_MAX_KNOWN = 2**18  # bytes of the arcs of one graph that are cached
 
 
 def _read_arcs(reader: CdrReader) -> tuple[tuple[int, int, float], ...]:
@@ -348,7 +260,7 @@ def _read_arcs(reader: CdrReader) -> tuple[tuple[int, int, float], ...]:
 
 @lru_cache(maxsize=32)
 def _known_arcs(data: bytes) -> tuple[tuple[int, int, float], ...]:
-    """The same graphs come again and again: their arcs, behind ``last_step``, are read and kept in memory once."""
+    """Arcs from the bytes behind ``last_step``, cached: the same few graphs come again and again."""
     reader = CdrReader(data, "ActiveGraph")
     reader.number("Q", "last_step")
     return _read_arcs(reader)
@@ -356,30 +268,16 @@ def _known_arcs(data: bytes) -> tuple[tuple[int, int, float], ...]:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """msg_agents_interfaces/msg/Progress: how far one agent is.
+    """msg_agents_interfaces/msg/Progress: how far an agent, the recorder or the switcher is."""
 
-    Attributes
-    ----------
-    stamp
-        simulated time of the step [ns]
-    run
-        16 bytes
-    agent
-        from 1
-    step
-        newest step that it has published
-    frame_id
-        of the header
-    """
-
-    stamp: int
-    run: bytes
-    agent: int
-    step: int
+    stamp: int  # simulated time of the step; on the topic `epoch`, node clock at simulated time 0 [ns]
+    run: bytes  # 16 bytes
+    agent: int  # from 1; 0: the recorder or the switcher
+    step: int  # newest one that it has published; from the recorder and the switcher, the last of the run
     frame_id: str = ""
 
     def encode(self) -> bytes:
-        """As CDR."""
+        """As little-endian CDR."""
         out = CdrWriter()
         out.header(self.stamp, self.frame_id, self.run)
         out.number("I", self.agent)
@@ -388,18 +286,7 @@ class Progress:
 
     @classmethod
     def decode(cls, data: bytes) -> Progress:
-        """From CDR.
-
-        Parameters
-        ----------
-        data
-            CDR bytes
-
-        Raises
-        ------
-        CdrError
-            they are no such message
-        """
+        """From CDR; CdrError where it is not a Progress."""
         reader = CdrReader(data, "Progress")
         stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
         run = reader.raw(RUN_SIZE, "run")
@@ -409,31 +296,14 @@ class Progress:
 
 
 def encode_string(text: str) -> bytes:
-    """A std_msgs/String as CDR.
-
-    Parameters
-    ----------
-    text
-        to be sent
-    """
+    """A std_msgs/String as CDR."""
     out = CdrWriter()
     out.string(text)
     return out.bytes()
 
 
 def decode_string(data: bytes) -> str:
-    """Text of a std_msgs/String.
-
-    Parameters
-    ----------
-    data
-        CDR bytes
-
-    Raises
-    ------
-    CdrError
-        they are no such message
-    """
+    """Text of a std_msgs/String; CdrError where the bytes are not one."""
     reader = CdrReader(data, "String")
     text = reader.string("data")
     reader.end()

@@ -1,9 +1,8 @@
 """Fields of messages in CDR bytes (OMG CDR, or XCDR1, as ROS 2 middleware sends it).
 
-Layout: a 4-byte encapsulation header (00 01: little-endian, 00 00: big-endian, two bytes of options), then
-the fields in order, each primitive aligned to its own size, counted from the end of the header. A string is
-its length with the closing NUL (uint32), its UTF-8 bytes and the NUL; a sequence is its length (uint32) and
-its elements.
+Layout: a 4-byte encapsulation header (00 01: little-endian, 00 00: big-endian, two bytes of options), then the fields
+in order, each primitive aligned to its own size, counted from the end of the header. A string is its length with the
+closing NUL (uint32), its UTF-8 bytes and the NUL; a sequence is its length (uint32) and its elements.
 """
 
 from __future__ import annotations
@@ -26,26 +25,16 @@ _MAX_PADDING = 7
 
 
 class CdrError(ValueError):
-    """Bytes that are not the expected message. The text names the field and what is wrong with it."""
+    """Bytes that are not the expected message; the text names the field and what is wrong with it."""
 
 
 _NUMBERS = {order: {code: struct.Struct(order + code) for code in "iIQ"} for order in "<>"}
 
 
 class CdrReader:
-    """Takes fields off CDR bytes; checks every length before it makes anything of it.
+    """Reads fields of a message, whose name ``kind`` and field name ``what`` appear in errors; copies what it returns.
 
-    Parameters
-    ----------
-    data
-        the message
-    kind
-        its name in errors
-
-    Raises
-    ------
-    CdrError
-        here and by all methods, where the bytes are not what is asked for
+    Every length is checked before it is used. All methods raise CdrError where the bytes are not what is asked for.
     """
 
     def __init__(self, data: bytes, kind: str) -> None:
@@ -65,46 +54,19 @@ class CdrReader:
         return start
 
     def number(self, code: str, what: str) -> int:
-        """An integer, of a type code of ``struct``; ``what`` names the field in errors.
-
-        Parameters
-        ----------
-        code
-            type code of ``struct``, such as "I"
-        what
-            name of the field, for errors
-        """
+        """An integer; ``code`` is a type code of ``struct``: "i", "I" or "Q"."""
         form = self._numbers[code]
         size = form.size
         value: int = form.unpack_from(self._data, self._take(size, size, what))[0]
         return value
 
     def raw(self, size: int, what: str) -> bytes:
-        """So many octets.
-
-        Parameters
-        ----------
-        size
-            number of octets
-        what
-            name of the field, for errors
-        """
+        """So many octets."""
         start = self._take(size, 1, what)
         return bytes(self._data[start : self._at])
 
     def string(self, what: str) -> str:
-        """A string.
-
-        Parameters
-        ----------
-        what
-            name of the field, for errors
-
-        Raises
-        ------
-        CdrError
-            it does not end, or is not UTF-8
-        """
+        """A string; it must end with NUL and be UTF-8."""
         size = self.number("I", what)
         text = self.raw(size, what)
         if size and text[-1]:
@@ -115,20 +77,7 @@ class CdrReader:
             raise CdrError(f"{self._kind}.{what}: not UTF-8") from error
 
     def array(self, code: str, what: str) -> AnyArray:
-        """A sequence of numbers, of a type code of numpy, copied.
-
-        Parameters
-        ----------
-        code
-            type code of numpy, such as "f8"
-        what
-            name of the field, for errors
-
-        Returns
-        -------
-        AnyArray
-            (length,) of that type
-        """
+        """(length,) a sequence of numbers; ``code`` is a type code of numpy, such as "f8"."""
         count = self.number("I", what)
         if not count:  # nothing follows, not even padding
             return np.empty(0, dtype=code)
@@ -141,17 +90,11 @@ class CdrReader:
         return self.number("i", "header") * SECOND + self.number("I", "header")
 
     def rest(self) -> bytes:
-        """What has not been read."""
+        """The bytes that have not been read."""
         return self._data[self._at :]
 
     def end(self) -> None:
-        """Nothing but padding may follow.
-
-        Raises
-        ------
-        CdrError
-            something else follows
-        """
+        """Check that nothing but padding follows."""
         left = len(self._data) - self._at
         if left > _MAX_PADDING:
             raise CdrError(f"{self._kind}: {left} bytes too many")
@@ -167,50 +110,22 @@ class CdrWriter:
         self._data += bytes((HEADER_SIZE - len(self._data)) % size)
 
     def number(self, code: str, value: int) -> None:
-        """An integer, of a type code of ``struct``.
-
-        Parameters
-        ----------
-        code
-            type code of ``struct``, such as "I"
-        value
-            that fits into it
-        """
+        """An integer; ``code`` is a type code of ``struct``, such as "I"."""
         self._align(struct.calcsize(code))
         self._data += struct.pack("<" + code, value)
 
     def raw(self, value: bytes) -> None:
-        """Octets, without their number.
-
-        Parameters
-        ----------
-        value
-            octets
-        """
+        """Octets, without their number."""
         self._data += value
 
     def string(self, text: str) -> None:
-        """A string.
-
-        Parameters
-        ----------
-        text
-            of any length
-        """
+        """A string."""
         encoded = text.encode() + b"\x00"
         self.number("I", len(encoded))
         self._data += encoded
 
     def array(self, code: str, values: AnyArray | Sequence[Any]) -> None:
-        """A sequence of numbers, of a type code of numpy.
-
-        Parameters
-        ----------
-        code
-            type code of numpy, such as "f8"
-        values
-            (length,) numbers that fit into it
-        """
+        """(length,) a sequence of numbers; ``code`` is a type code of numpy, such as "f8"."""
         array = np.asarray(values, dtype="<" + code)
         self.number("I", len(array))
         if len(array):
@@ -218,22 +133,7 @@ class CdrWriter:
             self._data += array.tobytes()
 
     def header(self, stamp: int, frame_id: str, run: bytes) -> None:
-        """What every message of the network begins with; ``stamp`` in ns.
-
-        Parameters
-        ----------
-        stamp
-            time [ns]
-        frame_id
-            of the header
-        run
-            16 bytes of the run id
-
-        Raises
-        ------
-        ValueError
-            another number of bytes
-        """
+        """Stamp [ns], frame_id and run id, which begin the network's messages; ValueError: not 16 bytes of run id."""
         if len(run) != RUN_SIZE:
             raise ValueError(f"run: {len(run)} bytes, expected the {RUN_SIZE} bytes of a UUID")
         self.number("i", stamp // SECOND)

@@ -1,4 +1,7 @@
-"""Chunks of an MCAP file: taken out of their compression, and all their messages found at once."""
+"""Chunks of an MCAP file: decompressed, and all their messages found at once.
+
+Damage is recognised here and reported as DamageError, or as an error of the decompressor.
+"""
 
 from __future__ import annotations
 
@@ -12,72 +15,40 @@ from mcap.opcode import Opcode
 
 from msg_analysis.types import AnyArray, IntArray
 
-LIMIT = 2**28
-"""Bytes of one record or chunk; recorders write megabytes, only damage claims more."""
-
-RECORD = struct.Struct("<BQ")
-"""Opcode and length, before the content of every record."""
-
+LIMIT = 2**28  # bytes of one record or chunk; recorders write megabytes, only damage claims more
+RECORD = struct.Struct("<BQ")  # opcode and length, before the content of every record
+# Fields of a message record before the CDR bytes: 22 bytes; times in ns.
 MESSAGE_HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")])
-"""What stands in a message record before the data of the message."""
-
 _CHUNK = struct.Struct("<QQQII")  # start and end time, size, CRC (0: none), length of the compression's name
-_INDEX_HEAD = 6  # bytes before the entries of a message index record: channel, length; an entry is (time, place)
+_INDEX_HEAD = 6  # bytes before the entries of a message index record: channel, length; an entry: time, offset
 _RECORD_HEAD = np.dtype([("opcode", "u1"), ("length", "<u8")])
 _LENGTH = struct.Struct("<Q")
-_ALIKE = 16  # records of equal length, after which more are expected
+_ALIKE = 16  # records of equal length in a row, after which more are expected
 
 
 class DamageError(Exception):
-    """A record whose content is not what its type wants."""
+    """A record whose content does not fit its type."""
 
 
 def gather(data: bytes, start: IntArray, size: int) -> AnyArray:
-    """Copy equally long pieces of a buffer into one contiguous array.
+    """(pieces,) of type ``V<size>``: pieces of a buffer, ``size`` >= 1 bytes each, copied from the offsets ``start``.
 
-    Parameters
-    ----------
-    data
-        the buffer
-    start
-        (pieces,) where each begins
-    size
-        bytes of each, at least 1
-
-    Returns
-    -------
-    AnyArray
-        (pieces,) of type ``V<size>``: ``.view`` says what they are
-
-    Raises
-    ------
-    IndexError
-        a piece that is not all in the buffer
+    ``.view`` gives them their type. IndexError where a piece ends behind the buffer.
     """
     count = len(data) - size + 1
     if count < 1:
         if len(start):
             raise IndexError(f"{size} bytes of a buffer of {len(data)}")
         return np.empty(0, f"V{size}")
-    # One element at every byte, each overlapping the next: picking elements copies pieces whole.
+    # One element at every byte, overlapping the next ones: indexing copies whole pieces.
     windows: AnyArray = np.ndarray(count, f"V{size}", data, strides=(1,))
     return np.asarray(windows[start])
 
 
 def unpack(content: bytes, zstd: zstandard.ZstdDecompressor) -> bytes:
-    """The records in a chunk.
+    """The records in a chunk, from the content of its record; DamageError: larger than ``LIMIT``, or a wrong checksum.
 
-    Parameters
-    ----------
-    content
-        of the chunk's record
-    zstd
-        zstandard.ZstdDecompressor to be used again from chunk to chunk: making one takes longer than a small chunk
-
-    Raises
-    ------
-    DamageError
-        too large, or a wrong checksum; decompressors raise errors of their own
+    ``zstd`` is reused from chunk to chunk: making one takes longer than a small chunk.
     """
     _, _, size, crc, name_size = _CHUNK.unpack_from(content)
     at = _CHUNK.size + name_size
@@ -89,7 +60,7 @@ def unpack(content: bytes, zstd: zstandard.ZstdDecompressor) -> bytes:
         raise DamageError
     if name == b"zstd":
         if zstandard.frame_content_size(packed) > LIMIT:
-            raise DamageError  # it would be unpacked whole before anyone looks
+            raise DamageError  # max_output_size is ignored where the frame states its size
         data = zstd.decompress(packed, max_output_size=size)
     elif name == b"lz4":
         import lz4.frame
@@ -100,33 +71,22 @@ def unpack(content: bytes, zstd: zstandard.ZstdDecompressor) -> bytes:
             raise DamageError
     else:
         data = bytes(packed)
-    if crc and zlib.crc32(data) != crc:  # without one, and whatever the other fields say, the records decide
+    if crc and zlib.crc32(data) != crc:  # 0: no checksum; other wrong fields do not matter, the records decide
         raise DamageError
     return data
 
 
 def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | None:
-    """Find all messages of a chunk at once by its index, which is believed only where the records bear it out.
+    """(messages,) offsets of the contents of all message records of a chunk, ascending, and (messages,) their sizes.
 
-    Parameters
-    ----------
-    data
-        the records in the chunk
-    index
-        Sequence[bytes] contents of the message index records behind the chunk
-
-    Returns
-    -------
-    tuple[IntArray, IntArray] | None
-        (messages,) where the content of each message's record starts, and its size, in the order of the chunk. None
-        where the messages of the index do not fill the chunk from the first byte to the last: then only a walk from
-        record to record finds what is there
+    ``index`` has the contents of the message index records behind the chunk. None where the messages that it names do
+    not fill the chunk from the first byte to the last: then only a walk from record to record finds what is there.
     """
     entries = [np.frombuffer(record, "<u8", offset=_INDEX_HEAD) for record in index if _is_index(record)]
     if not entries or len(entries) < len(index):
         return None
     start = np.concatenate(entries)[1::2]
-    start.sort(kind="stable")  # each channel's are in order already: merging them takes a tenth of the time
+    start.sort(kind="stable")  # each channel's offsets are sorted already: a stable sort merges them, ten times as fast
     if not len(start) or len(data) < RECORD.size or start[-1] > len(data) - RECORD.size:
         return None
     start = start.astype(np.int64)
@@ -139,21 +99,10 @@ def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | N
 
 
 def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
-    """Find the whole message records that follow upon each other from some place on.
+    """(messages,) content offsets and (messages,) sizes of the whole message records that follow ``at``, and their end.
 
-    Where the lengths differ they are walked one by one; after some of equal length, all more of them are found at once.
-
-    Parameters
-    ----------
-    data
-        a part of a file
-    at
-        where a record begins
-
-    Returns
-    -------
-    tuple[IntArray, IntArray, int]
-        (messages,) where the content of each begins, and its size; where what is no whole message record begins
+    Records are walked one by one while their lengths differ; after ``_ALIKE`` of equal length, the others of that
+    length are found at once.
     """
     starts: list[IntArray] = []
     sizes: list[IntArray] = []
@@ -191,15 +140,7 @@ def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
 
 
 def indexed(start: IntArray, index: Sequence[bytes]) -> bool:
-    """Whether an index names just the messages that are there.
-
-    Parameters
-    ----------
-    start
-        (messages,) where the content of each message's record starts, ascending
-    index
-        Sequence[bytes] contents of the message index records behind the chunk
-    """
+    """Whether a non-empty index names exactly the messages whose contents begin at ``start``, (messages,) ascending."""
     if not all(map(_is_index, index)):
         return False
     entries = [np.frombuffer(record, "<u8", offset=_INDEX_HEAD)[1::2] for record in index]
@@ -207,7 +148,7 @@ def indexed(start: IntArray, index: Sequence[bytes]) -> bool:
 
 
 def _is_index(record: bytes) -> bool:
-    """Whether it has the length that it says, in whole entries."""
+    """Whether it has the length that it states, in whole entries."""
     if len(record) < _INDEX_HEAD:
         return False
     size = int.from_bytes(record[_INDEX_HEAD - 4 : _INDEX_HEAD], "little")

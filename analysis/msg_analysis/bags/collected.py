@@ -1,7 +1,6 @@
-"""The states of a run, put in their places as they come out of the bag.
+"""The states of a run, written into the arrays of the result as they come out of the bag, in any order.
 
-A bag may hold any number of them in any order. Each is written into the arrays of the result at once, so that beside
-these only a few numbers per state are kept, whatever the length of the bag.
+Beside these arrays only a few numbers per state are kept, whatever the length of the bag.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from msg_analysis.model.step import Wiring
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
 _NEVER = np.zeros(1, dtype=np.bool_)
-_OTHER_COLUMNS = 4  # numbers of 8 bytes that are kept, or made on the way, of each state beside what it says
+_OTHER_COLUMNS = 4  # numbers of 8 bytes per state beside its own values, some only while it is processed
 
 
 class Collector:
-    """Takes the states of one kind of topic, of whatever runs.
+    """Takes the states of one kind of topic (`state` or `truth`), of any runs.
 
-    States of runs whose record has not been seen yet wait for it, as bytes: in most bags it comes first.
+    States of runs whose record has not been seen yet wait for it, as bytes: in most bags the record comes first.
     """
 
     def __init__(self) -> None:
@@ -39,15 +38,7 @@ class Collector:
         self._waiting: list[tuple[tuple[int, int], States]] = []
 
     def add(self, batch: Batch, chosen: IntArray) -> None:
-        """Take the states out of a batch.
-
-        Parameters
-        ----------
-        batch
-            messages
-        chosen
-            (k,) indices of those that are states
-        """
+        """Take from a batch the states: the messages with the indices ``chosen``, (k,)."""
         states, undecodable = decode_states(batch, chosen, self._position)
         self._undecodable += undecodable
         self._position += len(chosen)
@@ -59,19 +50,9 @@ class Collector:
                 self._waiting.append((run, part.alone()))
 
     def expect(self, record: RunRecord, width: int) -> None:
-        """From now on put the states of this run in their places; for runs that are expected already, nothing.
+        """From now on collect the states, of length ``width``, of this run; nothing where it is expected already.
 
-        Parameters
-        ----------
-        record
-            of the run
-        width
-            length of its states
-
-        Raises
-        ------
-        BagError
-            the run is too large for the memory of this machine
+        BagError where the result does not fit into the memory of this machine.
         """
         expected = run_number(record.run.bytes)
         if expected in self._expected:
@@ -85,31 +66,17 @@ class Collector:
                 self._waiting.append((run, part))
 
     def _of(self, run: tuple[int, int]) -> Collected:
-        """Made for the first state of a run: a bag may have records of runs of which there are none."""
+        """The result of a run, made for its first state: a bag may have records of runs without states."""
         if run not in self._collected:
             self._collected[run] = Collected(*self._expected[run])
         return self._collected[run]
 
     def count(self, run: bytes) -> int:
-        """Number of states of a run.
-
-        Parameters
-        ----------
-        run
-            16 bytes of its id
-        """
+        """Number of states of a run, given the 16 bytes of its id."""
         return self._counts[run_number(run)]
 
     def finish(self, record: RunRecord, width: int) -> Collected:
-        """All that came of a run, after the last batch; parameters and errors are those of ``expect``.
-
-        Parameters
-        ----------
-        record
-            of the run that is wanted
-        width
-            numbers of a state on this topic
-        """
+        """All that was collected of a run; call it after the last batch. Arguments and errors as of ``expect``."""
         self.expect(record, width)
         collected = self._of(run_number(record.run.bytes))
         collected.refused["undecodable"] += self._undecodable
@@ -130,30 +97,10 @@ def _by_run(states: States) -> list[tuple[tuple[int, int], States]]:
 
 
 class Collected:
-    """The states of a run on one kind of topic, each once, ordered by step.
+    """The states of a run on one kind of topic, each once, by step and agent. BagError: too large for the memory.
 
-    Parameters
-    ----------
-    record
-        of the run
-    width
-        length of its states
-
-    Attributes
-    ----------
-    states
-        (N + 1, m, width); NaN where a state is missing
-    modes
-        (N + 1, m) from 0; -1 where missing
-    lost, used, made
-        see ``Trajectory``
-    received, duplicates, out_of_order, refused
-        see ``Completeness``
-
-    Raises
-    ------
-    BagError
-        the run is too large for the memory of this machine
+    After ``finish``: ``states`` (N + 1, m, width), NaN where missing; ``modes`` (N + 1, m) from 0, -1 where missing;
+    ``lost``, ``used`` and ``made`` as in ``Trajectory``; the counts as in ``Completeness``.
     """
 
     def __init__(self, record: RunRecord, width: int) -> None:
@@ -166,20 +113,20 @@ class Collected:
         self._lossy = bool(experiment.noise.loss) or self._realtime
         most = self._links.most if self._lossy else 0
         cells = self._shape[0] * self._shape[1]
-        # The record alone says how large the result is, however little of it the bag holds.
+        # The result has the size that the record states, however little of it the bag holds.
         needed, available = 8 * cells * (width + _OTHER_COLUMNS + most), available_memory()
         try:
             if needed > available:
                 raise MemoryError
-            # Zeros cost no memory before they are written, so 0 is nowhere a value: all are one too large until the
-            # end. The place in the bag is that of the copy that was taken.
+            # Zeros cost no memory before they are written, so 0 means missing: position, modes, used and made are
+            # kept plus one until `finish`. The position is that of the copy that was kept.
             self._position = np.zeros(cells, dtype=np.int64)
             self._states: FloatArray = np.zeros((cells, width))
             self._modes = np.zeros(cells, dtype=np.int64)
             self._used = np.zeros((cells, most if self._realtime else 0), dtype=np.int64)
             self._made = np.zeros(cells if self._realtime else 0, dtype=np.int64)
             self._lost = np.zeros((cells, 0 if self._realtime else most), dtype=np.bool_)
-            self._listed = np.zeros(cells if self._lossy else 0, dtype=np.bool_)  # whether ``heard`` said something
+            self._listed = np.zeros(cells if self._lossy else 0, dtype=np.bool_)  # whether ``heard`` was not empty
         except (MemoryError, ValueError) as error:
             raise BagError(
                 f"run {record.run}: {experiment.steps} steps of {experiment.agents} agents need {amount(needed)}, "
@@ -193,20 +140,14 @@ class Collected:
         self.refused: Counter[str] = Counter()
 
     def add(self, states: States) -> None:
-        """Put states of this run in their places.
-
-        Parameters
-        ----------
-        states
-            in the order of the bag, and all behind those that came before
-        """
+        """Put states of this run in their places; they come in the order of the bag, from call to call too."""
         states, values = self._good(states)
         cell = states.step * self._shape[1] + states.agent - 1
         place = states.position + 1
         before = self._position[cell]
         if not before.any():
             self._position[cell] = place
-            if np.array_equal(self._position[cell], place):  # no two of them are of the same agent and step
+            if np.array_equal(self._position[cell], place):  # no two are of the same agent and step
                 self._write(cell, states, values)
                 return
             self._position[cell] = 0
@@ -222,11 +163,11 @@ class Collected:
 
     @cached_property
     def _links(self) -> _Links:
-        """Made when the first ``heard`` has to be understood: most runs have none."""
+        """Made when the first ``heard`` has to be interpreted: most runs have none."""
         return _Links(self._record.model, self._experiment.steps)
 
     def _good(self, states: States) -> tuple[States, FloatArray]:
-        """Those that can be states of this run, and their values; the others are counted."""
+        """Those that can be states of this run, and their values; the others are counted by reason."""
         right = states.replicas == self._width
         if not right.all():
             self.refused["wrong length"] += int((~right).sum())
@@ -267,7 +208,7 @@ class Collected:
             self._lost[cell] = heard == LOST
 
     def _differ(self, cell: IntArray, states: States, values: FloatArray) -> BoolArray:
-        """Which of these copies say something else than the first ones, which are in their places."""
+        """(copies,) whether these copies differ from the first ones, which are in their places."""
         differs = (values != self._states[cell]).any(axis=1) | (states.mode != self._modes[cell])
         if self._lossy:
             differs |= (states.heard(self._links.most) != self._heard(cell)).any(axis=1)
@@ -276,7 +217,7 @@ class Collected:
         return np.asarray(differs)
 
     def _heard(self, cell: IntArray) -> AnyArray:
-        """(cells, D) what ``heard`` said in the copies that were taken."""
+        """(cells, D) ``heard`` of the copies that were kept; 0 beyond its end."""
         step, agent = np.divmod(cell, self._shape[1])
         count = self._links.neighbours(self._modes[cell], agent) * self._listed[cell]
         if self._realtime:
@@ -287,9 +228,9 @@ class Collected:
         return np.where(np.arange(self._links.most) < count[:, None], heard, np.uint64(0))
 
     def finish(self) -> None:
-        """Say what is missing, after the last state."""
+        """Mark what is missing; call it after the last state."""
         if self._contradicted:
-            # One of the copies is forged, and nobody knows which: the state counts as missing.
+            # One of the copies is wrong and it is not known which: the state counts as missing.
             cells = np.concatenate(self._contradicted)
             for array in (self._position, self._modes, self._used, self._made, self._lost):
                 if len(array):
@@ -311,13 +252,7 @@ class Collected:
 
 
 def _out_of_order(position: IntArray) -> int:
-    """How many states came after a later one of the same agent.
-
-    Parameters
-    ----------
-    position
-        (N + 1, m) place in the bag, from 1; 0 where a state is missing
-    """
+    """How many states came after a later one of their agent, by (N + 1, m) place in the bag, from 1; 0: missing."""
     late = 0
     for column in position.T:  # one agent at a time: less memory
         came = np.where(column > 0, column, np.iinfo(np.int64).max)
@@ -327,30 +262,23 @@ def _out_of_order(position: IntArray) -> int:
 
 
 class _Links:
-    """What ``heard`` can be where it says something.
-
-    Attributes
-    ----------
-    most
-        largest number of neighbours
-    """
+    """What ``heard`` can be; ``most`` is the largest number of neighbours of any agent."""
 
     def __init__(self, model: Wiring, steps: int) -> None:
         self._last = np.uint64(steps)
         self.most = model.most_neighbours
-        self._neighbours = np.zeros((model.modes + 1, model.agents), dtype=np.int64)  # no graph led to step 0
+        self._neighbours = np.zeros((model.modes + 1, model.agents), dtype=np.int64)  # row 0: no graph led to step 0
         for mode in range(model.modes):
             self._neighbours[mode + 1] = [len(model.neighbours(mode, i)) for i in range(model.agents)]
 
     def neighbours(self, mode: IntArray, agent: IntArray) -> IntArray:
-        """How many these agents (from 0) have under these graphs (from 1; 0: none, at step 0)."""
+        """How many neighbours these agents (from 0) have in these graphs (from 1; 0: none, at step 0)."""
         return np.asarray(self._neighbours[mode, agent])
 
     def fit(self, states: States, *, realtime: bool, lossy: bool) -> BoolArray:
-        """Whether what they heard is, for each neighbour under their graph, a step that can be.
+        """Whether ``heard`` is possible: one entry per neighbour in their graph, each a step that can be.
 
-        In lockstep that is the step before, and nothing at all says the same of all neighbours. Where messages can be
-        lost it may be ``LOST``.
+        In lockstep that is the step before, and an empty ``heard`` says so of all; ``LOST`` is possible if ``lossy``.
         """
         heard, count = states.heard(self.most), states.heard_count
         before = (states.step.astype(np.uint64) - np.uint64(1))[:, None]

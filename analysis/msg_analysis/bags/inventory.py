@@ -1,4 +1,7 @@
-"""What the files of a bag hold, counted while they are read: whatever the messages are, and however the file ends."""
+"""What the files of a bag hold, counted while they are read, whatever the messages are and however a file ends.
+
+Also the check of a file's summary, which the library reads without looking at its checksum.
+"""
 
 from __future__ import annotations
 
@@ -20,35 +23,23 @@ from mcap.summary import Summary
 from msg_analysis.bags.mcapfile import Batch, McapFile
 from msg_analysis.bags.metadata import ChannelCount, FileCount
 
-RECORD_LIMIT = 2**28  # bytes of a record at the end of a file; damage claims more
-_FOOTER = struct.Struct("<9xQQI8x")  # starts of the summary and of its offsets, CRC from the former on to before itself
-_BEHIND_CRC = 12
+RECORD_LIMIT = 2**28  # bytes of a record at the end of a file; only damage claims more
+_FOOTER = struct.Struct("<9xQQI8x")  # starts of summary and summary offsets; CRC of all from the summary up to itself
+_BEHIND_CRC = 12  # bytes of the CRC and the closing magic
 _CHUNK = struct.Struct("<BQQQQ")  # opcode, length, first and last log time, size when unpacked
-_CHUNK_CRC = 4  # bytes behind it
-_PACKED = struct.Struct("<Q")  # size, behind the name of the compression
-_RECORD_HEAD = 9
+_CHUNK_CRC = 4  # bytes of the CRC behind `_CHUNK`
+_PACKED = struct.Struct("<Q")  # compressed size, behind the name of the compression
+_RECORD_HEAD = 9  # bytes of opcode and length
 
 
 @dataclass(slots=True)
 class FileInventory:
-    """One file, known when it has been read.
-
-    Attributes
-    ----------
-    file
-        as it was read: how it ends, what is damaged
-    count
-        messages by topic, first and last log time
-    summary
-        at its end; None where it has none that can be believed
-    problem
-        why nothing can be read of it; None where something can
-    """
+    """One file: what it holds and what is wrong with it, complete once ``watch`` has run to its end."""
 
     file: McapFile
     count: FileCount
-    summary: Summary | None = None
-    problem: str | None = None
+    summary: Summary | None = None  # None where the file has none that is correct
+    problem: str | None = None  # why nothing of the file can be read
 
     def watch(self) -> Iterator[Batch]:
         """The batches of the file, counted as they pass."""
@@ -76,12 +67,12 @@ class FileInventory:
 
     @property
     def whole(self) -> bool:
-        """Whether others can read it as it is: nothing torn, nothing damaged, and a summary that is true."""
+        """Whether other programs can read it as it is: not torn, not damaged, with a correct summary."""
         return self.lost_messages == 0 and not self.file.damaged_chunks and not self.file.false_indexes
 
     @property
     def lost_messages(self) -> int | None:
-        """How many messages the file says that it has, beyond those that were read; None where it does not say."""
+        """How many messages fewer were read than its summary states; None without a summary."""
         statistics = self.summary.statistics if self.summary else None
         if statistics is None:
             return None
@@ -90,59 +81,41 @@ class FileInventory:
 
     @property
     def compression(self) -> str | None:
-        """Kinds of compression of its chunks: "none", "zstd", "lz4", or several; None where it does not say."""
+        """Compression of its chunks: "none", "zstd", "lz4", or several; None without a summary or chunks."""
         kinds = {index.compression or "none" for index in self.summary.chunk_indexes} if self.summary else set()
         return ", ".join(sorted(kinds)) or None
 
 
 @dataclass(slots=True)
 class Inventory:
-    """All files of a bag.
-
-    Attributes
-    ----------
-    files
-        in their order
-    """
+    """All files of a bag, in their order."""
 
     files: list[FileInventory] = field(default_factory=list)
 
     def add(self, file: McapFile) -> FileInventory:
-        """A file that is going to be read.
-
-        Parameters
-        ----------
-        file
-            not read yet
-        """
+        """Add a file that has not been read yet."""
         self.files.append(FileInventory(file, FileCount(file.path.name)))
         return self.files[-1]
 
 
 def summary_of(file: Path) -> Summary | None:
-    """The summary at the end of an MCAP file; None where it has none or it is damaged.
-
-    Parameters
-    ----------
-    file
-        to look into
-    """
+    """The summary at the end of an MCAP file; None where it has none, or where it or its chunk indexes are wrong."""
     try:
         with file.open("rb") as stream:
             stream.seek(-_FOOTER.size, io.SEEK_END)
             start, _, crc = _FOOTER.unpack(stream.read())
             stream.seek(start)
-            if crc and crc != zlib.crc32(stream.read()[:-_BEHIND_CRC]):  # the library does not look
+            if crc and crc != zlib.crc32(stream.read()[:-_BEHIND_CRC]):  # the library does not check it
                 return None
             stream.seek(0)
             summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary()
             return summary if summary and all(_is_there(stream, index) for index in summary.chunk_indexes) else None
-    except Exception:  # the library reports damage by whatever goes wrong in it
+    except Exception:  # the library raises many kinds of errors on damage
         return None
 
 
 def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
-    """Whether there is a chunk where its index says, which says the same of itself."""
+    """Whether the chunk that an index describes stands where the index says, with the same head."""
     name = index.compression.encode()
     times = (index.message_start_time, index.message_end_time)
     head = _CHUNK.pack(Opcode.CHUNK, index.chunk_length - _RECORD_HEAD, *times, index.uncompressed_size)
@@ -154,15 +127,7 @@ def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
 
 
 def channel_count(channel: Channel, type_name: str) -> ChannelCount:
-    """A topic without messages yet, as an MCAP channel describes it.
-
-    Parameters
-    ----------
-    channel
-        of the file
-    type_name
-        of its messages, ``package/msg/Name``
-    """
+    """A topic without messages yet, from an MCAP channel; ``type_name`` is ``package/msg/Name``."""
     try:
         qos: Any = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "[]"))
     except (ValueError, RecursionError, yaml.YAMLError):

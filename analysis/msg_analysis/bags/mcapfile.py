@@ -1,4 +1,7 @@
-"""The messages of an MCAP file, whole or torn, in batches that numpy can work on."""
+"""The messages of an MCAP file, whole or torn, in batches that numpy can work on.
+
+A file is read once, from front to back. Damaged chunks are counted and left out; a tear ends the reading.
+"""
 
 from __future__ import annotations
 
@@ -29,51 +32,25 @@ from msg_analysis.errors import BagError
 from msg_analysis.types import AnyArray, BoolArray, IntArray
 
 MAGIC = b"\x89MCAP0\r\n"
-_LOOSE = 2**18  # messages that are not in chunks are taken in batches of so many bytes
+_LOOSE = 2**18  # bytes of a batch of messages that are not in chunks
 _ZSTD = ".zstd"  # suffix of rosbag2's compression mode `file`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """Messages in the order of the file.
-
-    Attributes
-    ----------
-    data
-        bytes in which they are; before the CDR bytes of each message there is the rest of its record
-    start, size
-        (messages,) where the CDR bytes begin in ``data``, and how many they are
-    head
-        (messages,) of type ``MESSAGE_HEAD``
-    end
-        bytes of the file up to the end of the chunk, or of the last record, that they are from
-    """
+    """Messages in the order of the file; the CDR bytes of each lie behind the rest of its record in ``data``."""
 
     data: bytes
-    start: IntArray
-    size: IntArray
-    head: AnyArray
-    end: int
+    start: IntArray  # (messages,) offset of the CDR bytes in ``data``
+    size: IntArray  # (messages,) number of CDR bytes
+    head: AnyArray  # (messages,) of type ``MESSAGE_HEAD``
+    end: int  # bytes of the file up to the end of the chunk, or of the last record, of these messages
 
     @classmethod
     def of_contents(cls, data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
-        """From the places of the contents of their records.
+        """A batch from the offsets and sizes, (messages,), of the contents of its message records in ``data``.
 
-        Parameters
-        ----------
-        data
-            a chunk, unpacked
-        start
-            (messages,) where the content of each record begins
-        size
-            (messages,) bytes of each
-        end
-            bytes of ``data`` that are records
-
-        Raises
-        ------
-        DamageError
-            too short for a message, or a time that no clock has
+        DamageError: a record too short for a message, or a time of 2^63 ns or more.
         """
         if (size < MESSAGE_HEAD.itemsize).any():
             raise DamageError
@@ -89,60 +66,38 @@ class Batch:
 
     @property
     def table(self) -> IntArray:
-        """(messages, 6) channel number, sequence, log time [ns], publish time [ns], start and size."""
+        """(messages, 6) int64: channel number, sequence, log time [ns], publish time [ns], start, size."""
         columns = [self.head[name].astype(np.int64) for name in MESSAGE_HEAD.names or ()]
         return np.column_stack((*columns, self.start, self.size))
 
     def message(self, index: int) -> bytes:
-        """CDR bytes of one message.
-
-        Parameters
-        ----------
-        index
-            of the message in the batch
-        """
+        """CDR bytes of the message at an index of the batch."""
         start = int(self.start[index])
         return self.data[start : start + int(self.size[index])]
 
 
 @dataclass(slots=True)
 class _Chunk:
-    """A chunk.
-
-    Attributes
-    ----------
-    content
-        of its record
-    end
-        bytes of the file up to its own end
-    index
-        contents of the message index records behind it
-    """
+    """A chunk and the message index records behind it."""
 
     content: bytes
-    end: int
+    end: int  # bytes of the file up to the end of its record
     index: list[bytes] = field(default_factory=list)
     _filled: int = 0
 
     def add_index(self, content: bytes) -> None:
-        """Take one more of its message index records, as long as they are not absurdly many."""
+        """Take the content of one more index record, up to ``LIMIT`` bytes of all."""
         self._filled += len(content)
         if self._filled <= LIMIT:
             self.index.append(content)
 
 
 class _Source:
-    """A stream of records, of which messages that follow upon each other are taken many at a time.
-
-    Parameters
-    ----------
-    stream
-        of which nothing else reads
-    """
+    """A stream of records that gives out many message records in a row at once; nothing else may read the stream."""
 
     def __init__(self, stream: io.BufferedReader) -> None:
         self._stream = stream
-        self._buffer, self._at = b"", 0  # read from the stream already, and how much of that has been given out
+        self._buffer, self._at = b"", 0  # bytes read from the stream, and how many of them were given out
 
     def read(self, size: int) -> bytes:
         """So many bytes; fewer at the end."""
@@ -154,13 +109,10 @@ class _Source:
         return found
 
     def messages(self, head: bytes) -> tuple[bytes, IntArray, IntArray, int]:
-        """Whole message records, the first of which has this head, which was the last that was read.
+        """Buffer, (messages,) content offsets and sizes in it, and bytes of all, of whole message records in a row.
 
-        Returns
-        -------
-        tuple[bytes, IntArray, IntArray, int]
-            the bytes in which they are; (messages,) where the content of each begins there, and its size; bytes of all:
-            0 where the first is too long for this, or cut off
+        The first is the one whose ``head`` was read last. 0 bytes where it is cut off or does not fit into ``_LOOSE``
+        bytes.
         """
         if self._at >= len(head):
             self._at -= len(head)
@@ -173,60 +125,34 @@ class _Source:
             self._buffer, self._at = self._buffer[self._at :] + self._stream.read(_LOOSE), 0
         length, self._at = end - self._at, end
         if not length:
-            self._at += len(head)  # as before
+            self._at += len(head)  # the head counts as read again
         return self._buffer, start, size, length
 
 
 @dataclass(slots=True)
 class McapFile:
-    """An MCAP file that is read once, from front to back, by iterating over ``batches()``.
-
-    Attributes
-    ----------
-    path
-        of the file; compressed as a whole where it ends with .zstd
-    channels, schemas
-        seen so far, by number
-    metadata, attachments
-        seen so far
-    profile, library
-        of the header
-    whole_bytes
-        length of the whole records so far
-    torn
-        what is there instead of the end of the file; None where it ends well (known when all is read)
-    damaged_chunks
-        chunks whose content did not survive; the reading goes on behind them
-    false_indexes
-        chunks whose message index says what is not so: here the records decide, others go by it
-    """
+    """An MCAP file to be read once, by iterating over ``batches()``; compressed as a whole if named *.zstd."""
 
     path: Path
-    channels: dict[int, Channel] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)  # by number; these and the following: seen so far
     schemas: dict[int, Schema] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
     profile: str = ""
     library: str = ""
-    whole_bytes: int = 0
-    torn: str | None = None
-    damaged_chunks: int = 0
-    false_indexes: int = 0
+    whole_bytes: int = 0  # length of the whole records so far, with the magic bytes; of a .zstd file, unpacked
+    torn: str | None = None  # what is there instead of the end of the file, known when all is read
+    damaged_chunks: int = 0  # chunks that are left out
+    false_indexes: int = 0  # chunks whose index is wrong: here the records decide, other programs use the index
 
     def batches(self) -> Iterator[Batch]:
-        """The messages of all whole records.
-
-        Raises
-        ------
-        BagError
-            not an MCAP file, empty, or one that cannot be read
-        """
+        """The messages of all whole records; BagError: not an MCAP file, empty, or one that cannot be read."""
         try:
             size = self.path.stat().st_size
             with contextlib.ExitStack() as stack:
                 stream = stack.enter_context(self.path.open("rb"))
                 if self.path.suffix == _ZSTD:
-                    size = 2**62  # known only when all is unpacked
+                    size = 2**62  # not known before all is unpacked
                     unpacked = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
                     stream = stack.enter_context(io.BufferedReader(unpacked))
                 yield from self._batches(stream, size)
@@ -264,7 +190,7 @@ class McapFile:
             yield from self._chunk(chunk, zstd)
 
     def _records(self, stream: _Source, size: int) -> Iterator[tuple[int, bytes, tuple[IntArray, IntArray]]]:
-        """Opcode and content of each record; of messages many at once, with the places of the content of each."""
+        """Opcode, content and (offsets, sizes) of each record; message records in a row come together."""
         while True:
             head = stream.read(RECORD.size)
             if len(head) < RECORD.size:
@@ -309,7 +235,7 @@ class McapFile:
                 self.metadata.append(Metadata.read(stream))
             elif opcode == Opcode.ATTACHMENT:
                 self.attachments.append(Attachment.read(stream))
-        except Exception as error:  # the library reports damage by whatever goes wrong in it
+        except Exception as error:  # the library raises many kinds of errors on damage
             raise DamageError from error
 
     def _chunk(self, chunk: _Chunk, zstd: zstandard.ZstdDecompressor) -> Iterator[Batch]:
@@ -321,7 +247,7 @@ class McapFile:
                 places = walked[:, 0], walked[:, 1]
                 self.false_indexes += bool(chunk.index) and not indexed(places[0], chunk.index)
             batch = Batch.of_contents(data, *places, chunk.end)
-        except Exception:  # decompressors and the library report damage by whatever goes wrong in them
+        except Exception:  # decompressors and the library raise many kinds of errors on damage
             self.damaged_chunks += 1
             return
         yield batch
@@ -341,23 +267,22 @@ class McapFile:
 
 
 def _keep_memory() -> None:
-    """Let the C library keep what is freed from chunk to chunk.
+    """Let the C library keep large blocks that are freed from chunk to chunk, instead of mapping fresh pages each time.
 
-    Blocks larger than any that was ever freed it takes from the system each time anew, and touching fresh pages takes
-    longer than all that is done with a chunk. Freeing one large block moves that threshold (mallopt(3),
-    M_MMAP_THRESHOLD).
+    Touching fresh pages takes longer than all that is done with a chunk. Freeing one large block raises the threshold
+    (mallopt(3), M_MMAP_THRESHOLD).
     """
     np.empty(2**24, np.uint8)
 
 
 def _loose_batch(data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
-    """Messages that are not in a chunk; those that are damaged are left out one by one."""
+    """Messages that are not in a chunk; damaged ones are left out one by one."""
     start, size = start[size >= MESSAGE_HEAD.itemsize], size[size >= MESSAGE_HEAD.itemsize]
     timed = ~_no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
     return Batch.of_contents(data, start[timed], size[timed], end)
 
 
 def _no_time(head: AnyArray) -> BoolArray:
-    """Which messages have a log or publish time of 2^63 ns or more, which no clock has."""
+    """(messages,) whether the log or publish time is 2^63 ns or more, which no clock shows."""
     octets = head.view(np.uint8).reshape(len(head), MESSAGE_HEAD.itemsize)
     return np.asarray((octets[:, 13] | octets[:, 21]) >= 128)  # the highest byte of either

@@ -14,52 +14,32 @@ from msg_analysis.errors import BagError
 
 METADATA_FILE = "metadata.yaml"
 _ROOT = "rosbag2_bagfile_information"
-# Those in C, where PyYAML has them: a network of 1000 agents has 30,000 lines.
+# Those in C, where PyYAML has them: metadata of 1000 agents has 30,000 lines.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_DEEPEST = 50
+_DEEPEST = 50  # levels of nesting
 _NEVER = 2**63 - 1  # what rosbag2 writes as the start of a bag without messages
 
 
 @dataclass(slots=True)
 class ChannelCount:
-    """A topic of a file and how many messages it has.
-
-    Attributes
-    ----------
-    topic, type_name, type_hash
-        of the channel
-    qos
-        offered profiles, the same list as in the MCAP channel
-    messages
-        counted so far
-    """
+    """A topic of a file and how many messages it has."""
 
     topic: str
     type_name: str
     type_hash: str
-    qos: list[dict[str, Any]]
+    qos: list[dict[str, Any]]  # offered profiles, the same list as in the MCAP channel
     messages: int = 0
 
 
 @dataclass(slots=True)
 class FileCount:
-    """A file of a bag and what is in it.
+    """A file of a bag and what is in it."""
 
-    Attributes
-    ----------
-    name
-        without directory
-    start, end
-        log times of the first and the last message [ns]
-    channels
-        its topics, by name
-    """
-
-    name: str
-    start: int = _NEVER
-    end: int = 0
-    channels: dict[str, ChannelCount] = field(default_factory=dict)
+    name: str  # without directory
+    start: int = _NEVER  # log time of the first message [ns]
+    end: int = 0  # log time of the last message [ns]
+    channels: dict[str, ChannelCount] = field(default_factory=dict)  # by topic
 
     @property
     def messages(self) -> int:
@@ -73,15 +53,7 @@ class FileCount:
 
 
 def bag_information(files: Sequence[FileCount], custom: Mapping[str, str]) -> dict[str, Any]:
-    """What rosbag2 wants to know about a bag.
-
-    Parameters
-    ----------
-    files
-        Sequence[FileCount] its files, in order
-    custom
-        Mapping[str, str] our own entries
-    """
+    """What metadata.yaml says of a bag with these files, in their order; ``custom`` holds our own entries."""
     topics = total_channels(files)
     start = min(file.start for file in files)
     return {
@@ -103,7 +75,7 @@ def bag_information(files: Sequence[FileCount], custom: Mapping[str, str]) -> di
             }
             for topic in topics.values()
         ],
-        "compression_format": "",  # of rosbag2's own kinds; the chunks of MCAP are compressed by themselves
+        "compression_format": "",  # only of rosbag2's own compression; MCAP files state that of their chunks
         "compression_mode": "",
         "relative_file_paths": [file.name for file in files],
         "files": [
@@ -121,13 +93,7 @@ def bag_information(files: Sequence[FileCount], custom: Mapping[str, str]) -> di
 
 
 def total_channels(files: Sequence[FileCount]) -> dict[str, ChannelCount]:
-    """The topics of several files by name, each with all its messages.
-
-    Parameters
-    ----------
-    files
-        of one bag
-    """
+    """The topics of the files of a bag by name, each with all its messages."""
     topics: dict[str, ChannelCount] = {}
     for file in files:
         for name, channel in file.channels.items():
@@ -137,26 +103,12 @@ def total_channels(files: Sequence[FileCount]) -> dict[str, ChannelCount]:
 
 
 def dump(document: Any) -> str:
-    """As YAML, keys in the order given.
-
-    Parameters
-    ----------
-    document
-        of plain values, lists and dicts
-    """
+    """Plain values, lists and dicts as YAML, keys in the order given."""
     return str(yaml.dump(document, Dumper=_DUMPER, sort_keys=False))
 
 
 def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
-    """Put metadata.yaml into a bag, whole or not at all.
-
-    Parameters
-    ----------
-    directory
-        of the bag
-    information
-        Mapping[str, Any] from :func:`bag_information`
-    """
+    """Put metadata.yaml with :func:`bag_information` into a bag, whole or not at all."""
     temporary = directory / f".{METADATA_FILE}.tmp"
     with temporary.open("w", encoding="utf-8") as stream:
         stream.write(dump({_ROOT: dict(information)}))
@@ -166,7 +118,7 @@ def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
 
 
 def _load(text: str) -> Any:
-    """The document. PyYAML's loader in C does not survive deep nesting, so that is looked for first."""
+    """The document; deep nesting, which crashes PyYAML's C loader, is refused first."""
     depth = 0
     for event in yaml.parse(text, _LOADER):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
@@ -176,18 +128,7 @@ def _load(text: str) -> Any:
 
 
 def read_metadata(directory: Path) -> dict[str, Any] | None:
-    """Bag information of a directory, or None where there is no metadata.yaml.
-
-    Parameters
-    ----------
-    directory
-        of the bag
-
-    Raises
-    ------
-    BagError
-        not the metadata of a bag
-    """
+    """Bag information of a directory; None without metadata.yaml, BagError where it is not that of a bag."""
     file = directory / METADATA_FILE
     try:
         document = _load(file.read_text(encoding="utf-8"))

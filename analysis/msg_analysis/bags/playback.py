@@ -1,9 +1,8 @@
 """The messages of a bag, of any topics and types, in the order of time: what a player publishes.
 
-Within a topic that is the order of the file; a message whose log time is before that of its predecessor on the topic
-comes right after it. Across topics it is the order of log times, and of the file where these are equal. Recorders write
-messages as they come, so a bag is only nearly in that order, and what is read has to be held until nothing earlier can
-follow. How early messages behind some point of a file can be is known from an outline of the file, taken before.
+Within a topic that is the order of the file; a message logged earlier than its predecessor on the topic takes the time
+of that. Across topics it is the order of log times, then of the file. A bag is only nearly in that order, so messages
+are held until nothing earlier can follow: an outline of each file, taken first, bounds the times behind each point.
 """
 
 from __future__ import annotations
@@ -25,104 +24,54 @@ from msg_analysis.bags.mcapfile import MAGIC, McapFile
 from msg_analysis.bags.reader import bag_files
 from msg_analysis.errors import BagError
 
+# Bytes of messages held to be put in order. A bag that needs more is played out of order rather than held in memory.
 MOST_HELD = 256 * 2**20
-"""Bytes of messages held to be put in order; if a bag is so far out of order that this does not do, order gives way."""
 _RECORD = struct.Struct("<BQ")
 _TIMES = struct.Struct("<QQ")  # of the first and the last message of a chunk, at its beginning
 _EMPTY_INDEX = 6  # bytes of a message index without entries
-_LATCHED = ("transient_local", 1)  # in words, and as older rosbag2 wrote it
+_LATCHED = ("transient_local", 1)  # as text, and as the number of older rosbag2
 
 
 @dataclass(slots=True)
 class BagTopic:
-    """A topic of a bag.
+    """A topic of a bag."""
 
-    Attributes
-    ----------
-    name
-        absolute
-    type_name
-        of its messages, such as ``std_msgs/msg/String``
-    encoding
-        of its messages; ``cdr`` in ROS 2
-    type_hash
-        of its type's description; empty where the bag does not say
-    latched
-        whether a publisher of it kept its messages for those who come late
-    messages
-        how many there are
-    """
-
-    name: str
-    type_name: str
-    encoding: str
-    type_hash: str
-    latched: bool
+    name: str  # absolute
+    type_name: str  # such as ``std_msgs/msg/String``
+    encoding: str  # of the messages; ``cdr`` in ROS 2
+    type_hash: str  # empty where the bag does not state it
+    latched: bool  # whether a publisher kept its messages for late subscribers
     messages: int = 0
 
 
 @dataclass(slots=True)
 class _Outline:
-    """What is known of a file before it is played.
-
-    Attributes
-    ----------
-    lows
-        (end of a piece of the file [bytes], earliest log time in it [ns]), in the order of the file
-    start, end
-        log times of the earliest and the latest message [ns]; None without messages
-    """
+    """What is known of a file before it is played."""
 
     path: Path
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
-    lows: list[tuple[int, int]] = field(default_factory=list)
-    start: int | None = None
-    end: int | None = None
+    lows: list[tuple[int, int]] = field(default_factory=list)  # (end of a piece [bytes], its earliest log time [ns])
+    start: int | None = None  # earliest log time [ns]; None without messages
+    end: int | None = None  # latest log time [ns]
     damage: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message of a bag: when it is its turn [ns of log time], its topic, its bytes.
+    """A message of a bag."""
 
-    Attributes
-    ----------
-    time
-        when it is its turn [ns of log time]
-    topic
-        name in the bag
-    data
-        as recorded
-    """
-
-    time: int
+    time: int  # log time, at least that of its predecessor on the topic [ns]
     topic: str
-    data: bytes
+    data: bytes  # as recorded
 
 
 class Playback:
-    """A bag that is read in the order of time, as often as wanted, a piece at a time.
+    """A bag, whole or torn, that is read in the order of time, as often as wanted, a piece at a time.
 
-    Parameters
-    ----------
-    path
-        the directory of a bag, or one of its .mcap files; whole or torn
-
-    Attributes
-    ----------
-    topics
-        by name; those of which there are messages
-    start, end
-        log times of the earliest and the latest message [ns]
-    damage
-        what is wrong with its files, a line each; damaged chunks may show only while they are read
-
-    Raises
-    ------
-    BagError
-        no bag, or without messages
+    ``topics`` has those with messages, by name; ``start`` and ``end`` are the extreme log times [ns]; ``damage`` has a
+    line per damaged file, some only after reading. BagError: no bag, no messages, or a topic with two types.
     """
 
     def __init__(self, path: Path) -> None:
@@ -161,15 +110,7 @@ class Playback:
             )
 
     def messages(self, topics: Collection[str], until: int = 2**63) -> Iterator[Message]:
-        """The messages of some topics.
-
-        Parameters
-        ----------
-        topics
-            names
-        until
-            time [ns] of the last ones that are wanted; what is behind them in the bag is not read
-        """
+        """The messages of some topics up to the time ``until`` [ns]; the rest of the bag is not read."""
         newest: dict[str, int] = {}
         pending: list[tuple[int, int, str, bytes]] = []  # time, position in the bag, topic, data
         position = held = 0
@@ -211,7 +152,7 @@ class Playback:
             self.damage.append(f"{outline.path}: {outline.damage}")
 
     def _starts_after(self) -> list[int]:
-        """For each file, the earliest time in those behind it."""
+        """For each file, the earliest time [ns] in the files behind it."""
         starts, least = [], 2**63
         for outline in reversed(self._outlines):
             starts.append(least)
@@ -220,27 +161,27 @@ class Playback:
 
 
 class _Lows:
-    """How early messages behind some point of a file can be."""
+    """Lower bound of the log times behind a point of a file; ``later``: that of the files behind it [ns]."""
 
     def __init__(self, lows: list[tuple[int, int]], later: int) -> None:
         self._ends = [end for end, _ in lows]
-        self._from = [later]  # each piece on
+        self._from = [later]  # by piece: lowest time from it on
         for _, low in reversed(lows):
             self._from.append(min(self._from[-1], low))
         self._from.reverse()
         self._next = 0
 
     def behind(self, offset: int) -> int:
-        """After a piece that ends here; called once for every piece that was read, in order."""
+        """Bound [ns] behind a piece that ends at this offset; call it for every piece that was read, in order."""
         while self._next < len(self._ends) and self._ends[self._next] < offset:
-            self._next += 1  # not read: damaged
+            self._next += 1  # a damaged piece, which was left out
         if self._next < len(self._ends) and self._ends[self._next] == offset:
-            self._next += 1  # else without messages
+            self._next += 1  # else a piece without messages
         return self._from[self._next]
 
 
 def _latched(profiles: str) -> bool:
-    """Whether one of the offered profiles, in rosbag2's words, is transient-local."""
+    """Whether one of the offered profiles (YAML, as rosbag2 writes them) is transient-local."""
     try:
         listed: Any = yaml.safe_load(profiles)
     except yaml.YAMLError:
@@ -251,14 +192,14 @@ def _latched(profiles: str) -> bool:
 
 
 def _quick_outline(path: Path) -> _Outline | None:
-    """From the heads of the records and the summary, without unpacking chunks; None where these do not do.
+    """Outline from the heads of the records and the summary, without unpacking chunks; None where that is not enough.
 
-    They do for a file that was ended well and has all of its messages in chunks, as most have.
+    It is enough for a file that was closed properly and has all messages in chunks, as most have.
     """
     outline = _Outline(path)
     statistics: Statistics | None = None
     size = path.stat().st_size
-    silent = None  # end of a chunk that claims no time, or 0: which of the two its index tells
+    silent = None  # end of a chunk with times 0: its index tells whether it has messages
     with path.open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             return None
@@ -291,7 +232,7 @@ def _quick_outline(path: Path) -> _Outline | None:
                         outline.channels[channel.id] = channel
                     else:
                         statistics = Statistics.read(content)
-                except Exception:  # the library reports damage by whatever goes wrong in it
+                except Exception:  # the library raises many kinds of errors on damage
                     return None
             elif opcode == Opcode.FOOTER:
                 break
@@ -307,13 +248,7 @@ def _quick_outline(path: Path) -> _Outline | None:
 
 
 def _outline(path: Path) -> _Outline:
-    """By reading all of a file.
-
-    Raises
-    ------
-    BagError
-        not an MCAP file, empty, or one that cannot be read
-    """
+    """Outline by reading all of a file; BagError: not an MCAP file, empty, or one that cannot be read."""
     outline, file = _Outline(path), McapFile(path)
     for batch in file.batches():
         if not len(batch.table):

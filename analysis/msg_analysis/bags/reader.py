@@ -1,4 +1,7 @@
-"""Reads a recorded run, whoever recorded it, and counts what is there before anything else."""
+"""Reads a recorded run, whichever program recorded it, and counts what is there and what is missing.
+
+The run record comes from the topic `experiment`, or from the metadata of files that this software wrote.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ from msg_analysis.model.record import RunRecord
 from msg_analysis.model.trajectory import Completeness, Trajectory
 from msg_analysis.types import IntArray
 
-# Topics are told by type and by the end of their name: the network may run in any namespace.
+# Topics are recognised by type and by the end of their name: the network may run in any namespace.
 _STATE, _TRUTH, _GRAPH, _EXPERIMENT = "state", "truth", "graph", "experiment"
 _NUMBERS = {None: 0, _STATE: 1, _TRUTH: 2, _GRAPH: 3, _EXPERIMENT: 4}
 _TOPICS = {
@@ -39,27 +42,10 @@ _EACH_COMPRESSED = (
 
 
 def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory:
-    """The run that a bag holds.
+    """The run of a bag: of a directory or of one of its .mcap files; torn files are read up to the tear.
 
-    Parameters
-    ----------
-    path
-        the directory of a bag, with metadata.yaml or without, or one of its .mcap files; torn files are read up to the
-        tear
-    inventory
-        is filled with what the files hold, also where no run can be made of it
-
-    Returns
-    -------
-    Trajectory
-        with the account of what is missing in ``completeness``
-
-    Raises
-    ------
-    BagError
-        no bag, a bag without the run record, or with several runs
-    InputError
-        the run record in it is not valid
+    ``inventory`` is filled with what the files hold, even if no run can be made of it. BagError: no bag, no run record,
+    or several runs; InputError: the run record is not valid.
     """
     path = Path(path)
     contents = _Contents()
@@ -69,7 +55,7 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
         entry = (inventory or Inventory()).add(McapFile(file))
         try:
             contents.read(entry.file, entry.watch() if inventory else entry.file.batches())
-        except BagError as error:  # the recorder died when it had just made it, or it is damaged from the start
+        except BagError as error:  # the recorder died just after it made the file, or its start is damaged
             entry.problem = str(error)
             unreadable.append(error)
     if len(unreadable) == len(files):
@@ -80,18 +66,7 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
 
 
 def bag_files(path: Path) -> list[Path]:
-    """The MCAP files of a bag in their order.
-
-    Parameters
-    ----------
-    path
-        directory or file
-
-    Raises
-    ------
-    BagError
-        there is none, one is missing, or the bag is of a kind that cannot be read
-    """
+    """The MCAP files of a bag in their order; BagError: there are none, one is missing, or another storage."""
     if path.is_file():
         return [path]
     if not path.is_dir():
@@ -121,20 +96,20 @@ def bag_files(path: Path) -> list[Path]:
 
 
 def _file_number(file: Path) -> tuple[int, str]:
-    """Rosbag2 numbers the files of a split bag: name_0.mcap, name_1.mcap, ..., name_10.mcap."""
+    """Order of the files of a split bag, which rosbag2 numbers: name_0.mcap, name_1.mcap, ..., name_10.mcap."""
     number = re.search(r"_(\d+)\.mcap", file.name)
     return int(number[1]) if number else 0, file.name
 
 
 @dataclass(slots=True)
 class _Contents:
-    """What the files of a bag hold of our topics."""
+    """What the files of a bag hold of the network's topics."""
 
     states: Collector = field(default_factory=Collector)
     truths: Collector = field(default_factory=Collector)
     graphs: list[ActiveGraph] = field(default_factory=list)
     experiments: dict[str, None] = field(default_factory=dict)  # texts, each once, in order
-    records: dict[str, None] = field(default_factory=dict)  # the same from the metadata of our own files
+    records: dict[str, None] = field(default_factory=dict)  # the same from the metadata of our files
     refused: Counter[str] = field(default_factory=Counter)
 
     def read(self, file: McapFile, batches: Iterable[Batch]) -> None:
@@ -156,10 +131,10 @@ class _Contents:
         self.refused["damaged chunk"] += file.damaged_chunks
 
     def _add(self, batch: Batch, kinds: dict[int, str | None]) -> None:
-        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: none of ours
+        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: not a topic of the network
         kind_of[list(kinds)] = [_NUMBERS[kind] for kind in kinds.values()]
         kind = kind_of[batch.channel]
-        # First the records: states whose run is known are put in their places at once.
+        # Records first: states of a known run are put in their places at once.
         for index in np.flatnonzero(kind >= _NUMBERS[_GRAPH]).tolist():
             data = batch.message(index)
             try:
@@ -181,7 +156,7 @@ class _Contents:
         try:
             record = RunRecord.from_json(text, "topic experiment")
         except InputError:
-            return  # only worth a word where there is no other record
+            return  # `_choose` reports it if there is no valid record
         for collector, width in zip((self.states, self.truths), _widths(record), strict=True):
             collector.expect(record, width)
 
@@ -211,7 +186,7 @@ def _choose(contents: _Contents, path: Path) -> RunRecord:
         try:
             record = RunRecord.from_json(text, f"{path}: topic experiment")
             records.setdefault(record.run.bytes, record)
-        except InputError as error:  # another program's topic of that name, or a record that we cannot use
+        except InputError as error:  # another program's topic of that name, or an invalid record
             errors.append(error)
     if not records:
         raise errors[0]
@@ -262,7 +237,7 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
 
 
 def _modes(contents: _Contents, run: bytes, steps: int, graphs: int) -> IntArray:
-    """(N,) graph of every step from the sojourns; -1 where none or more than one claims it."""
+    """(N,) graph of every step from the sojourns, from 0; -1 where none or more than one covers it."""
     sojourns: set[tuple[int, int, int, int]] = set()
     for graph in contents.graphs:
         if graph.run != run:

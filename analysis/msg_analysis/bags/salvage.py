@@ -1,4 +1,7 @@
-"""Makes a bag out of what a killed recorder, a full disk or a power cut left behind."""
+"""Makes a bag out of what a killed recorder, a full disk or a power cut left behind.
+
+Whole files are kept byte for byte; the others are rewritten from their whole records.
+"""
 
 from __future__ import annotations
 
@@ -28,18 +31,21 @@ class SalvageReport:
     Attributes
     ----------
     kept_messages
-        in the new bag
-    kept_bytes, dropped_bytes
-        of the torn files: their whole records, and what follows them. Of a file that is compressed as a whole: kept
-        when unpacked; how many are dropped is not known (0)
+        messages in the new bag
+    kept_bytes
+        bytes of the whole records of all readable files; of a file that is compressed as a whole (.zstd), unpacked
+    dropped_bytes
+        bytes behind the whole records of torn files, and all bytes of files of which nothing can be read; not exact for
+        a torn .zstd file, of which packed and unpacked bytes are compared
     lost_messages
-        in damaged chunks of files that still say how many they had; what was in a part that is cut off cannot be known
+        messages in damaged chunks of files that still state how many they had; those of a part that is cut off are not
+        known
     damaged_chunks
         chunks in the whole part whose content was lost
     dropped_files
         files of which nothing can be read
     torn
-        what was there instead of the end of the file; None where all ended well
+        what was there instead of the end of each torn file; None where all were whole
     """
 
     kept_messages: int
@@ -51,7 +57,7 @@ class SalvageReport:
     torn: str | None = None
 
     def __add__(self, other: SalvageReport) -> SalvageReport:
-        """Of two files."""
+        """Of two files together."""
         return SalvageReport(
             self.kept_messages + other.kept_messages,
             self.kept_bytes + other.kept_bytes,
@@ -64,7 +70,9 @@ class SalvageReport:
 
 
 def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
-    """Make a bag of a torn .mcap file, or of a directory with such files. The torn one is left as it is.
+    """Make a bag of a torn .mcap file, or of a directory with such files, which are left as they are.
+
+    The new bag appears whole or not at all.
 
     Parameters
     ----------
@@ -73,10 +81,15 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
     out
         directory of the new bag; must not exist
 
+    Returns
+    -------
+    SalvageReport
+        what was kept and what was lost
+
     Raises
     ------
     BagError
-        no message can be read, it is still being recorded, or ``out`` exists or cannot be written
+        no message can be read, the bag is still being recorded, or ``out`` exists or cannot be written
     """
     out = Path(out).absolute()
     _refuse_living(Path(torn))
@@ -108,27 +121,18 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
 
 
 def salvage_in_place(directory: str | Path) -> SalvageReport:
-    """Make the directory of a recording that was cut short a bag.
+    """Make the directory of a recording that was cut short (no metadata.yaml yet) a bag; whole files stay as they are.
 
-    Whole files stay as they are. Each other one is first copied beside itself and replaced only when all copies are
-    written; then comes metadata.yaml. Where this fails, nothing is lost and it can be done again.
-
-    Parameters
-    ----------
-    directory
-        with .mcap files and no metadata.yaml
-
-    Raises
-    ------
-    BagError
-        it is a bag already, is still being recorded, or cannot be read or written
+    Each other file is first copied beside itself and replaced when all copies are written; metadata.yaml comes last. If
+    this fails, nothing is lost and it can be repeated. BagError: a bag already, being recorded, or not readable or
+    writable.
     """
     directory = Path(directory).absolute()
     if (directory / METADATA_FILE).exists():
         raise BagError(f"{directory}: has its {METADATA_FILE}: it is a bag already, nothing to salvage")
     _refuse_living(directory)
     entries, total = _look(bag_files(directory))
-    saved: list[tuple[Path, Path | None, FileCount]] = []  # file, its copy, what is in it
+    saved: list[tuple[Path, Path | None, FileCount]] = []  # file, its copy (None: whole), what is in it
     try:
         for entry in (entry for entry in entries if not entry.problem):
             file = entry.file.path
@@ -162,7 +166,7 @@ def _refuse_living(bag: Path) -> None:
 
 
 def _look(files: Sequence[Path]) -> tuple[list[FileInventory], SalvageReport]:
-    """Read all files, to know what is in them and what is not."""
+    """Read all files: what each holds, and the report of all."""
     entries, total = [], SalvageReport(0, 0, 0)
     for file in files:
         entry = FileInventory(McapFile(file), FileCount(file.name))
@@ -188,7 +192,7 @@ def _report(entry: FileInventory) -> SalvageReport:
 
 
 def _custom(entries: Sequence[FileInventory]) -> dict[str, str]:
-    """Our entries in metadata.yaml: the first of the torn bag's own, and what became of it."""
+    """Our entries in metadata.yaml: the run of the torn bag, if it is known, and that the bag was salvaged."""
     custom = {"complete": "false", "salvaged": "true"}
     for entry in entries:
         for record in entry.file.metadata:
@@ -205,7 +209,7 @@ def _copy(file: Path, copy: Path) -> FileCount:
     with copy.open("wb") as stream:
         writer = Writer(stream, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD)
         batches = source.batches()
-        first = next(batches, None)  # the header has been read now
+        first = next(batches, None)  # reads the header
         writer.start(profile=source.profile or "ros2", library=source.library or "mcap")
         channels = _Channels(writer, source, count)
         for batch in itertools.chain([first] if first else [], batches):

@@ -1,4 +1,7 @@
-"""How an MCAP file describes the network's messages: definitions, type hashes and QoS, in rosbag2's words."""
+"""How an MCAP file describes the network's messages: definitions, type hashes and QoS, as rosbag2 writes them.
+
+Also the names of the recorded topics.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +17,7 @@ _FIELD_OF_OTHER_PACKAGE = re.compile(r"^([a-z][a-z0-9_]*)/(?:msg/)?([A-Z]\w*)", 
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """A message type.
-
-    Attributes
-    ----------
-    package, name
-        of the type
-    type_hash
-        RIHS01 hash of its description (REP-2016), as rosidl writes it to ``share/<package>/msg/<name>.json``
-    """
+    """A message type; its hash is the RIHS01 hash of REP-2016, in rosidl's ``share/<package>/msg/<name>.json``."""
 
     package: str
     name: str
@@ -30,7 +25,7 @@ class MessageType:
 
     @property
     def full_name(self) -> str:
-        """Package/msg/name."""
+        """``package/msg/Name``."""
         return f"{self.package}/msg/{self.name}"
 
     @property
@@ -71,25 +66,15 @@ STRING = MessageType("std_msgs", "String", "RIHS01_df668c740482bbd48fb39d76a70df
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A recorded topic.
+    """A recorded topic."""
 
-    Attributes
-    ----------
-    name
-        absolute
-    type
-        of its messages
-    latched
-        whether who comes late still gets the messages
-    """
-
-    name: str
+    name: str  # absolute
     type: MessageType
-    latched: bool
+    latched: bool  # whether late subscribers still get the messages
 
     @property
     def qos(self) -> list[dict[str, Any]]:
-        """The one profile that its publishers offer, in rosbag2's words: reliable, keep-all, maybe latched."""
+        """The one profile that its publishers offer, as rosbag2 writes it: reliable, keep-all, latched or not."""
         forever = {"sec": 9223372036, "nsec": 854775807}
         return [
             {
@@ -107,16 +92,9 @@ class Topic:
 
 
 def network_topics(agents: int, namespace: str = "", *, truth: bool = False) -> Sequence[Topic]:
-    """What a recorder of the network records: ``experiment``, ``graph``, ``agent_<i>/state``, ``agent_<i>/truth``.
+    """What a recorder records: ``experiment``, ``graph``, ``agent_<i>/state`` and, if ``truth``, ``agent_<i>/truth``.
 
-    Parameters
-    ----------
-    agents
-        their number m
-    namespace
-        of the network, such as ``/lab``; empty for the root
-    truth
-        whether the states are published with noise, and as they are on a topic of their own
+    ``namespace`` is such as ``/lab``; empty for the root. ``truth``: the published states are not the true, whole ones.
     """
     root = "/" + namespace.strip("/") + "/" if namespace.strip("/") else "/"
     return (
@@ -128,26 +106,10 @@ def network_topics(agents: int, namespace: str = "", *, truth: bool = False) -> 
 
 
 def state_topic(root: str, agent: int) -> str:
-    """Topic of the states of an agent (from 1) below a root that ends with a slash.
-
-    Parameters
-    ----------
-    root
-        such as "/" or "/lab/"
-    agent
-        number from 1
-    """
+    """Topic of the states that agent ``agent`` (from 1) publishes; ``root`` ends with a slash: "/" or "/lab/"."""
     return f"{root}agent_{agent}/state"
 
 
 def truth_topic(root: str, agent: int) -> str:
-    """Topic of the states as they are, where others are published, of an agent (from 1) below a root.
-
-    Parameters
-    ----------
-    root
-        such as "/" or "/lab/"
-    agent
-        number from 1
-    """
+    """Topic of the true states, where the published ones differ; arguments as of ``state_topic``."""
     return f"{root}agent_{agent}/truth"

@@ -1,4 +1,7 @@
-"""State messages as columns: where they have the agents' own layout, a batch of them is decoded at once."""
+"""State messages as columns: those in the agents' own layout are decoded a batch at a time.
+
+Other valid layouts (big-endian, with a ``frame_id``) are first encoded again in the agents' own.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from msg_analysis.bags.mcapfile import Batch
 from msg_analysis.model.steptime import SECOND
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
-# An AgentState with empty frame_id, as far as all of them are alike; padding left out.
+# The fixed part of an AgentState with empty frame_id; the gaps between the offsets are padding.
 _HEAD = np.dtype(
     {
         "names": [
@@ -32,27 +35,13 @@ _FIXED_SIZE = 68  # of a message without its ``heard`` and ``state``: the head, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
-    """States in the order of the bag, still in the bytes of their batch: what is asked for is taken out of them.
+    """States in the order of the bag, still in the bytes of their batch, from which the columns are taken on demand."""
 
-    Attributes
-    ----------
-    data
-        bytes in which they are, in the agents' own layout
-    start
-        (messages,) where the CDR bytes of each begin
-    head
-        (messages,) their beginnings
-    replicas
-        (messages,) length of ``state``
-    position
-        (messages,) place in the bag
-    """
-
-    data: bytes
-    start: IntArray
-    head: AnyArray
-    replicas: IntArray
-    position: IntArray
+    data: bytes  # messages in the agents' own layout
+    start: IntArray  # (messages,) offset of the CDR bytes
+    head: AnyArray  # (messages,) of type ``_HEAD``
+    replicas: IntArray  # (messages,) length of ``state``
+    position: IntArray  # (messages,) place among the bag's messages of this kind, from 0
 
     def __len__(self) -> int:
         return len(self.start)
@@ -92,13 +81,7 @@ class States:
         return np.asarray(self.head["heard_count"].astype(np.int64))
 
     def heard(self, most: int) -> AnyArray:
-        """(messages, most) the first entries of ``heard``, uint64; 0 beyond its end.
-
-        Parameters
-        ----------
-        most
-            entries of a message to take
-        """
+        """(messages, most) the first entries of ``heard``, uint64; 0 beyond its end."""
         out = np.zeros((len(self), most), np.uint64)
         length = np.minimum(self.heard_count, most)
         for size in np.unique(length[length > 0]).tolist():
@@ -108,20 +91,14 @@ class States:
         return out
 
     def state(self, width: int) -> FloatArray:
-        """(messages, width) of states that all have this length.
-
-        Parameters
-        ----------
-        width
-            numbers of a state
-        """
+        """(messages, width) of states that all have this length."""
         if not width:
             return np.empty((len(self), 0))
         values = gather(self.data, self.start + _FIXED_SIZE + 8 * self.heard_count, 8 * width).view("<f8")
         return np.asarray(values.reshape(len(self), width), dtype=np.float64)
 
     def alone(self) -> States:
-        """The same with bytes of their own, so that those of the batch can go."""
+        """The same with bytes of their own, so that those of the batch can be freed."""
         size = _FIXED_SIZE + 8 * (self.heard_count + self.replicas)
         ranges = zip(self.start.tolist(), (self.start + size).tolist(), strict=True)
         data = b"".join([self.data[first:end] for first, end in ranges])
@@ -129,33 +106,15 @@ class States:
 
 
 def run_number(run: bytes) -> tuple[int, int]:
-    """The 16 bytes of a run id as the two numbers by which :class:`States` tells runs apart.
-
-    Parameters
-    ----------
-    run
-        16 bytes of a UUID
-    """
+    """The 16 bytes of a run id as two little-endian uint64, by which :class:`States` tells runs apart."""
     first, second = struct.unpack("<QQ", run)
     return first, second
 
 
 def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States, int]:
-    """Take the states out of a batch.
+    """The messages with the indices ``chosen``, (k,), of a batch as states, and how many of them are not an AgentState.
 
-    Parameters
-    ----------
-    batch
-        messages
-    chosen
-        (k,) indices of those that are states
-    position
-        place in the bag of the first of them
-
-    Returns
-    -------
-    tuple[States, int]
-        the states; how many messages are no AgentState
+    ``position`` is the place in the bag of the first of them.
     """
     start, size = batch.start[chosen], batch.size[chosen]
     place = position + np.arange(len(chosen))
@@ -176,7 +135,7 @@ def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States
 
 
 def _fixed(data: bytes, start: IntArray, size: IntArray, position: IntArray) -> tuple[States, BoolArray]:
-    """The messages that have the agents' own layout, and which those are."""
+    """The messages that have the agents' own layout, and (messages,) which ones have it."""
     fixed = size >= _FIXED_SIZE
     long = start if fixed.all() else np.where(fixed, start, 0)
     if len(data) < _FIXED_SIZE:
@@ -194,12 +153,12 @@ def _fixed(data: bytes, start: IntArray, size: IntArray, position: IntArray) -> 
 
 
 def _in_own_layout(data: bytes) -> bytes:
-    """The same message as the agents would have written it; raises CdrError."""
+    """The same message as the agents would have written it; CdrError where it is not an AgentState."""
     message = AgentState.decode(data)
     own = AgentState(
         *(message.stamp, message.run, message.agent, message.step, message.mode, message.state, message.heard)
     )
     try:
-        return own.encode().ljust(_FIXED_SIZE + 8 * len(message.heard), b"\x00")  # nothing follows an empty state
+        return own.encode().ljust(_FIXED_SIZE + 8 * len(message.heard), b"\x00")  # no padding before an empty state
     except struct.error as error:
         raise CdrError("AgentState.header: a time out of range") from error

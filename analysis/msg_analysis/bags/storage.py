@@ -1,4 +1,4 @@
-"""How a bag lies on the disk: compressed or not, in one file or in several."""
+"""How the files of a bag are stored: their compression, and the size after which a new file begins."""
 
 from __future__ import annotations
 
@@ -14,18 +14,10 @@ MEGABYTE = 10**6
 
 @dataclass(frozen=True, slots=True)
 class Storage:
-    """The choices that there are.
-
-    Attributes
-    ----------
-    compression
-        of the chunks of the files
-    split_size
-        bytes of messages after which the bag goes on in a new file; None: one file. A file gets larger by its head, its
-        summary and a chunk
-    """
+    """Compression of the chunks, and when the bag goes on in a new file."""
 
     compression: Compression = "zstd"
+    # Bytes of messages per file; None: one file. A file gets larger by its head, its summary and one chunk.
     split_size: int | None = None
 
     def __post_init__(self) -> None:

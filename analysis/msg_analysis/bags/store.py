@@ -1,4 +1,7 @@
-"""Writes a trajectory as a bag with the topics and the layout of a recorded network run."""
+"""Writes a trajectory as a bag with the topics and the layout of a recorded network run.
+
+States that are missing in the trajectory are missing in the bag.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +24,7 @@ from msg_analysis.types import IntArray
 
 
 def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT) -> None:
-    """Write a bag, whole or not at all.
-
-    Parameters
-    ----------
-    trajectory
-        of the twin, or read from another bag; what is missing in it is missing in the bag
-    directory
-        of the bag; must not exist
-    storage
-        compression and size of its files
-
-    Raises
-    ------
-    BagError
-        the directory exists or cannot be written
-    """
+    """Write a bag, whole or not at all; BagError where the directory exists or cannot be written."""
     directory = Path(directory).absolute()
     if directory.exists():
         raise BagError(f"{directory}: exists already: choose another name, or move it away first")
@@ -44,7 +32,7 @@ def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Sto
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{directory.name}.", dir=directory.parent) as workshop:
-            # The bag gets its own name at once: that of its file derives from it.
+            # It has its final name already: the name of its file derives from it.
             unfinished = Path(workshop) / directory.name
             noisy = trajectory.published is not None
             topics = network_topics(trajectory.record.experiment.agents, truth=noisy)
@@ -99,9 +87,9 @@ def _names(topic: Callable[[str, int], str], agents: int) -> list[str]:
 
 
 def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[int]]:
-    """What an agent says at step k that it heard in the step that led there.
+    """Function of (k, agent from 0) that gives ``heard`` of that state: the steps used in the step that led there.
 
-    Nothing in lockstep where nothing was lost, everything in real time.
+    Empty in lockstep where nothing was lost; complete in real time.
     """
     lost, values = trajectory.lost, trajectory.used
     if lost is None and values is None:

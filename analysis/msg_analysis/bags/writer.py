@@ -1,4 +1,7 @@
-"""Writes a bag that rosbag2, rosbags, Foxglove and PlotJuggler open: a directory with MCAP files."""
+"""Writes a bag that rosbag2, rosbags, Foxglove and PlotJuggler open: a directory with MCAP files.
+
+While it is written, the directory has a locked marker instead of metadata.yaml.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,8 @@ from msg_analysis.bags.schemas import Topic
 from msg_analysis.bags.storage import DEFAULT, Compression, Storage
 from msg_analysis.errors import BagError
 
-# As rosbag2 has it: small enough that a killed recorder loses little, large enough that what readers do once for a
-# chunk does not count. With a third of it, reading takes a fifth longer.
+# As in rosbag2: small enough that a killed recorder loses little, large enough that the readers' work per chunk does
+# not matter. With a third of it, reading takes a fifth longer.
 CHUNK_SIZE = 768 * 1024
 RECORDING_MARKER = ".recording"
 RECORD_NAME = "msg_agents"  # of the MCAP metadata record with the run record
@@ -32,7 +35,7 @@ COMPRESSION_TYPES: dict[Compression, CompressionType] = {
 
 
 class _Channel:
-    """Number of a topic in the current file, its count there, and its messages in the files before."""
+    """Number of a topic in the current file, its count there, and its number of messages in the files before."""
 
     __slots__ = ("before", "count", "id")
 
@@ -41,25 +44,11 @@ class _Channel:
 
 
 class BagWriter:
-    """A bag in the making: its directory has ``.recording`` (locked, with our process id), no metadata.yaml.
+    """A bag being written: its directory has ``.recording`` (locked, with our process id) and no metadata.yaml.
 
-    Parameters
-    ----------
-    directory
-        of the bag; must not exist, or be empty
-    topics
-        what it will hold
-    record
-        the run record as JSON; kept in every file as well, so that a torn bag, or a single file of it, still tells what
-        run it is of
-    storage
-        compression, and whether the bag goes on in a new file when one is large enough. Each file is finished, and on
-        the disk, before the next one begins
-
-    Raises
-    ------
-    BagError
-        the directory exists or cannot be made
+    ``directory`` must not exist, or be empty. The run record (JSON) is kept in every file, so that each one names its
+    run. A file is closed and on the disk before the next begins. BagError, here and in the methods: cannot be written;
+    what was written before stays readable.
     """
 
     def __init__(
@@ -75,7 +64,7 @@ class BagWriter:
             self._custom["run"] = str(json.loads(record).get("run", ""))
         self._closed = False
         try:
-            # It may be there already, empty: whoever starts several runs at once reserves their names that way.
+            # It may be there already, empty: a runner that starts several runs at once reserves their names that way.
             self.directory.mkdir(parents=True, exist_ok=True)
             if any(self.directory.iterdir()):
                 raise FileExistsError
@@ -86,7 +75,7 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"{directory}: cannot be made ({error.strerror}): choose another place") from error
         try:
-            fcntl.flock(self._marker, fcntl.LOCK_EX)  # the system takes it away when this process dies
+            fcntl.flock(self._marker, fcntl.LOCK_EX)  # the system releases it when this process ends
             json.dump({"pid": os.getpid()}, self._marker)
             self._marker.flush()
             self._begin_file()
@@ -99,7 +88,7 @@ class BagWriter:
         return (self.directory / self._file.name).open("xb")
 
     def _begin_file(self) -> None:
-        """All that is needed to read this file without the others."""
+        """Write all that is needed to read this file without the others."""
         chunk_size = min(CHUNK_SIZE, self._split_size or CHUNK_SIZE)
         self._mcap = Writer(self._stream, chunk_size=chunk_size, compression=self._compression)
         self._mcap.start(profile="ros2", library="mcap")
@@ -113,7 +102,7 @@ class BagWriter:
                 schemas[kind] = self._mcap.register_schema(kind, "ros2msg", topic.type.schema.encode())
             self._add_channel(topic, schemas[kind])
         self._mcap.flush()
-        # What stands at the head is not counted: it may be larger than the limit, and every file has it.
+        # The head is not counted: it may be larger than the limit, and every file has it.
         self._full = None if self._split_size is None else self._stream.tell() + self._split_size
 
     def _add_channel(self, topic: Topic, schema: int) -> None:
@@ -137,22 +126,7 @@ class BagWriter:
         self._begin_file()
 
     def write(self, topic: str, data: bytes, time_ns: int) -> None:
-        """Append one message.
-
-        Parameters
-        ----------
-        topic
-            absolute name of one of the bag's topics
-        data
-            the message as CDR, with its encapsulation header
-        time_ns
-            simulated time [ns]; :func:`msg_analysis.bags.cdr.stamp_ns` takes it from the message's header
-
-        Raises
-        ------
-        BagError
-            the disk is full or the bag is closed; what was written before stays readable
-        """
+        """Append a message (CDR with encapsulation header) to a topic, by absolute name, at a simulated time [ns]."""
         channel = self._channels.get(topic)
         if channel is None or self._closed:
             reason = "is closed" if self._closed else f"has no topic {topic}"
@@ -178,30 +152,16 @@ class BagWriter:
         return sum(file.messages for file in self._files)
 
     def flush(self) -> None:
-        """Hand everything so far to the operating system, so that it survives the end of this process.
-
-        Raises
-        ------
-        BagError
-            the disk is full
-        """
+        """Hand everything so far to the operating system, so that it survives the end of this process."""
         try:
             self._mcap.flush()
         except OSError as error:
             raise self._failed(error) from error
 
     def close(self, complete: bool = True) -> None:
-        """Finish the file, write metadata.yaml, remove the marker. Calling it again does nothing.
+        """Finish the file, write metadata.yaml, remove the marker; ``complete``: whether the end of the run was seen.
 
-        Parameters
-        ----------
-        complete
-            whether the recorder saw the end of the run
-
-        Raises
-        ------
-        BagError
-            the disk is full; the marker stays and the file can be salvaged
+        Calling it again does nothing. If the disk is full, the marker stays and the bag can be salvaged.
         """
         if self._closed:
             return
@@ -222,7 +182,7 @@ class BagWriter:
     def _failed(self, error: OSError) -> BagError:
         self._closed = True
         for stream in (self._stream, self._marker):
-            with contextlib.suppress(OSError):  # closing tries to write what could not be written
+            with contextlib.suppress(OSError):  # closing tries again to write what is left
                 stream.close()
         return BagError(
             f"{self.directory}: cannot be written ({error.strerror or error}): free some space or choose "
@@ -239,13 +199,7 @@ class BagWriter:
 
 
 def recording_pid(directory: Path) -> int | None:
-    """Process that is writing this bag; None where nobody is (any more).
-
-    Parameters
-    ----------
-    directory
-        of a bag
-    """
+    """Process that is writing this bag; None where none is: the lock of the marker ends with its process."""
     try:
         with (directory / RECORDING_MARKER).open(encoding="utf-8") as marker:
             try:

@@ -1,4 +1,7 @@
-"""Conducting a sweep: what is there already is kept, the rest is done, and all of it is judged together."""
+"""Conducting a sweep: outcomes that are there are kept, the other jobs are done, and all are judged together.
+
+``workers`` decides where a job runs, ``point`` what is done in it.
+"""
 
 from __future__ import annotations
 
@@ -18,70 +21,34 @@ from msg_analysis.sweep.store import Store
 from msg_analysis.sweep.workers import Lost, Workers
 
 OtherSoftware = Literal["refuse", "redo", "keep"]
-NETWORK_PATIENCE = 60.0
-"""Seconds that running networks have to end in order."""
+NETWORK_PATIENCE = 60.0  # s that running networks have to end in order
 
-Watch = Callable[[int, int, int], None]
-"""Told of progress: outcomes that are there, of how many, and how many of them failed."""
+Watch = Callable[[int, int, int], None]  # progress: outcomes that are there, of how many, how many of them failed
 
 
 @dataclass(frozen=True, slots=True)
 class Conducted:
-    """What was done.
+    """What was done."""
 
-    Attributes
-    ----------
-    outcomes
-        in the order of the jobs
-    kept
-        how many of the jobs had been done before
-    others
-        outcomes in the same directory that are of none of the jobs
-    """
-
-    outcomes: tuple[Outcome, ...]
-    kept: int
-    others: int
+    outcomes: tuple[Outcome, ...]  # in the order of the jobs
+    kept: int  # jobs that had been done before
+    others: int  # outcomes in the store that belong to none of the jobs
 
 
 def conduct(
-    jobs: Sequence[Job],
+    jobs: Sequence[Job],  # equal ones are done once
     store: Store,
     *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    network: NetworkOptions | None = None,
-    other_software: OtherSoftware = "refuse",
-    retry: bool = False,
+    workers: int | None = None,  # processes here; None: one per CPU, or a single one where networks run
+    scheduler: str | None = None,  # of a Dask cluster, whose workers are used instead
+    network: NetworkOptions | None = None,  # needed where jobs run networks
+    other_software: OtherSoftware = "refuse",  # what to do with outcomes that other software made
+    retry: bool = False,  # whether failed jobs are done again
     watch: Watch = lambda _done, _total, _failed: None,
 ) -> Conducted:
-    """Do all jobs that have not been done.
+    """Do all jobs that have not been done; outcomes are kept in ``store`` as soon as they come.
 
-    Parameters
-    ----------
-    jobs
-        Sequence[Job] what to do; what is there twice is done once
-    store
-        where outcomes are kept, and taken from
-    workers
-        processes of this machine; by default as many as it has CPUs, or one where networks run
-    scheduler
-        of a Dask cluster, whose workers are used instead
-    network
-        needed where jobs run networks
-    other_software
-        what becomes of outcomes that other software made: "refuse" to go on, "redo" or "keep" them
-    retry
-        whether what has failed is tried again
-    watch
-        told of progress
-
-    Raises
-    ------
-    InputError
-        outcomes of other software, or the workers cannot be had
-    WorkersLostError
-        the cluster went away; what was done is kept
+    InputError: outcomes of other software ("refuse"), or no workers. WorkersLostError: the cluster went away.
     """
     todo = _todo(jobs, store, other_software, retry)
     kept = len(jobs) - sum(job.id in todo for job in jobs)
@@ -131,38 +98,22 @@ def _lost(job: Job, lost: Lost) -> Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What the runs of a sweep say together.
+    """What the runs of a sweep say together; the tuples are in the order of the outcomes."""
 
-    Attributes
-    ----------
-    p_holm
-        of every outcome: its p-value, adjusted over all of them (Holm); None where it has none
-    verdicts
-        of every outcome: "agrees", "disagrees", "unpredicted"; None for predictions and what failed
-    verdict
-        "agrees"; "disagrees" if any does; "incomplete" if none does and something failed; None for predictions
-    """
-
-    p_holm: tuple[float | None, ...]
-    verdicts: tuple[str | None, ...]
+    p_holm: tuple[float | None, ...]  # p-values, adjusted over all of them (Holm); None where there is none
+    verdicts: tuple[str | None, ...]  # "agrees", "disagrees", "unpredicted"; None for predictions and failures
+    # "disagrees" if any run does; else "incomplete" if anything failed; else "agrees", or None for predictions. Runs
+    # that are all "unpredicted" count as "agrees".
     verdict: str | None
 
     @property
     def exit_code(self) -> int:
-        """0 fine, 1 disagrees, 3 something failed."""
+        """0 agrees or only predictions, 1 disagrees, 3 something failed."""
         return {"disagrees": 1, "incomplete": 3}.get(self.verdict or "", 0)
 
 
 def judge(outcomes: Sequence[Outcome], level: float) -> Judgement:
-    """Hold all runs together against their predictions: a false "disagrees" anywhere has at most this chance.
-
-    Parameters
-    ----------
-    outcomes
-        Sequence[Outcome] of predictions or runs
-    level
-        the chance
-    """
+    """Judge all runs together (Holm): the chance of any false "disagrees" is at most ``level``."""
     p_values: list[float | None] = [outcome.result.get("p") if outcome.status == DONE else None for outcome in outcomes]
     tested = [place for place, p in enumerate(p_values) if p is not None]
     adjusted: list[float | None] = [None] * len(outcomes)

@@ -1,4 +1,7 @@
-"""Dotted keys: a place in a document, and what stands there."""
+"""Dotted keys: places in the document of an experiment.
+
+Names are joined by dots, places in lists stand in brackets and count from 1: ``noise.process[3]``.
+"""
 
 from __future__ import annotations
 
@@ -16,22 +19,9 @@ class KeyProblemError(Exception):
 
 
 def put(document: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """A copy of a document with another value at a place; only what leads there is copied.
+    """A copy of a document with another value at a place; only the containers on the way are copied.
 
-    Parameters
-    ----------
-    document
-        of an experiment
-    key
-        names joined by dots, places in lists in brackets, from 1: ``noise.process[3]``. Names that are in the document
-        may have dots in them. Sections that are not there yet are made
-    value
-        what shall stand there
-
-    Raises
-    ------
-    KeyProblemError
-        the key does not lead anywhere
+    Names in the document may have dots in them; missing sections are made. KeyProblemError: the key leads nowhere.
     """
     parts = _split(key)
     changed = dict(document)
@@ -76,7 +66,7 @@ def _put(here: Any, parts: list[str | int], value: Any, key: str, path: str) -> 
 
 
 def _name(here: Any, parts: list[str | int]) -> tuple[str | int, int]:
-    """The next name and how many parts make it: as many as make a name that is there."""
+    """The next name and how many parts it takes: a name that is there may have dots."""
     if isinstance(parts[0], str) and isinstance(here, dict) and parts[0] not in here:
         name = parts[0]
         for count, part in enumerate(parts[1:], start=2):

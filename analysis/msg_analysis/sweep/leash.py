@@ -1,6 +1,6 @@
-"""Becomes another program, which is told to end when the process that started it has ended: PID COMMAND...
+"""Replaces itself by a command that gets SIGTERM when its parent process has ended. Arguments: PARENT_PID COMMAND...
 
-Linux only; elsewhere the program is started all the same.
+The signal is Linux only (PR_SET_PDEATHSIG); elsewhere the command runs without it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Set the leash, and become the program."""
+    """Ask for the signal, and become the command."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM))
     if os.getppid() != int(sys.argv[1]):  # it has ended already

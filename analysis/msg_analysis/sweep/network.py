@@ -1,6 +1,6 @@
-"""Runs of networks for a sweep: ``msg-agents run`` as a process of its own, one at a time on a machine.
+"""Runs of networks for a sweep: ``msg-agents run`` as a process of its own, a limited number at a time on a machine.
 
-Nothing of ROS is imported: a worker that makes predictions does without, and so does one whose networks run.
+Nothing of ROS is imported here: only the process that is started needs it.
 """
 
 from __future__ import annotations
@@ -24,19 +24,13 @@ from msg_analysis.sweep.point import Job, NetworkOptions, NetworkStoppedError
 
 PROGRAM = "msg-agents"
 POLL = 0.1  # s
+# Signals, and the seconds that a run then has to end: it ends its own processes in order.
 ESCALATION = ((signal.SIGINT, 30.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 5.0))
-"""Signals and the seconds that a run has to obey each: it ends its own processes in order."""
 _LEASH = Path(__file__).with_name("leash.py")
 
 
 def find_program() -> str:
-    """Path of ``msg-agents``: beside this Python, else on the path.
-
-    Raises
-    ------
-    InputError
-        it is not installed, or does not start
-    """
+    """Path of ``msg-agents``, beside this Python or else on PATH; InputError where it or its rclpy is missing."""
     beside = Path(sys.executable).with_name(PROGRAM)
     found = str(beside) if beside.is_file() else shutil.which(PROGRAM)
     remedy = "install the package msg_agents and ROS 2 (or simulate with the offline twin instead)"
@@ -51,59 +45,28 @@ def find_program() -> str:
 
 
 def options(directory: Path, keep: bool, at_once: int) -> NetworkOptions:
-    """How the networks of a sweep are run.
-
-    Parameters
-    ----------
-    directory
-        of the sweep; bags go to ``runs`` in it
-    keep
-        whether all bags are kept, or only those of runs that do not agree with their prediction
-    at_once
-        networks at a time on a machine
-
-    Raises
-    ------
-    InputError
-        see ``find_program``
-    """
+    """How the networks of a sweep in ``directory`` are run; errors as of ``find_program``."""
     return NetworkOptions(find_program(), str(directory.absolute() / "runs"), keep, at_once)
 
 
 def _interpreter(program: Path) -> str | None:
-    """The Python in the first line of a script."""
+    """The Python in the first line of a script; None where there is none."""
     with program.open("rb") as file:
         line = file.readline(1000).decode(errors="replace").strip()
     return line[2:] if line.startswith("#!/") and "python" in line and " " not in line else None
 
 
 def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
-    """Run a network and read its result.
+    """Run a network and read its result, the document of ``msg-agents run --json``.
 
-    Parameters
-    ----------
-    job
-        with the options for networks
-    stopping
-        Callable[[], bool] whether to end it
-
-    Returns
-    -------
-    Mapping[str, Any]
-        The document of ``msg-agents run --json``.
-
-    Raises
-    ------
-    InputError
-        it could not be run; the text is what it said
-    NetworkStoppedError
-        it was ended
+    InputError has the last line that a failed run wrote to stderr. NetworkStoppedError: ``stopping`` was true, it was
+    ended.
     """
     options = job.network
     assert options is not None
     directory = Path(options.directory) / job.id
     with _slot(options.at_once, stopping) as slot:
-        shutil.rmtree(directory, ignore_errors=True)  # of a run whose worker was killed
+        shutil.rmtree(directory, ignore_errors=True)  # left by a run whose worker was killed
         directory.mkdir(parents=True)
         file = directory / "experiment.json"
         file.write_text(job.document, encoding="utf-8")
@@ -125,11 +88,11 @@ def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
 def _run(
     options: NetworkOptions, file: Path, directory: Path, slot: int, stopping: Callable[[], bool]
 ) -> tuple[dict[str, Any] | None, str, int]:
-    """Its result, what it said on stderr, and its exit code."""
+    """Its result (None: not JSON), what it wrote to stderr, and its exit code."""
     command = [options.program, "run", str(file), "--out", str(directory), "--json"]
     with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
-        # In a session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The
-        # slot is its own, too: should this worker be killed, the next network waits until this one has ended.
+        # A session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The slot is
+        # inherited: if this worker is killed, the next network waits until this one has ended.
         process = subprocess.Popen(
             [sys.executable, str(_LEASH), str(os.getpid()), *command],
             stdin=subprocess.DEVNULL,
@@ -168,14 +131,9 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 @contextmanager
 def _slot(at_once: int, stopping: Callable[[], bool]) -> Iterator[int]:
-    """Hold one of so many places for networks on this machine; waits until one is free.
+    """Hold one of ``at_once`` places for networks of this user on this machine; waits until one is free.
 
-    The system frees the place when all who hold it have ended, however they end.
-
-    Raises
-    ------
-    NetworkStoppedError
-        the sweep was ended before
+    A place is a locked file, inherited by the network: it is free when all processes that hold it have ended.
     """
     while True:
         for number in range(at_once):

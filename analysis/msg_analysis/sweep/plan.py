@@ -1,4 +1,7 @@
-"""From a sweep file to its points: every one of them a valid experiment before anything is computed."""
+"""From a sweep file to its points: every one of them is a valid experiment before anything is computed.
+
+All mistakes are reported together, each once, with the points that have it.
+"""
 
 from __future__ import annotations
 
@@ -20,55 +23,29 @@ from msg_analysis.sweep.point import Job
 from msg_analysis.sweep.spec import MOST_POINTS, Kind, SweepSpec
 
 SEED = "run.seed"
-_NAMED = 3
-"""Points that a complaint names."""
+_NAMED = 3  # points that a problem names
 
-Checked = Callable[[int, int], None]
-"""Told how many of how many points have been checked."""
+Checked = Callable[[int, int], None]  # progress: how many combinations of how many have been checked
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One run, or one prediction.
+    """One run, or one prediction."""
 
-    Attributes
-    ----------
-    values
-        of the swept keys
-    repetition
-        which run at these values, from 0; None for predictions
-    seed
-        of the run; None for predictions
-    job
-        what is to be done
-    """
-
-    values: Mapping[str, Any]
-    repetition: int | None
-    seed: int | None
+    values: Mapping[str, Any]  # of the swept keys
+    repetition: int | None  # from 0; None for predictions
+    seed: int | None  # None for predictions
     job: Job
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """A sweep whose points are all valid.
+    """A sweep whose points are all valid."""
 
-    Attributes
-    ----------
-    name
-        of the file, without its ending
-    spec
-        the file
-    experiment
-        name of the experiment
-    points
-        in the order of the file: the first key changes slowest, repetitions fastest
-    """
-
-    name: str
+    name: str  # of the file, without its ending
     spec: SweepSpec
-    experiment: str
-    points: tuple[Point, ...]
+    experiment: str  # name of the experiment
+    points: tuple[Point, ...]  # in the order of the file: first key slowest, repetitions fastest
 
     @property
     def kind(self) -> Kind:
@@ -82,21 +59,9 @@ class Sweep:
 
 
 def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) -> Sweep:
-    """Read a sweep file and check every point of it.
+    """Read a sweep file (YAML; JSON is YAML too) and check every point of it.
 
-    Parameters
-    ----------
-    path
-        the file (YAML; JSON is YAML too)
-    checked
-        told of progress
-
-    Raises
-    ------
-    InputError
-        the file, or that of the experiment, cannot be read
-    ExperimentError
-        names every mistake, and the points that have it
+    InputError: it, or the file of the experiment, cannot be read. ExperimentError: all mistakes, with their points.
     """
     path = Path(path)
     mapping = read_yaml(path)
@@ -124,7 +89,7 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
 
 
 def _spec_problems(spec: SweepSpec) -> list[str]:
-    """What several keys of the sweep file say together."""
+    """Mistakes in several keys of the sweep file together."""
     found = []
     lengths = {key: len(values) for key, values in spec.over.items()}
     if spec.combine == "zip" and len(set(lengths.values())) > 1:
@@ -151,7 +116,7 @@ def _combinations(spec: SweepSpec) -> Iterator[dict[str, Any]]:
 
 def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
     combinations = list(_combinations(spec))
-    wrong: dict[str, list[int]] = {}  # line: combinations that it is about
+    wrong: dict[str, list[int]] = {}  # line: indices of the combinations that have it
     points: list[Point] = []
     name = ""
     for number, values in enumerate(combinations):
@@ -190,39 +155,18 @@ def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: Experiment) ->
 
 
 def own_seed(seed: int, values: Mapping[str, Any], repetition: int) -> int:
-    """A seed for one run of many: it depends on nothing else, so that it stays when other points come or go.
-
-    Parameters
-    ----------
-    seed
-        of the experiment
-    values
-        of the swept keys
-    repetition
-        from 0
-
-    Returns
-    -------
-    int
-        below 2**32
-    """
+    """Seed below 2**32 of one run; it depends on the arguments only, so it stays when other points come or go."""
     text = json.dumps([seed, dict(values), repetition], sort_keys=True)
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big")
 
 
 def label(values: Mapping[str, Any]) -> str:
-    """A point in words: the swept keys and their values.
-
-    Parameters
-    ----------
-    values
-        of the keys
-    """
+    """A point in words: the swept keys and their values."""
     return ", ".join(f"{key} = {show(value)}" for key, value in values.items())
 
 
 def _grouped(wrong: Mapping[str, Sequence[int]], combinations: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Each complaint once, with the points that it is about."""
+    """Each problem once, with the points that have it."""
     lines = []
     for line, numbers in wrong.items():
         if len(numbers) == len(combinations) > 1:

@@ -1,4 +1,7 @@
-"""One point of a sweep: what is done there, and what is kept of it. This is what runs on the workers."""
+"""One point of a sweep: what is done there, and what is kept of it. This is what runs on the workers.
+
+Theory, twin and statistics are imported only in the jobs that need them.
+"""
 
 from __future__ import annotations
 
@@ -19,120 +22,56 @@ _LAWS = ("continuous", "emulated", "discrete")
 
 
 class NetworkStoppedError(Exception):
-    """A run was ended because the sweep was: it is no result."""
+    """A run was ended because the sweep was: it has no result."""
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkOptions:
-    """How runs of networks are made.
+    """How runs of networks are made."""
 
-    Attributes
-    ----------
-    program
-        msg-agents
-    directory
-        where the bags are made
-    keep
-        whether bags are kept of runs that agree with the prediction, too
-    at_once
-        most networks of sweeps at a time on one machine
-    """
-
-    program: str
-    directory: str
-    keep: bool = False
-    at_once: int = 1
+    program: str  # path of msg-agents
+    directory: str  # where the bags are made
+    keep: bool = False  # also keep bags of runs that agree with the prediction
+    at_once: int = 1  # most networks at a time, of all sweeps of this user on one machine
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Something to be done, self-contained: a worker needs no file for it.
+    """One thing to do, self-contained: a worker needs no file for it."""
 
-    Attributes
-    ----------
-    id
-        the same for the same thing to be done
-    kind
-        what
-    document
-        the experiment, as JSON
-    level
-        of the comparison
-    network
-        how runs of networks are made
-    """
-
-    id: str
+    id: str  # hash of kind, document and, of runs, level
     kind: Kind
-    document: str
-    level: float
+    document: str  # the experiment, as JSON
+    level: float  # of the tests of a run
     network: NetworkOptions | None = field(default=None, compare=False)
 
     @classmethod
     def of(cls, kind: Kind, document: Mapping[str, Any], level: float = 0.01) -> Self:
-        """The job for an experiment.
-
-        Parameters
-        ----------
-        kind
-            what is to be done with it
-        document
-            the experiment, as in its file
-        level
-            of the tests of a run
-        """
+        """The job for an experiment, a document as in its file; ``level`` of the tests of a run."""
         text = json.dumps(document)
         what = json.dumps([kind, None if kind == "predict" else level, document], sort_keys=True)
-        # The order of the graphs is that of the modes.
+        # The order of the graphs, which sort_keys hides, is that of the modes.
         what += json.dumps(list(document["graphs"]))
         return cls(hashlib.sha256(what.encode()).hexdigest()[:20], kind, text, level)
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a job.
+    """What came of a job."""
 
-    Attributes
-    ----------
-    id
-        of the job
-    status
-        ``DONE`` or ``FAILED``
-    reason
-        why it failed; None where it did not
-    result
-        what is kept: a document; empty where it failed
-    seconds
-        that it took [s]
-    place
-        host and process that did it
-    software
-        that it was done with
-    """
-
-    id: str
-    status: str
-    reason: str | None
-    result: Mapping[str, Any]
-    seconds: float
-    place: str
-    software: str
+    id: str  # of the job
+    status: str  # ``DONE`` or ``FAILED``
+    reason: str | None  # why it failed
+    result: Mapping[str, Any]  # what is kept, also of an incomplete run; empty where it failed otherwise
+    seconds: float  # wall time [s]
+    place: str  # host:process id
+    software: str  # see ``software.installed``
 
 
 def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
-    """Do it. What is wrong with this point becomes a failed outcome, so that the others go on.
+    """Do a job. An error becomes a failed outcome, so that the other points go on.
 
-    Parameters
-    ----------
-    job
-        what to do
-    stopping
-        Callable[[], bool] whether the sweep is being ended; asked while a network runs
-
-    Raises
-    ------
-    NetworkStoppedError
-        the sweep has been ended
+    ``stopping`` is asked while a network runs; if the sweep is being ended, NetworkStoppedError is raised.
     """
     from msg_analysis.sweep.software import installed
 
@@ -149,7 +88,7 @@ def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
         raise
     except MemoryError:
         reason = "out of memory"
-    except Exception as error:  # a defect: of this point only, as far as anybody can tell
+    except Exception as error:  # a defect, perhaps of this point only
         reason = f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - begin
     place = f"{socket.gethostname()}:{os.getpid()}"
@@ -175,13 +114,7 @@ def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
 
 
 def of_prediction(document: Mapping[str, Any]) -> dict[str, Any]:
-    """What is kept of a prediction: the errors under every law, without the matrices.
-
-    Parameters
-    ----------
-    document
-        as ``predict --json`` prints it
-    """
+    """What is kept of a prediction, as ``predict --json`` prints it: the errors under every law, without matrices."""
     keys = ("system_error", "system_certainty", "node_errors")
     laws = {law: document[law] for law in (*_LAWS, "static") if document.get(law)}
     kept: dict[str, Any] = {law: {key: found[key] for key in keys} for law, found in laws.items()}
@@ -189,14 +122,9 @@ def of_prediction(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def of_comparison(document: Mapping[str, Any]) -> dict[str, Any]:
-    """What is kept of a comparison: the errors, and the least p-value of the family, which stands for the whole run.
+    """What is kept of a comparison, as ``compare --json`` prints it: the errors and the least p-value of its tests.
 
-    As the p-values are adjusted, the least one is a p-value of "the run follows its law" itself.
-
-    Parameters
-    ----------
-    document
-        as ``compare --json`` prints it
+    As the p-values are adjusted, the least one is a p-value of the hypothesis that the run follows its law.
     """
     tests = document.get("tests") or []
     least = min(tests, key=lambda test: test["p_adjusted"], default=None)

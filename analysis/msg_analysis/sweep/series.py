@@ -1,4 +1,7 @@
-"""What a figure of a sweep shows: one column of its table over a swept key, for each value of the others."""
+"""What a figure of a sweep shows: one column of its table over a swept key, for each value of the other keys.
+
+Repetitions are taken together: the mean, and the 95 % interval of the mean.
+"""
 
 from __future__ import annotations
 
@@ -13,91 +16,44 @@ from msg_analysis.sweep.plan import Sweep
 from msg_analysis.sweep.table import Row, column_names
 
 DEFAULT = "system_error"
-HALF = 1.959963984540054
-"""Standard errors on each side of a 95 % interval."""
+HALF = 1.959963984540054  # standard errors on each side of a 95 % interval
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The rows of one combination of values, repetitions taken together.
+    """The rows of one combination of values, repetitions taken together."""
 
-    Attributes
-    ----------
-    x
-        value of the key along the axis
-    value
-        mean over the repetitions; None where there is none
-    low, high
-        95 % interval of a measured value, else None
-    predicted
-        mean of the exact expectations of what is measured, else None
-    reference
-        the same in continuous time, of a predicted value, else None
-    """
-
-    x: Any
-    value: float | None
-    low: float | None
+    x: Any  # value of the key along the axis
+    value: float | None  # mean over the repetitions
+    low: float | None  # 95 % interval of a measured value
     high: float | None
-    predicted: float | None
-    reference: float | None
+    predicted: float | None  # mean of the exact expectations of what is measured
+    reference: float | None  # of a predicted value: the same in continuous time
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Places along the axis.
+    """Places along the axis."""
 
-    Attributes
-    ----------
-    label
-        values of the other keys, in words; empty where there are none
-    places
-        in the order of the axis
-    """
-
-    label: str
-    places: tuple[Place, ...]
+    label: str  # values of the other keys, in words; empty where there are none
+    places: tuple[Place, ...]  # in the order of the axis
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What is drawn.
+    """What is drawn."""
 
-    Attributes
-    ----------
-    x, y
-        the key along the axis, and the column
-    logarithmic
-        whether the axis is
-    measured
-        whether there are intervals
-    series
-        one for each combination of values of the other keys
-    """
-
-    x: str
-    y: str
-    logarithmic: bool
-    measured: bool
-    series: tuple[Series, ...]
+    x: str  # the key along the axis
+    y: str  # the column
+    logarithmic: bool  # the axis of x
+    measured: bool  # whether there are intervals
+    series: tuple[Series, ...]  # one for each combination of values of the other keys
 
 
 def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None) -> Picture:
-    """Choose what to draw.
+    """Choose what to draw of ``rows_of``; InputError where there is no such column of numbers.
 
-    Parameters
-    ----------
-    sweep
-        whose rows these are
-    rows
-        Sequence[Row] of ``rows_of``
-    column
-        a column of numbers, or the beginning of one: ``system_error`` stands for what is measured or predicted of it
-
-    Raises
-    ------
-    InputError
-        there is no such column
+    ``column`` may be the beginning of a name: ``system_error`` stands for what is measured or predicted of it.
     """
     wanted = column or DEFAULT
     names = _columns(rows, wanted)
@@ -120,13 +76,7 @@ def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None) -> Pic
 
 
 def value_text(value: Any) -> str:
-    """A value of a key for a table or a label: numbers with six digits.
-
-    Parameters
-    ----------
-    value
-        as in an experiment file
-    """
+    """A value of a key for a table or a label: numbers with six digits."""
     return f"{value:.6g}" if isinstance(value, float) else show(value)
 
 
@@ -151,7 +101,7 @@ def _numeric(rows: Sequence[Row], name: str) -> bool:
 
 
 def _offer(rows: Sequence[Row]) -> str:
-    """Names of columns, those of all agents but the first left out."""
+    """Names of columns of numbers; those of agents other than the first are left out."""
     short = {name.removesuffix(".measured") for name in column_names(rows) if _numeric(rows, name)}
     return ", ".join(sorted(name for name in short if "[" not in name or "[1]" in name))
 
@@ -180,7 +130,7 @@ def _mean(rows: Sequence[Row], name: str | None) -> float | None:
 
 
 def _logarithmic(sweep: Sweep, along: str) -> bool:
-    """As the file says; else where the values are so far apart that most would lie on top of each other."""
+    """As the file says; else whether all values are numbers > 0 that span a factor of 50 or more."""
     axis = sweep.spec.over[along]
     if axis.logarithmic is not None:
         return axis.logarithmic

@@ -18,13 +18,7 @@ _LIBRARIES = ("distributed", "pyarrow")
 
 
 def require_libraries() -> None:
-    """Refuse to begin without the libraries that only sweeps need: a system's packages may not have them.
-
-    Raises
-    ------
-    InputError
-        names those that are missing
-    """
+    """InputError that names the libraries that only sweeps need and that are not installed."""
     missing = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(
@@ -34,9 +28,9 @@ def require_libraries() -> None:
 
 @functools.cache
 def installed() -> str:
-    """Versions of all that a result depends on, in one line.
+    """Versions of msg_analysis, numpy and scipy in one line, with a digest of the code that results depend on.
 
-    Two installations say the same only where the code of the law, the theory and the statistics is the same.
+    The digest covers ``model``, ``theory``, ``inference``, the twin and ``sweep/point.py``.
     """
     source = Path(msg_analysis.__file__).parent
     files = [file for room in _ROOMS for file in (source / room).glob("*.*") if file.suffix in (".py", ".c")]

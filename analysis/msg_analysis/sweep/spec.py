@@ -12,23 +12,16 @@ from msg_analysis.model.spec import Count, expected, is_number
 
 Kind = Literal["predict", "simulate", "network"]
 
-MOST_POINTS = 20_000
-"""Most points of a sweep: the experiments of all are held in memory."""
+MOST_POINTS = 20_000  # of a sweep: the experiments of all are held in memory
 
 _KEYS = {"values", "from", "to", "count", "step", "spacing"}
 _FORMS = "a list of values, {from, to, count}, {from, to, count, spacing: log} or {from, to, step}"
 
 
 class Axis(list[Any]):
-    """The values of a key, in order.
+    """The values of a key, in order."""
 
-    Attributes
-    ----------
-    logarithmic
-        whether they are spaced so, which a figure then follows; None: not said
-    """
-
-    logarithmic: bool | None = None
+    logarithmic: bool | None = None  # spacing, which a figure then follows; None: not stated
 
 
 def _axis(value: object) -> Axis:
@@ -74,7 +67,7 @@ def _range(first: float, last: float, value: dict[str, Any]) -> Axis:
         numbers = first + float(value["step"]) * np.arange(count)
     else:
         numbers = np.linspace(first, last, count)
-    # Without the last digits, which would be rounding: 0.30000000000000004.
+    # Without the last digits, which are rounding: 0.30000000000000004.
     axis = Axis(float(f"{number:.12g}") for number in numbers)
     if whole and spacing == "linear" and all(number.is_integer() for number in axis):
         axis = Axis(int(number) for number in axis)

@@ -1,4 +1,4 @@
-"""What has been done, on disk: one line for each outcome, appended as soon as it is there."""
+"""Outcomes on disk: one line of JSON for each, appended and synchronised as soon as it is there."""
 
 from __future__ import annotations
 
@@ -20,36 +20,18 @@ _FIELDS = {field.name for field in fields(Outcome)}
 
 @dataclass(slots=True)
 class Store:
-    """The outcomes in a directory; one process at a time writes there.
-
-    Attributes
-    ----------
-    directory
-        made where it does not exist
-    outcomes
-        by id of the job; the last one of each
-    damaged
-        lines that could not be read: what they held is done again
-    """
+    """The outcomes in a directory; a lock lets one process at a time write there."""
 
     directory: Path
-    outcomes: dict[str, Outcome]
-    damaged: int
+    outcomes: dict[str, Outcome]  # by id of the job; the last one of each
+    damaged: int  # lines that could not be read: their jobs are done again
     _descriptor: int
 
     @classmethod
     def open(cls, directory: str | Path) -> Self:
-        """Open a directory, and read what is there.
+        """Open a directory, made if needed, and read its outcomes.
 
-        Parameters
-        ----------
-        directory
-            where
-
-        Raises
-        ------
-        InputError
-            another process writes there, or the directory cannot be used
+        InputError: another process writes there, or the directory cannot be used.
         """
         directory = Path(directory)
         path = directory / JOURNAL
@@ -71,19 +53,13 @@ class Store:
         except OSError:
             os.close(descriptor)
             raise
-        # A line without an end was being written when a sweep was killed.
+        # A last line without its end was being written when a sweep was killed: drop it.
         os.truncate(descriptor, whole)
         os.lseek(descriptor, 0, os.SEEK_END)
         return cls(directory, outcomes, damaged, descriptor)
 
     def add(self, outcomes: Iterable[Outcome]) -> None:
-        """Keep outcomes: when this returns, they are on the disk.
-
-        Parameters
-        ----------
-        outcomes
-            of points, each once
-        """
+        """Keep outcomes: when this returns, they are on the disk."""
         lines = b""
         for outcome in outcomes:
             self.outcomes[outcome.id] = outcome
@@ -94,7 +70,7 @@ class Store:
         os.fsync(self._descriptor)
 
     def close(self) -> None:
-        """Let others write there."""
+        """Release the lock."""
         os.close(self._descriptor)
 
     def __enter__(self) -> Self:
@@ -107,7 +83,7 @@ class Store:
 
 
 def _read(path: Path) -> tuple[dict[str, Outcome], int, int]:
-    """Outcomes, lines that are none, and bytes up to the end of the last whole line."""
+    """Outcomes, number of lines that are none, and bytes up to the end of the last whole line."""
     content = path.read_bytes()
     whole = content.rfind(b"\n") + 1
     outcomes: dict[str, Outcome] = {}

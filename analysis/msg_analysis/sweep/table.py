@@ -22,14 +22,9 @@ _ESTIMATE = ("measured", "predicted", "standard_error", "z", "p", "p_holm")
 
 
 def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], judgement: Judgement) -> list[Row]:
-    """One row for each point, by name of the column; a column that a row does not have is empty there.
+    """One row for each point, by name of the column; what a row does not have is empty there.
 
-    Parameters
-    ----------
-    sweep
-        the points
-    outcomes, judgement
-        of each of them
+    Columns that are empty in all rows are left out, except ``reason`` and the swept keys.
     """
     rows = []
     for number, (point, outcome) in enumerate(zip(sweep.points, outcomes, strict=True)):
@@ -51,7 +46,7 @@ def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], judgement: Judgement) -> 
 
 
 def _columns(name: str, value: Any) -> Row:
-    """Columns of one key of a result: those of an estimate, or of a law, or of each agent."""
+    """Columns of one key of a result: of an estimate, of a law, or of each agent (from 1)."""
     if isinstance(value, list):
         return {
             column: entry
@@ -70,24 +65,12 @@ def _columns(name: str, value: Any) -> Row:
 
 
 def column_names(rows: Sequence[Row]) -> list[str]:
-    """Of all rows, in the order in which they come first.
-
-    Parameters
-    ----------
-    rows
-        of the table
-    """
+    """Of all rows, in the order in which they first appear."""
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
 def arrow_table(rows: Sequence[Row]) -> pa.Table:
-    """The table: numbers where all of a column are numbers, else texts; what is no scalar is JSON.
-
-    Parameters
-    ----------
-    rows
-        of the table
-    """
+    """The table: booleans or numbers where all of a column are, else texts; values that are not text become JSON."""
     import pyarrow as pa
 
     columns = {}
@@ -112,14 +95,7 @@ def _text(value: Any) -> str:
 def write_tables(rows: Sequence[Row], document: Mapping[str, Any], directory: Path) -> list[Path]:
     """Write ``results.parquet``, ``results.csv`` and ``results.json``, each whole or not at all.
 
-    Parameters
-    ----------
-    rows
-        of ``rows_of``
-    document
-        the JSON document; its numbers are finite or None
-    directory
-        where
+    The numbers of ``document``, which is written as JSON, must be finite.
     """
     import pyarrow.csv
     import pyarrow.parquet

@@ -1,4 +1,7 @@
-"""Processors for many like things: processes of this machine, or a Dask cluster. Whoever dies is replaced."""
+"""Worker pool: processes of this machine, or a Dask cluster; a worker that dies is replaced.
+
+Items are sent in batches of about half a second of work. What kills workers is tried again alone, then given up.
+"""
 
 from __future__ import annotations
 
@@ -27,45 +30,32 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R")
 
-BATCH_SECONDS = 0.5
-"""Work of a task: next to it, the few milliseconds that Dask needs for each count little."""
-
+BATCH_SECONDS = 0.5  # s of work per task, next to which the few milliseconds that Dask needs for it do not matter
 MOST_IN_BATCH = 500
-QUEUED = 2
-"""Tasks at a time for each thread of the workers: one that it works on, one that is there when it has finished."""
-
-NOTICE = 0.5
-"""Seconds between two questions of a worker whether the work is being ended."""
-
+QUEUED = 2  # tasks sent per thread of the workers: one that is worked on, one that is ready after it
+NOTICE = 0.5  # s between two checks of a worker whether the work is being ended
+# Signals that end a sweep as Ctrl-C does: that of a cluster's queue, and that of a terminal that is closed.
 ENDING = (signal.SIGTERM, signal.SIGHUP)
-"""Signals that end a sweep as Ctrl-C does: of a cluster's queue, and of a terminal that goes."""
 _CONNECT = 10.0  # s
+# Less of what Dask does besides the work, which costs time on two cores.
 _QUIET = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.interval": "10s",
     "distributed.admin.tick.interval": "1s",
 }
-"""What Dask does besides the work, which on two cores takes from it."""
-
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _NEEDED = ("msg_analysis.theory.prediction", "msg_analysis.inference.compare", "msg_analysis.twin")
 
+# What is done with an item; the second argument says whether the work is being ended.
 Function = Callable[[T, Callable[[], bool]], R]
-"""What is done with an item: it is also given a function that says whether the work is being ended."""
 
 
 class WorkersLostError(Exception):
-    """The cluster went away in the middle."""
+    """The cluster went away in the middle of the work."""
 
 
 class Lost:
-    """In place of a result: the item killed every worker that tried it.
-
-    Parameters
-    ----------
-    reason
-        what is known of that, for people
-    """
+    """In place of a result: the item killed every worker that tried it; ``reason`` is a text for the user."""
 
     def __init__(self, reason: str) -> None:
         self.reason = reason
@@ -77,7 +67,7 @@ def available() -> int:
 
 
 def warm_up() -> None:
-    """Begin to start what worker processes are forked from, so that it imports while this process does other things.
+    """Begin to start the server that workers are forked from: it imports while this process does other things.
 
     It ignores Ctrl-C, and so do the workers: this process ends them.
     """
@@ -91,14 +81,9 @@ def warm_up() -> None:
 
 
 class Workers:
-    """Worker processes of this machine, or those of a cluster; to be used with ``with``.
+    """Worker processes of this machine (None: one per CPU), or those of the Dask scheduler at an address.
 
-    Parameters
-    ----------
-    count
-        processes of this machine; by default as many as there are CPUs
-    scheduler
-        address of a Dask scheduler; its workers are used instead
+    To be used with ``with``, which raises InputError where no scheduler answers or its workers have other software.
     """
 
     def __init__(self, count: int | None = None, scheduler: str | None = None) -> None:
@@ -109,20 +94,14 @@ class Workers:
         self._stop_name = f"msg-sweep-stop-{uuid.uuid4().hex}"
 
     def __enter__(self) -> Self:
-        """Start or find the workers.
-
-        Raises
-        ------
-        InputError
-            there is no scheduler at the address, or its workers have other software
-        """
+        """Start or find the workers."""
         import dask
 
         if not self._scheduler:
             warm_up()
         import distributed
 
-        # What it has to say concerns us, and we tell it to the user in our words.
+        # Silence its logs: what matters to the user is raised as an error here.
         for name in list(logging.root.manager.loggerDict):
             if name.partition(".")[0] == "distributed":
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -160,7 +139,7 @@ class Workers:
         self._close()
 
     def _close(self) -> None:
-        # Whoever presses Ctrl-C again while this ends everything in order would get in the way of it.
+        # A second Ctrl-C must not interrupt the orderly end.
         with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
             if self._client is not None:
                 self._client.close(timeout=5)
@@ -169,32 +148,19 @@ class Workers:
 
     @property
     def threads(self) -> int:
-        """Things that can be done at a time now; 0 where there is no worker yet."""
+        """Items that can be worked on at a time now; 0 where a cluster has no worker yet."""
         assert self._client is not None
         return sum(self._client.nthreads().values()) if self._scheduler else self._count
 
     def outcomes(
         self, function: Function[T, R], items: Sequence[T], *, patience: float = 2 * NOTICE
     ) -> Generator[list[tuple[T, R | Lost]], None, None]:
-        """Do something with every item; the results come in batches, in the order in which they are ready.
+        """Do something with every item, by a function at the top of a module that the workers can import.
 
-        If a worker dies, what it was doing is done by another one; what kills three of them is given up.
-
-        Parameters
-        ----------
-        function
-            Function[T, R] at the top of a module that the workers can import
-        items
-            Sequence[T] what it is called with
-        patience
-            seconds that running work has to end when this is interrupted; then its processes are killed
-
-        Raises
-        ------
-        WorkersLostError
-            the scheduler has gone
-        InputError
-            a worker cannot do it, because it has other software
+        Results come in batches, as they are ready. A batch whose workers died more often than Dask allows (3 times by
+        default) is tried again item by item; an item that kills its workers again is ``Lost``. If this is interrupted,
+        running work has ``patience`` seconds to end. WorkersLostError: the scheduler has gone; InputError: other
+        software on a worker.
         """
         from distributed import as_completed
 
@@ -238,7 +204,7 @@ class Workers:
     def _result(self, future: Future) -> tuple[list[Any], float] | None:
         """Results of a batch and the seconds that it took; None where workers died over and over.
 
-        One of the items in it may have killed them, or one that a worker had at the same time: each is tried alone.
+        An item of it may have killed them, or one that a worker had at the same time: each is then tried alone.
         """
         from distributed import KilledWorker
 
@@ -256,10 +222,10 @@ class Workers:
             raise error
         if self._client.status != "running":
             raise WorkersLostError("the scheduler has gone")
-        return None  # the only worker that had the result has died
+        return None  # the only worker that had the result died
 
     def _stop(self, running: Sequence[Future], patience: float) -> None:
-        """Drop what has not begun, and have what runs end in order."""
+        """Tell the workers to stop, and wait up to ``patience`` seconds for the running batches."""
         from distributed import Event, wait
 
         with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
@@ -268,7 +234,7 @@ class Workers:
             wait(running, timeout=patience)
 
     def _compare_software(self) -> None:
-        """Refuse workers with other software; those that come later refuse themselves."""
+        """Refuse workers with other software; those that join later refuse themselves in ``_do``."""
         assert self._client is not None
         try:
             found = self._client.run(installed)
@@ -285,14 +251,14 @@ class Workers:
 
 
 def _take(pending: deque[T], seconds: float, threads: int) -> list[T]:
-    """As many items as make a batch, fewer towards the end, so that all workers end together."""
+    """As many items as make a batch; fewer towards the end, so that all workers end together."""
     most = 1 if math.isinf(seconds) else int(BATCH_SECONDS / max(seconds, 1e-9))
     most = max(1, min(most, MOST_IN_BATCH, len(pending) // (QUEUED * max(threads, 1))))
     return [pending.popleft() for _ in range(most)]
 
 
 def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: str) -> tuple[list[R], float]:
-    """On a worker: do a batch; one thread of linear algebra, since there is a worker for every CPU."""
+    """On a worker: do a batch, and time it [s]; one thread of linear algebra, since there is a worker for every CPU."""
     from threadpoolctl import threadpool_limits
 
     if installed() != software:
@@ -313,7 +279,7 @@ class EndedError(Exception):
 
 
 class _Stopping:
-    """Whether whoever gave us the work wants it to end; if the scheduler has gone, nobody wants it any more."""
+    """Whether the work is to end; asks the scheduler every ``NOTICE`` seconds, and is true if that has gone."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -334,7 +300,7 @@ class _Stopping:
 
 @contextmanager
 def _ignoring(*numbers: signal.Signals) -> Iterator[None]:
-    """Ignore signals for a while, where this is the main thread: processes that are started meanwhile always do."""
+    """Ignore signals for a while, if this is the main thread; processes started meanwhile ignore them for good."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -348,7 +314,7 @@ def _ignoring(*numbers: signal.Signals) -> Iterator[None]:
 
 @contextmanager
 def _deferring_interrupts() -> Iterator[None]:
-    """What is done in here is done as a whole: signals that end a program count when it is over."""
+    """Postpone signals that end the program until the block is done; then the first one is raised."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
