@@ -1,8 +1,8 @@
-"""Networks of agents under Markov-switching graphs, as ROS 2 nodes.
+"""ROS 2 networks of agents under Markov-switching graphs.
 
     from msg_agents import run_network
 
-What can be imported from here is that of ``msg_agents.runner``, and is imported when it is first asked for.
+The public names are those of ``msg_agents.runner``, which is imported at their first use.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 try:
     __version__ = version("msg_agents")
-except PackageNotFoundError:  # run from a source tree that nobody installed
+except PackageNotFoundError:  # run from a source tree, not installed
     __version__ = "0.0.0"
 
 __all__ = ["RunResult", "conclude", "run_network"]

@@ -1,4 +1,4 @@
-"""What a process of the network tells the one that started it, in a file: what was refused, who waits for what."""
+"""Account files, in which the processes of a run report refused messages and what their nodes wait for."""
 
 from __future__ import annotations
 
@@ -15,21 +15,13 @@ Refused = tuple[str, str, str, int]  # node, topic, reason, count
 
 @dataclass(slots=True)
 class Account:
-    """Of all processes of a run.
+    """Sum of the account files of a run."""
 
-    Attributes
-    ----------
-    refused
-        messages that nodes did not take, counted by (node, topic, reason)
-    waiting
-        for what those nodes wait that cannot go on, by node
-    """
-
-    refused: Counter[tuple[str, str, str]] = field(default_factory=Counter)
-    waiting: dict[str, str] = field(default_factory=dict)
+    refused: Counter[tuple[str, str, str]] = field(default_factory=Counter)  # by (node, topic, reason)
+    waiting: dict[str, str] = field(default_factory=dict)  # by node, what it waits for; only nodes that wait
 
     def strangers(self) -> list[dict[str, Any]]:
-        """The list of ``result.json``: who refused what on which topic, why, and how often."""
+        """Key ``strangers`` of result.json: refused messages by node, topic and reason, with their counts."""
         return [
             {"node": node, "topic": topic, "reason": reason, "count": count}
             for (node, topic, reason), count in sorted(self.refused.items())
@@ -37,17 +29,7 @@ class Account:
 
 
 def write_account(path: Path, refused: Sequence[Refused], waiting: Mapping[str, str]) -> None:
-    """Replace the account of one process. That it cannot be written (full disk) is no reason to fail.
-
-    Parameters
-    ----------
-    path
-        of the file
-    refused
-        messages that were refused
-    waiting
-        name of a node, and what it waits for
-    """
+    """Replace the account file of one process atomically; an error such as a full disk is ignored."""
     with contextlib.suppress(OSError):
         temporary = path.with_suffix(".part")
         temporary.write_text(json.dumps({"refused": refused, "waiting": waiting}), encoding="utf-8")
@@ -55,13 +37,7 @@ def write_account(path: Path, refused: Sequence[Refused], waiting: Mapping[str, 
 
 
 def read_accounts(paths: Iterable[Path]) -> Account:
-    """Sum of the accounts of processes, in the order of their start, those that were killed included.
-
-    Parameters
-    ----------
-    paths
-        of the files; those that are not there are left out
-    """
+    """Add up account files, given in the order of the starts; missing or damaged files are left out."""
     account = Account()
     waiting: dict[str, str] = {}
     for path in paths:
@@ -69,6 +45,6 @@ def read_accounts(paths: Iterable[Path]) -> Account:
             document = json.loads(path.read_text(encoding="utf-8"))
             for *what, count in document["refused"]:
                 account.refused[tuple(what)] += count
-            waiting |= document["waiting"]  # later processes know better; "" for who does not wait
+            waiting |= document["waiting"]  # later processes are more recent; "": does not wait
     account.waiting = {node: message for node, message in waiting.items() if message}
     return account

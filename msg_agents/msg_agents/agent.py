@@ -1,4 +1,4 @@
-"""The agent node: one row of the MJLS on topics. What differs by pace is in ``lockstep`` and ``realtime``."""
+"""The agent node: one row of the MJLS on topics. ``lockstep`` and ``realtime`` hold what depends on the pace."""
 
 from __future__ import annotations
 
@@ -29,29 +29,10 @@ NOT_FINITE = "not finite"
 
 
 class Agent(NetworkNode):
-    """Moves numbers between topics and the law; when it makes a step, and with what, is a matter of its pace.
+    """Connects topics and law; the subclass for the pace decides when to step and with which inputs.
 
-    Others hear ``state``. Where that is not the whole truth, because of broadcast noise or a protocol that keeps
-    something to itself, the truth goes to ``truth``, for the log.
-
-    Parameters
-    ----------
-    record
-        of the run
-    model
-        its step model, or wiring
-    agent
-        index from 0
-    peers
-        every other agent that it hears or is heard by, ascending
-    colleagues
-        the agents of its process, itself included
-    readers
-        names of the nodes, besides the other agents, that must read the states before the run starts
-    checkpoints
-        directory that keeps what it has published, from which it goes on if it has been there before
-    group
-        to which it belongs
+    Other agents read ``state``. Where that is not the exact state (broadcast noise, or a protocol that publishes only a
+    part of it), the exact one is published on ``truth``, for the log and the live node.
     """
 
     def __init__(
@@ -59,11 +40,11 @@ class Agent(NetworkNode):
         *,
         record: RunRecord,
         model: Wiring,
-        agent: int,
-        peers: Sequence[int],
-        colleagues: Collection[int],
-        readers: Sequence[str],
-        checkpoints: Path | None,
+        agent: int,  # index from 0
+        peers: Sequence[int],  # every other agent that it hears or is heard by at any time, ascending
+        colleagues: Collection[int],  # agents of its process, itself included
+        readers: Sequence[str],  # other nodes that must read the states before the run starts
+        checkpoints: Path | None,  # directory of the published states, from which it resumes after a restart
         group: AgentGroup,
     ) -> None:
         super().__init__(agent_name(agent), record=record)
@@ -88,28 +69,16 @@ class Agent(NetworkNode):
         self._truth: Publisher | None = None
         if experiment.truth:
             self._truth = self.create_publisher(AgentStateMsg, truth_topic(agent), STREAM)
-            self._awaits_truth = [name for name in readers if name == RECORDER]  # others may do with what all hear
+            self._awaits_truth = [name for name in readers if name == RECORDER]  # others need only what agents hear
 
     def meet(self, colleagues: Mapping[int, Agent]) -> None:
-        """Hand the state directly to the agents of the same process, by index; hear those of others on topics.
-
-        Parameters
-        ----------
-        colleagues
-            agents of this process by index from 0, itself included
-        """
+        """Connect to the peers: agents of this process (by index) by direct calls, the others by topics."""
         self._listeners = [colleagues[j].hear for j in self._near]
         for j in self._far:
             self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), STREAM, raw=True)
 
     def host(self, agents: Sequence[Agent]) -> None:
-        """Have what the agents of a process need once: asked of the first of them.
-
-        Parameters
-        ----------
-        agents
-            of this process
-        """
+        """Create what a process needs only once. Called on its first agent, with all its agents."""
 
     def found(self) -> bool:
         """See NetworkNode."""
@@ -125,13 +94,13 @@ class Agent(NetworkNode):
         return missing
 
     def finish(self, *, complete: bool, deadline: float) -> None:
-        """See NetworkNode. Who belongs to the run has said that it has all; of others nobody knows."""
+        """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""
         for writer in (self._states, self._truth):
             if complete and writer is not None and self.has_guests(writer):
                 writer.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
 
     def begin(self) -> None:
-        """Publish x(0), or, after another process, all that may have been under way when that one went."""
+        """Publish x(0); after a takeover, repeat all states that are kept and ask the peers to repeat theirs."""
         if self._published.found:
             self._repeat(0)
             self._ask_again()
@@ -140,7 +109,7 @@ class Agent(NetworkNode):
         self._report()
 
     def _take_over(self) -> bytes | None:
-        """Go on where a process before this one has been, if there was one: the last that it published."""
+        """Resume from the last state that an earlier process published; its message, or None without one."""
         published = self._published.read()
         if published:
             step, message = published[-1]
@@ -161,7 +130,7 @@ class Agent(NetworkNode):
         self._send(law.step, law.state, message)
 
     def _send(self, step: int, state: bytes, message: bytes) -> None:
-        """Send a state: as it is, for the log, and as others hear it."""
+        """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it."""
         if self._truth is not None:
             self.publish(self._truth, message)
             whole, state = state, self._law.published(step, state)
@@ -171,52 +140,30 @@ class Agent(NetworkNode):
             hear(self._law.agent, step, state)
 
     def send_again(self, since: int) -> None:
-        """Somebody may have missed what was sent from a step on.
-
-        Parameters
-        ----------
-        since
-            first step that is wanted
-        """
+        """Repeat the states from step ``since`` on, for a reader that may have missed them."""
         self._repeat(since)
 
     def _repeat(self, since: int) -> None:
-        """Send what was sent from a step on, as far as it is kept: the truth, from which follows what others hear."""
+        """Repeat the kept states from step ``since`` on; what others hear is derived from the exact states."""
         for step, message in self._published.read(since):
             frame = self._whole.unwrap(message)
             assert frame is not None, "of our own making"
             self._send(step, frame[3], message)
 
     def _ask_again(self) -> None:
-        """Ask every peer of another process for what may have been missed of it."""
+        """Ask the peers in other processes for states that may have been missed."""
         raise NotImplementedError
 
     def _receiver(self, peer: int) -> Callable[[bytes], None]:
-        """The callback for one peer's states: this is the hot path."""
+        """The callback for a peer's states (hot path)."""
         raise NotImplementedError
 
     def hear(self, peer: int, step: int, value: Any) -> None:
-        """Take x_peer(step) from an agent of the same process.
-
-        Parameters
-        ----------
-        peer
-            index from 0
-        step
-            k
-        value
-            x_peer(k), as the law takes it
-        """
+        """Take x_peer(step) by a direct call from an agent of the same process (index from 0)."""
         raise NotImplementedError
 
     def learn(self, graph: ActiveGraph) -> str | None:
-        """Take note of a sojourn; None, or why not.
-
-        Parameters
-        ----------
-        graph
-            of this run
-        """
+        """Take note of a sojourn of the graph; the reason if it is refused, else None."""
         raise NotImplementedError
 
     def _report(self) -> None:

@@ -1,4 +1,4 @@
-"""Who reads what a player publishes: it begins when they are there."""
+"""Waits for the readers of a player's topics."""
 
 from __future__ import annotations
 
@@ -11,59 +11,33 @@ from rclpy.publisher import Publisher
 
 from msg_analysis.errors import InputError
 
-SETTLED = 0.8  # s in which nobody new is found: then those who are there already have been
-SETTLE_LIMIT = 5.0  # s for which to look for more
-SAID = 2.0  # s after which it is said who is waited for
-AWAKE = 1.0  # s between two looks, of which more do not count: then this process was stopped
+SETTLED = 0.8  # s without a change in the readers, after which discovery counts as finished
+SETTLE_LIMIT = 5.0  # s after which it counts as finished in any case
+SAID = 2.0  # s after which a note says what is missing
+AWAKE = 1.0  # s; a longer gap between two looks counts as this much: the process was stopped
 
 
 class Audience:
-    """The readers of the topics of a player.
-
-    Parameters
-    ----------
-    node
-        whose topics they are
-    writers
-        publishers of the topics
-    latched
-        keys of those that need not be waited for: who reads them gets all of them, however late
-    subscribers
-        how many readers every topic must have
-    readers
-        names of nodes that must read every topic
-    timeout
-        s to wait for them
-    """
+    """The readers of a player's topics. Latched topics are not waited for, unless all are latched."""
 
     def __init__(
         self,
         node: Node,
         writers: Mapping[str, Publisher],
-        latched: Iterable[str],
+        latched: Iterable[str],  # keys of ``writers``
         *,
-        subscribers: int,
-        readers: Sequence[str],
-        timeout: float,
+        subscribers: int,  # readers that every awaited topic must have
+        readers: Sequence[str],  # names of nodes that must read every awaited topic
+        timeout: float,  # s
     ) -> None:
         self._node, self._subscribers, self._readers, self._timeout = node, subscribers, readers, timeout
         self._writers = list(writers.values())
         self._awaited = [writers[name] for name in sorted(writers.keys() - set(latched) or writers.keys())]
 
     def wait(self, pause: Callable[[], None], on_note: Callable[[str], None]) -> None:
-        """Until those who must be there are, and in any case until those who are there already have been found.
+        """Wait for the required readers, and in any case until no more readers are being discovered.
 
-        Parameters
-        ----------
-        pause
-            takes some time, between two looks
-        on_note
-            told whom it waits for
-
-        Raises
-        ------
-        InputError
-            somebody did not come
+        ``pause`` takes some time between two looks. InputError: required readers are missing after the timeout.
         """
         looked = time.monotonic()
         waited = changed = 0.0
@@ -93,7 +67,7 @@ class Audience:
             on_note(f"somebody else publishes too: {', '.join(others)}")
 
     def _missing(self) -> list[str]:
-        """What is missing to begin, in words."""
+        """Unmet requirements in words."""
         few, without = [], dict[str, list[str]]()
         for writer in self._awaited:
             count = writer.get_subscription_count()

@@ -1,4 +1,4 @@
-"""Message types of the topics of a bag, as they are installed here."""
+"""Message types of a bag's topics, as they are installed here."""
 
 from __future__ import annotations
 
@@ -14,38 +14,15 @@ from msg_analysis.errors import InputError
 
 
 def message_class(type_name: str) -> Any:
-    """Class of a message type, ``package/msg/Name``.
-
-    Parameters
-    ----------
-    type_name
-        such as std_msgs/msg/String
-
-    Raises
-    ------
-    ImportError, AttributeError, ValueError
-        there is none of this name here
-    """
+    """Class of a type such as std_msgs/msg/String; ImportError, AttributeError or ValueError without one."""
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 
 def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Callable[[str], None]) -> dict[str, Any]:
-    """Message classes of the topics that can be played, by name.
+    """Message classes by topic name, without the topics that cannot be played; a note names those.
 
-    Parameters
-    ----------
-    topics
-        of the bag
-    all_wanted
-        whether somebody asked for just these, so that none may be left out
-    on_note
-        told which are left out
-
-    Raises
-    ------
-    InputError
-        one cannot be played that must be, or none can
+    InputError: none can be played, or not all where ``all_wanted`` says that the user chose these topics.
     """
     found, unplayable = {}, []
     for topic in topics:
@@ -64,22 +41,7 @@ def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Ca
 
 
 def check_definitions(node: Node, writers: Mapping[str, Publisher], topics: Mapping[str, BagTopic]) -> None:
-    """Recorded bytes mean something else under another definition of a type of that name.
-
-    Parameters
-    ----------
-    node
-        that publishes
-    writers
-        its publishers, by name of the topic in the bag
-    topics
-        of the bag, by name
-
-    Raises
-    ------
-    InputError
-        a topic was recorded with another definition
-    """
+    """InputError if a topic was recorded with another definition of its type: its bytes mean something else."""
     for name, publisher in writers.items():
         recorded = topics[name].type_hash
         ours = {

@@ -1,4 +1,4 @@
-"""Does a bag hold, to the last bit, what the law and the seed say?"""
+"""The bit-for-bit check: whether a bag holds exactly what the law and the seed give."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """What came of it.
+    """Result of ``check``.
 
     Attributes
     ----------
     compared
-        states that were there to compare
+        states that were compared; where the run logs both exact and published states, both count
     missing
-        states that were not
+        states that could not be compared: not in the bag or, in real time, without all their inputs
     difference
-        the first one in words (steps first, then agents from 1), or None
+        the first difference in words (lowest step, then lowest agent; agents from 1), or None
     """
 
     compared: int
@@ -35,25 +35,25 @@ class Check:
 
 
 def check(trajectory: Trajectory) -> Check:
-    """Compute a run again with the offline twin and compare every state and every graph.
+    """Compute a run again with the offline twin, and compare every state, lost message and graph bit for bit.
 
-    Of a run in lockstep the twin needs the seed only. In real time it also takes from the log what every agent used in
-    every step, and the stamps must allow for that: nothing is used before it was made.
+    In lockstep the twin needs only the run record. In real time it also takes from the log which values every agent
+    used in every step, and no value may be used before it was made, according to the stamps.
 
     Parameters
     ----------
     trajectory
-        of the bag
+        the run, as read from its bag
 
     Raises
     ------
     NotAvailableError
-        the run was not of a kind that the twin repeats
+        the twin cannot repeat a run of this kind
     """
     if trajectory.record.experiment.run.pace == "realtime":
         return _check_realtime(trajectory)
     twin = simulate(trajectory.record.experiment, record=trajectory.record)
-    # What is there at step k comes out of the graph and the losses of the steps before. First come, first named.
+    # The states of step k follow from graphs and losses of earlier steps: the earliest difference is the cause.
     found = [
         _first_state(trajectory, trajectory.states, twin.states, "logged"),
         _first_state(trajectory, trajectory.published, twin.published, "published"),
@@ -77,7 +77,7 @@ def _check_realtime(trajectory: Trajectory) -> Check:
 
 
 def _earliest(found: Sequence[tuple[float, str] | None]) -> str | None:
-    """Of differences with their steps, the first one in words."""
+    """The earliest of some (step, words), without the step."""
     differences = [difference for difference in found if difference is not None]
     return min(differences, key=lambda difference: difference[0])[1] if differences else None
 
@@ -93,13 +93,13 @@ def _first_graph(trajectory: Trajectory, modes: IntArray) -> tuple[float, str] |
 
 
 def _first_early_use(trajectory: Trajectory) -> tuple[float, str] | None:
-    """A value that went into a state which was made before it, or at the same time."""
+    """The first value that was used in a state made before it, or at the same time."""
     used, made, modes = trajectory.used, trajectory.made, trajectory.agent_modes
     assert used is not None
     assert made is not None
     assert modes is not None
     model = trajectory.record.step_model
-    # Where a state is missing, and with it its graph, these are those of some graph: nothing was used there.
+    # Where a state is missing its mode is -1, which picks the last graph: harmless, since ``used`` is -1 there too.
     sender = neighbour_tables(model).senders[modes[1:], np.arange(model.agents)]
     early = (used >= 0) & (made[1:] >= 0)[:, :, None] & (made[used, sender] >= made[1:, :, None])
 
@@ -115,7 +115,7 @@ def _first_early_use(trajectory: Trajectory) -> tuple[float, str] | None:
 
 
 def _first(wrong: BoolArray, describe: Callable[..., str]) -> tuple[float, str] | None:
-    """When the first of some things was wrong (steps come first), and a description of it; None if none is."""
+    """Step (first index) and description of the first True entry; None if there is none."""
     if not wrong.any():
         return None
     where = [int(i) for i in np.argwhere(wrong)[0]]
@@ -146,7 +146,7 @@ def _first_loss(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] |
     if trajectory.lost is None or twin.lost is None or trajectory.agent_modes is None:
         return None
     model = trajectory.record.model
-    # Of states that are there, and came out of the right graph: without it the neighbours are others.
+    # Only states that are there and used the right graph: under another one the neighbours differ.
     comparable = trajectory.agent_modes[1:] == twin.modes[:, None]
     logged, law = trajectory.lost, twin.lost
 
@@ -158,6 +158,6 @@ def _first_loss(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] |
             f"{words[int(logged[step, agent, which])]}, the seed gives {words[int(law[step, agent, which])]}"
         )
 
-    # The step has used its graph by then; the states that come out of it are of the next one.
+    # After the graph of this step, before the states of the next one.
     found = _first(comparable[:, :, None] & (logged != law), describe)
     return found and (found[0] + 0.5, found[1])

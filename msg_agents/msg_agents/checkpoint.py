@@ -1,7 +1,7 @@
 """The last states that an agent has published, in a file that outlives its process.
 
-Every state is written before it is published. Whoever takes over from a killed process finds there how far it came, and
-can publish again what was still on its way; and any agent can send again what a peer that comes back has missed.
+Every state is written before it is published. A process that takes over from a killed one resumes from there, and
+publishes again what may have been lost on the way. Any agent can also repeat what a restarted peer has missed.
 """
 
 from __future__ import annotations
@@ -16,56 +16,30 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.record import RunRecord
 
 MOST, LEAST, ROOM = AGAIN, 256, 1 << 24
-"""States kept of each agent: as many as find room [bytes], between these. More than the 5,000 that a reader may be
-behind (what the middleware keeps of a writer), where that is possible; and always more than agents may be apart."""
+"""States kept of each agent: as many as fit into ROOM bytes, between LEAST and MOST. Where possible, more than the
+5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
 
-# Length of the message, and step + 1, written after it: 0 or an older step's mark until it is whole.
+# Length of the message and step + 1, written after the message: 0 or the mark of an older step until it is whole.
 MARK = struct.Struct("<QQ")
 
 
 def longest_heard(record: RunRecord) -> int:
-    """Most steps that ``heard`` of a state message can list in a run.
-
-    Parameters
-    ----------
-    record
-        of the run
-    """
+    """The largest length that ``heard`` of a state message can have in a run."""
     experiment = record.experiment
     return experiment.agents - 1 if experiment.noise.loss or experiment.run.pace == "realtime" else 0
 
 
 def room_for(size: int) -> int:
-    """Bytes of the file of an agent whose longest message has so many.
-
-    Parameters
-    ----------
-    size
-        of the message, in bytes
-    """
+    """Size of the checkpoint file of an agent whose longest message has ``size`` bytes."""
     slot = size + MARK.size
     return slot * max(LEAST, min(MOST, ROOM // slot))
 
 
 class Checkpoint:
-    """A ring of messages in a memory-mapped file. Survives its process, not its machine.
+    """A ring of messages in a memory-mapped file, which survives its process, but not its machine.
 
-    Parameters
-    ----------
-    path
-        of the file; made if there is none. None: in memory, for this process only
-    size
-        bytes of the longest message
-
-    Attributes
-    ----------
-    found
-        whether the file was there: some process has been here before
-
-    Raises
-    ------
-    InputError
-        the file is there and of another size, or there is no room for it
+    ``found``: the file was there, so another process has run this agent before. ``size`` is that of the longest message
+    in bytes. Without a path it is in memory, for this process only. InputError: a file of another size, or no room.
     """
 
     def __init__(self, path: Path | None, size: int) -> None:
@@ -85,7 +59,7 @@ class Checkpoint:
                     f"{path}: {found} bytes, expected {total}: it is of another run: remove it, or name another place"
                 )
             self.found = bool(found)
-            # All of it now: a disk that is full later would kill whoever writes to the map.
+            # Allocate all of it now: if the disk were full later, writing to the map would kill the process.
             os.posix_fallocate(descriptor, 0, total)
             self._map = mmap.mmap(descriptor, total)
         except OSError as error:
@@ -97,28 +71,15 @@ class Checkpoint:
             os.close(descriptor)
 
     def write(self, step: int, message: bytes) -> None:
-        """Keep the message of a step; steps must come one after the other.
-
-        Parameters
-        ----------
-        step
-            k
-        message
-            CDR bytes of the state
-        """
+        """Keep the message (CDR) of a step; steps must be consecutive."""
         start = step % self._capacity * self._slot
         self._map[start : start + len(message)] = message
         MARK.pack_into(self._map, start + self._size, len(message), step + 1)
 
     def read(self, first: int = 0) -> list[tuple[int, bytes]]:
-        """(step, message) of the newest unbroken row of steps, from a first one on, ascending.
+        """(step, message) of the newest consecutive steps, ascending, from step ``first`` on.
 
         The slot after the newest is left out: it may be torn.
-
-        Parameters
-        ----------
-        first
-            least step that is wanted
         """
         marks = [MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self._capacity)]
         newest = max(mark for _, mark in marks) - 1

@@ -1,7 +1,7 @@
 """The command line ``msg-agents``.
 
-Results go to stdout, everything else to stderr. Exit codes: 0 fine or agrees, 1 disagrees, 2 bad usage or input,
-3 data incomplete. What takes long to import is imported by the command that needs it.
+Results go to stdout, everything else to stderr. Exit codes: 0 success or agreement, 1 disagreement, 2 bad usage or
+input, 3 incomplete data. Modules that take long to import are imported by the commands that need them.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def run(
 
 
 def _end(result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
-    """Say what failed, judge what was recorded, show the result, and leave with the exit code."""
+    """Print the failures, judge what was recorded, show the result, and exit with its code."""
     from msg_agents.runner import conclude
 
     for line in result.failures:
@@ -175,7 +175,7 @@ def _end(result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None]
 
 
 def _ending(result: RunResult) -> dict[str, Any]:
-    """The end of a run, for who watches it."""
+    """Text and verdict of the end of a run, for the live page."""
     if result.failures:
         return {"text": f"The run has ended early: {result.failures[0]}", "verdict": "incomplete"}
     if result.comparison is None:
@@ -191,10 +191,10 @@ def _ending(result: RunResult) -> dict[str, Any]:
 
 
 def _show(result: RunResult, as_json: bool) -> None:
-    """The result on stdout, and as result.json beside the bag."""
+    """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
     from msg_agents.runner import REPORT_FILE, RESULT_FILE
 
-    document: dict[str, Any] = {"verdict": "incomplete" if result.failures else None}  # None: nothing was to be judged
+    document: dict[str, Any] = {"verdict": "incomplete" if result.failures else None}  # None: nothing to judge
     if result.comparison is not None:
         document = dict(result.comparison.to_json())
     document |= {

@@ -1,4 +1,4 @@
-"""Commands of ``msg-agents`` that are one process of a network: ``agent``, ``switcher`` and ``recorder``."""
+"""Commands of ``msg-agents`` that run one process of a network: ``agent``, ``switcher`` and ``recorder``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ use_sim_time = click.option(
 
 
 def _node_options(command: Callable[..., None]) -> Callable[..., None]:
-    """What the commands of single nodes have in common."""
+    """Add the options that the commands of single nodes share."""
     for option in (
         click.argument("run_record", type=RUN_RECORD),
         click.option(
@@ -89,10 +89,10 @@ _checkpoint = click.option(
 
 
 def _agents_of_record(context: click.Context, _option: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """The agents of the run record that is on the command line already."""
+    """Shell completion: the agents of the run record on the command line."""
     try:
         agents = len(json.loads(Path(context.params["run_record"]).read_text(encoding="utf-8"))["start"])
-    except (OSError, ValueError, KeyError, TypeError):  # a shell is told nothing, rather than something wrong
+    except (OSError, ValueError, KeyError, TypeError):  # better no completion than a wrong one
         return []
     return [CompletionItem(str(i)) for i in range(1, agents + 1) if str(i).startswith(incomplete)]
 
@@ -245,18 +245,7 @@ def _make(directory: Path | None) -> Path | None:
 
 
 def load_record(path: Path) -> RunRecord:
-    """The run record in a file.
-
-    Parameters
-    ----------
-    path
-        of the file that ``msg-agents prepare`` wrote
-
-    Raises
-    ------
-    InputError
-        it cannot be read, or is none
-    """
+    """Read a run record from ``msg-agents prepare``; InputError if it cannot be read or is not one."""
     from msg_analysis.errors import InputError
     from msg_analysis.model.record import RunRecord
 

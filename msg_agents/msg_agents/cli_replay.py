@@ -38,14 +38,14 @@ _timeout = click.option(
 
 
 def _topics_of_bag(context: click.Context, _option: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """The topics of the bag that is on the command line already."""
+    """Shell completion: the topics of the bag on the command line."""
     from msg_analysis.bags.metadata import read_metadata
     from msg_analysis.errors import InputError
 
     try:
         information = read_metadata(Path(context.params["bag"])) or {}
         names = [entry["topic_metadata"]["name"] for entry in information["topics_with_message_count"]]
-    except (InputError, OSError, KeyError, TypeError):  # a shell is told nothing, rather than something wrong
+    except (InputError, OSError, KeyError, TypeError):  # better no completion than a wrong one
         return []
     return [CompletionItem(name) for name in sorted(names) if name.startswith(incomplete)]
 
@@ -194,7 +194,7 @@ def play(
 
 
 class _play_bar:  # noqa: N801  used like a function
-    """Notes on stderr and, on a terminal, a bar: time of the bag, rate."""
+    """Prints notes on stderr and, on a terminal, a bar with the time in the bag and the rate."""
 
     def __init__(self, name: str) -> None:
         from rich.console import Console
@@ -211,7 +211,7 @@ class _play_bar:  # noqa: N801  used like a function
             console=self._console,
             disable=not self._console.is_terminal,
             transient=True,
-            auto_refresh=False,  # no thread, which might hold a lock that is wanted when a signal comes
+            auto_refresh=False,  # no thread: it might hold a lock that a signal handler needs
         )
         self._task = self._progress.add_task(name, total=None, state="looking for readers")
 
@@ -227,7 +227,7 @@ class _play_bar:  # noqa: N801  used like a function
         self._progress.start()
 
     def hide(self) -> None:
-        """Take it off the terminal, which is left as it was."""
+        """Remove the bar, and leave the terminal as it was."""
         self._progress.stop()
 
     def update(self, played: Played) -> None:
@@ -245,7 +245,7 @@ class _play_bar:  # noqa: N801  used like a function
 
 
 def _notes() -> Callable[[str], None]:
-    """What prints a note on stderr."""
+    """A function that prints a note on stderr."""
     from rich.console import Console
     from rich.text import Text
 
@@ -254,7 +254,7 @@ def _notes() -> Callable[[str], None]:
 
 
 def _enter(domain: int | None) -> None:
-    """Choose the domain, and see to it that signals end the process in order."""
+    """Set the ROS domain, and let SIGTERM and SIGHUP end the process in order."""
     if domain is not None:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
 
@@ -262,7 +262,7 @@ def _enter(domain: int | None) -> None:
         sys.exit(128 + number)
 
     for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # nohup
+        if signal.getsignal(number) is not signal.SIG_IGN:  # ignored under nohup
             signal.signal(number, end)
 
 
@@ -308,13 +308,13 @@ def live(
         _notes()(found.report.note)
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0 if found.finished else INCOMPLETE)  # nothing is left to do, and the middleware may not let go
+    os._exit(0 if found.finished else INCOMPLETE)  # all is done, and leaving the middleware may hang
 
 
 def _watch(
     *, reliable: bool, timeout: float | None, as_json: bool, domain: int | None, served: Web | None, host: str
 ) -> Watched | None:
-    """What was seen of a network, which is shown on the way; None: there was none."""
+    """Watch a network and show it meanwhile; what was seen, or None without a network."""
     from msg_agents.live import watch
     from msg_analysis.report.live import live_line, live_table
 
@@ -349,7 +349,7 @@ def _watch(
 
 
 def _publisher(served: Web | None) -> Callable[[Watched, float], None]:
-    """What puts a report on the page, if there is one."""
+    """A function that sends reports to the page; without a page it does nothing."""
     if served is None:
         return lambda *_: None
     from msg_agents.moment import Clockwork, moment_document, setting
@@ -360,7 +360,7 @@ def _publisher(served: Web | None) -> Callable[[Watched, float], None]:
         if not clockworks:
             clockworks.append(Clockwork(watched.record.experiment))
             served.begin(setting(watched.record.experiment))
-        # Which agent is how far, is not counted here: the newest step of any of them stands for all.
+        # The steps of single agents are not counted here: the newest step of any agent stands for all.
         moment = clockworks[0].moment([watched.report.newest], watched.report)
         served.show(moment_document(moment) | {"steps": []})
 
@@ -393,4 +393,4 @@ def markers(*, rate: float, replica: int, frame: str, timeout: float | None, dom
     _enter(domain)
     over = show_markers(rate=rate, replica=replica - 1, frame=frame, timeout=timeout, on_note=_notes())
     sys.stderr.flush()
-    os._exit(0 if over else INCOMPLETE)  # nothing is left to do, and the middleware may not let go
+    os._exit(0 if over else INCOMPLETE)  # all is done, and leaving the middleware may hang

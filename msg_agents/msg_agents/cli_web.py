@@ -1,4 +1,4 @@
-"""The options of commands that serve a page for browsers."""
+"""Options and helpers of the commands that serve a live page for browsers."""
 
 from __future__ import annotations
 
@@ -19,13 +19,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def web_options(function: Function) -> Function:
-    """The options ``--web`` and ``--web-host``.
-
-    Parameters
-    ----------
-    function
-        of the command, which gets ``web`` and ``web_host``
-    """
+    """Add the options ``--web`` and ``--web-host`` to a command."""
     host = click.option(
         "--web-host",
         default=HOST,
@@ -46,13 +40,7 @@ def web_options(function: Function) -> Function:
 
 
 def with_port(args: list[str]) -> list[str]:
-    """The same arguments, where ``--web`` takes the one after it only if that is a number.
-
-    Parameters
-    ----------
-    args
-        of the command line
-    """
+    """The arguments with the default port after every ``--web`` that no number follows."""
     pairs = zip(args, [*args[1:], ""], strict=False)
     return [f"--web={PORT}" if one == "--web" and not after.isdigit() else one for one, after in pairs]
 
@@ -66,7 +54,7 @@ class WebCommand(click.Command):
 
 
 class WebRosCommand(RosCommand):
-    """The same for a ROS 2 node."""
+    """A command of a ROS 2 node that takes ``--web`` with or without a port."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """See click.Command."""
@@ -75,20 +63,7 @@ class WebRosCommand(RosCommand):
 
 @contextmanager
 def page(port: int | None, host: str) -> Iterator[Web | None]:
-    """The page, until the context ends; None where no port is given.
-
-    Parameters
-    ----------
-    port
-        0: any that is free
-    host
-        where it is served
-
-    Raises
-    ------
-    InputError
-        it cannot be served there
-    """
+    """Serve the live page inside the context (port 0: any free port); None without a port."""
     if port is None:
         yield None
         return
@@ -99,17 +74,7 @@ def page(port: int | None, host: str) -> Iterator[Web | None]:
 
 
 def announce(web: Web, host: str, note: Callable[[str], None]) -> None:
-    """Say where the page is, and who can see it.
-
-    Parameters
-    ----------
-    web
-        that serves it
-    host
-        where it is served
-    note
-        told a line for people
-    """
+    """Note the address of the page, and that other machines can see it where that is so."""
     note(f"live page at {web.address}")
     if host not in LOOPBACK:
         note("whoever can reach this machine can see the page; it is not encrypted and asks for no password")

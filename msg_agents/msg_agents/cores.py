@@ -1,4 +1,4 @@
-"""Which processor core each process of a network keeps to."""
+"""Which CPU core each process of a network keeps to."""
 
 from __future__ import annotations
 
@@ -9,35 +9,22 @@ from itertools import accumulate
 from msg_agents.network import RECORDER, ProcessPlan
 
 RECORDING = 0.25
-"""What a message costs the recorder, as part of what the step that made it costs the agent."""
+"""Cost of a message for the recorder, relative to the cost of the step that made it for the agent."""
 
 
 def available_cores() -> list[int]:
-    """The cores that this process may use, ascending; none where the system does not say (it is not Linux)."""
+    """The cores that this process may use, ascending; none where the system does not say (not Linux)."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
 def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) -> dict[str, int]:
-    """A core for each process, where there are more of them than cores.
+    """A core for each process by name, where agent processes and recorder outnumber two or more cores; else empty.
 
-    In lockstep every message wakes the process that it is for. To wake it on another core costs an interrupt there,
-    and left alone the scheduler spreads those who wake each other over the cores: with two, the demo network makes a
-    third to a half fewer steps per second (docs/performance.md). Where every process can have a core of its own, the
-    scheduler is left alone.
-
-    Parameters
-    ----------
-    plans
-        in the order of ``plan_network``, in which neighbours are next to each other: they share a core
-    cores
-        numbers of the cores
-    first
-        any number; networks that are given successive ones begin at different cores, and so share them evenly
-
-    Returns
-    -------
-    dict[str, int]
-        core by name of the process; the switcher, which has hardly anything to do, is not in it
+    In lockstep every message wakes the process that receives it. To wake it on another core costs an interrupt there,
+    and without pinning the scheduler spreads communicating processes over the cores: with two cores, the demo network
+    makes a third to a half fewer steps per second (docs/performance.md). ``plans`` must have the order of
+    ``plan_network``, so that neighbours share a core. Networks with successive values of ``first`` begin at different
+    cores, and so share them evenly. The switcher, which needs hardly any time, gets no core.
     """
     agents = sum(len(plan.agents) for plan in plans)
     loads = {
@@ -52,15 +39,7 @@ def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) ->
 
 
 def keep_to(process: int, core: int) -> None:
-    """Keep a process that has just been started, and what it starts, to a core; not if the system will not have it.
-
-    Parameters
-    ----------
-    process
-        its id
-    core
-        number of the core, as the system has it
-    """
+    """Pin a process that has just been started, and its children, to a core; errors are ignored."""
     try:
         os.sched_setaffinity(process, {core})
     except OSError:  # it has ended already, or the core has been taken from us

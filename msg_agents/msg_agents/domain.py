@@ -1,4 +1,4 @@
-"""A ROS domain of our own, so that two runs on one machine do not hear each other."""
+"""A ROS domain for each run, so that two runs on one machine do not hear each other."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from msg_analysis.errors import InputError
 
 DOMAINS = range(1, 102)
-"""0 is everybody's default; above 101 the ports lie among those that Linux hands out to anyone."""
+"""0 is the default of every ROS program; above 101 the ports are among the ephemeral ports of Linux."""
 
 PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
 
@@ -31,8 +31,9 @@ def _ports_in_use() -> set[int]:
 
 
 def _open_lock(path: Path) -> int:
-    """Open a lock file, which may be another user's: that can be read and locked, but not opened for writing, nor, in
-    a directory like /tmp, with O_CREAT.
+    """Open a lock file, which may belong to another user.
+
+    Such a file can be read and locked, but not opened for writing nor, in a directory like /tmp, with O_CREAT.
     """
     try:
         return os.open(path, os.O_RDONLY)
@@ -42,14 +43,9 @@ def _open_lock(path: Path) -> int:
 
 @contextmanager
 def free_domain() -> Iterator[int]:
-    """Hold a ROS_DOMAIN_ID that no other run holds and whose ports nobody uses.
+    """Hold a ROS_DOMAIN_ID that no other run holds and whose ports are unused; InputError if there is none.
 
-    A lock on a file marks it as taken; the system takes the lock away when this process ends, however it ends.
-
-    Raises
-    ------
-    InputError
-        all are taken
+    It is held by a lock on a file, which the system releases when this process ends, however it ends.
     """
     busy = {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in _ports_in_use()}
     candidates = [domain for domain in DOMAINS if domain not in busy]

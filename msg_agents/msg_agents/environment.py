@@ -8,41 +8,27 @@ from pathlib import Path
 from msg_analysis.errors import InputError
 
 LOOPBACK_PROFILE = Path(__file__).with_name("loopback.xml")
-MOST_PARTICIPANTS = 100  # of a domain that find each other on one machine: maxInitialPeersRange of loopback.xml
+MOST_PARTICIPANTS = 100  # that find each other in a domain on one machine: maxInitialPeersRange of loopback.xml
 UDP_PROFILE = Path(__file__).with_name("udp.xml")
 TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
-RESTARTS = 3  # of killed processes in a run, if nothing else is said
-LAST_DOMAIN = 231  # the ports of 232, the last that ROS knows, end after some 60 participants
-DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other, in small networks
-PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts of a run, where there are several
+RESTARTS = 3  # of killed processes in a run, by default
+LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
+DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
+PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
 
 
 def check_domain() -> None:
-    """See to it that the environment's ROS_DOMAIN_ID can be used, before the middleware is asked.
-
-    Raises
-    ------
-    InputError
-        it cannot
-    """
+    """InputError if the environment's ROS_DOMAIN_ID is not usable; to be called before the middleware starts."""
     value = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not value.isdecimal() or int(value) > LAST_DOMAIN:
         raise InputError(f"ROS_DOMAIN_ID: {value}: expected a number from 0 to {LAST_DOMAIN}")
 
 
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
-    """Ours with what the nodes need; where the user has chosen another discovery range or profile, that stays.
-
-    Parameters
-    ----------
-    domain
-        ROS_DOMAIN_ID
-    profile
-        of Fast DDS
-    """
+    """Our environment with what the nodes need; another discovery range or profile of the user's is kept."""
     environment = {
-        # The arithmetic of one agent is far too small for threads, which would only fight for the cores.
+        # The arithmetic of one agent is far too small for threads, which would only compete for the cores.
         "OPENBLAS_NUM_THREADS": "1",
         "OMP_NUM_THREADS": "1",
         **os.environ,
@@ -53,19 +39,19 @@ def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str,
     }
     local = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST") == "LOCALHOST"
     if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
-        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SYSTEM_DEFAULT"  # as the profile says
+        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SYSTEM_DEFAULT"  # the profile decides
         environment.update(dict.fromkeys(PROFILE_VARIABLES, str(profile)))
     return environment
 
 
 def without_shared_memory() -> dict[str, str]:
-    """Changes to our environment by which the middleware uses none, so that a process that ends at once leaves none.
+    """Changes to our environment that make the middleware use UDP only; the user's profile or transports are kept.
 
-    Where the user has chosen a profile or transports, these stay. Others, who may use it, are reached by UDP.
+    A process that ends at once would otherwise leave shared memory behind.
     """
     if any(os.environ.get(name) for name in (*PROFILE_VARIABLES, TRANSPORTS_VARIABLE)):
         return {}
-    if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST":  # adds it, whatever a profile says
+    if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST":  # adds shared memory to any profile
         return {
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
             **dict.fromkeys(PROFILE_VARIABLES, str(LOOPBACK_PROFILE)),

@@ -1,4 +1,4 @@
-"""Where this rclpy keeps the error that its C layer raises."""
+"""RCLError, the error of rclpy's C layer, wherever this version of rclpy has it."""
 
 try:
     from rclpy._rclpy_pybind11 import RCLError

@@ -1,4 +1,4 @@
-"""What is installed to be run: the command line, and the nodes as executables of the ROS 2 package.
+"""Installed entry points: the command line, and the nodes as executables of the ROS 2 package.
 
 Each node is the command of that name of ``msg-agents``: ``ros2 run msg_agents agent --ros-args -p run:=... ...``.
 """
@@ -48,6 +48,6 @@ def markers() -> None:
 def _run(*command: str) -> None:
     try:
         from msg_agents.cli import main
-    except KeyboardInterrupt:  # what is being imported cannot be asked to see to it
+    except KeyboardInterrupt:  # the command group handles it only after these imports
         sys.exit(INTERRUPTED)
     main([*command, *sys.argv[1:]], prog_name="msg-agents")

@@ -23,37 +23,15 @@ from msg_analysis.model.step import Wiring
 
 AGENTS: dict[str, type[Agent]] = {"lockstep": LockstepAgent, "realtime": RealtimeAgent}  # by pace
 PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages of an agent, in a small network
-MOST_REPORTS = 250.0  # of them a second from a whole network: the switcher reads them all
+MOST_REPORTS = 250.0  # Progress messages a second from a whole network: the switcher reads all of them
 
 
 class AgentGroup:
     """Agents as nodes of one process.
 
-    Every endpoint has to be made known to every process. So what an agent need not have for itself the group has once,
-    on the node of its first agent: graph, progress, end, resend. And states go from one to the other directly, as in
-    ROS's own communication within a process, and on their topics to everybody else.
-
-    Parameters
-    ----------
-    record
-        of the run
-    model
-        its step model, or wiring
-    agents
-        indices from 0, at least one
-    readers
-        names of the nodes, besides the other agents, that must read the states before the run starts
-    checkpoints
-        directory that keeps what the agents have published, from which they go on if they have been there before
-
-    Attributes
-    ----------
-    nodes
-        the agents, in this order
-    turns
-        of the agents
-    progress_period
-        s of wall time between two Progress messages of an agent
+    Every endpoint is announced to every process. So what agents can share exists once per group, on the node of its
+    first agent: graph, progress, end, resend. States pass directly between agents of the group, as in ROS's own
+    intra-process communication, and on topics to all other nodes.
     """
 
     def __init__(
@@ -61,9 +39,9 @@ class AgentGroup:
         *,
         record: RunRecord,
         model: Wiring,
-        agents: Sequence[int],
-        readers: Sequence[str],
-        checkpoints: Path | None = None,
+        agents: Sequence[int],  # indices from 0, at least one
+        readers: Sequence[str],  # other nodes that must read the states before the run starts
+        checkpoints: Path | None = None,  # directory of the published states, from which agents resume
     ) -> None:
         self.turns = Turns(len(agents), self._defer)
         self.progress_period = max(PROGRESS_PERIOD, model.agents / MOST_REPORTS)
@@ -82,14 +60,14 @@ class AgentGroup:
                 checkpoints=checkpoints,
                 group=self,
             )
-        self.nodes = list(self._agents.values())
+        self.nodes = list(self._agents.values())  # in the order of ``agents``
         for agent in self.nodes:
             agent.meet(self._agents)
         self._host = self.nodes[0]
         self._host.host(self.nodes)
         self._progress = self._host.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
         self._resend: Publisher | None = None
-        self._sojourns: dict[int, tuple[int, int, int]] = {}  # taken: what they said, by sequence number
+        self._sojourns: dict[int, tuple[int, int, int]] = {}  # accepted (mode, first, last step) by sequence number
         self._host.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._receive_graph, LATCHED, raw=True)
         self._host.create_subscription(ProgressMsg, RESEND_TOPIC, self._receive_resend, LATCHED, raw=True)
         self._host.leave_at_end(self.nodes)
@@ -98,39 +76,17 @@ class AgentGroup:
         self._host.executor.create_task(callback)
 
     def fail(self, error: Exception) -> None:
-        """End the process because an agent cannot go on.
-
-        Parameters
-        ----------
-        error
-            that the agent ended with
-        """
+        """End the process with the error of an agent."""
         for agent in self.nodes:
             agent.fail(error)
 
     def report(self, agent: int, step: int) -> None:
-        """Tell the switcher how far an agent is.
-
-        Parameters
-        ----------
-        agent
-            index from 0
-        step
-            that it has reached
-        """
+        """Tell the switcher which step an agent (index from 0) has reached."""
         self._host.publish(self._progress, self._host.progress(agent + 1, step))
 
     def ask_again(self, agent: int, step: int) -> None:
-        """Ask an agent of another process for its states from a step on.
-
-        Parameters
-        ----------
-        agent
-            index from 0
-        step
-            first step that is wanted
-        """
-        if self._resend is None:  # hardly ever needed; latched, so that it does not matter when it is matched
+        """Ask an agent of another process (index from 0) for its states from a step on."""
+        if self._resend is None:  # rarely needed; latched, so a late discovery does no harm
             self._resend = self._host.create_publisher(ProgressMsg, RESEND_TOPIC, LATCHED)
         self._host.publish(self._resend, self._host.progress(agent + 1, step))
 

@@ -1,4 +1,4 @@
-"""What a node says of itself on /diagnostics, as any ROS 2 monitor shows it."""
+"""Health of the nodes, on /diagnostics for any ROS 2 monitor and in the account file."""
 
 from __future__ import annotations
 
@@ -18,33 +18,16 @@ PERIOD = 1.0  # s
 
 @dataclass(slots=True)
 class Health:
-    """How a node is.
+    """The health of a node."""
 
-    Attributes
-    ----------
-    message
-        one line
-    waiting
-        whether it cannot go on, or not keep up, for the time being
-    values
-        facts, by name
-    """
-
-    message: str
-    waiting: bool = False
+    message: str  # one line
+    waiting: bool = False  # cannot go on, or not keep up, at present
     values: dict[str, str] = field(default_factory=dict)
 
     def to_status(self, node: Node, refused: Mapping[tuple[str, str], int], repeated: int) -> DiagnosticStatus:
-        """The message. Refused messages are a warning: somebody else is on our topics.
+        """The diagnostic message about a node; ``refused`` counts messages by (topic, reason).
 
-        Parameters
-        ----------
-        node
-            that it is about
-        refused
-            number of messages by topic and reason
-        repeated
-            messages that came again
+        Refused messages are a warning: other nodes publish on the topics of the run.
         """
         warn = self.waiting or bool(refused)
         counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in refused.items()}
@@ -61,14 +44,9 @@ class Health:
 
 
 class Reporter:
-    """Publishes the health of all nodes of a process once a second; whether one gets on is judged between two reports.
+    """Publishes the health of all nodes of a process once a second, and keeps its account file.
 
-    Parameters
-    ----------
-    nodes
-        at least one; with a method ``health() -> Health`` and counters ``refused`` and ``repeated``
-    account
-        file for whoever started the process: what its nodes have refused, and what they wait for
+    The nodes need a method ``health() -> Health`` and the counters ``refused`` and ``repeated``.
     """
 
     def __init__(self, nodes: Sequence[Node], account: Path | None = None) -> None:
@@ -89,7 +67,7 @@ class Reporter:
         self.keep_account()
 
     def keep_account(self) -> None:
-        """Write the account, whole or not at all."""
+        """Write the account file atomically, if there is one."""
         if self._account is not None:
             refused = [(node.get_name(), *what, count) for node in self._nodes for what, count in node.refused.items()]
             write_account(self._account, refused, self._waiting)

@@ -1,7 +1,7 @@
 """A network spread over several hosts: which agents are where, and how the processes find each other.
 
-Every host runs its share of the same plan, from the same run record. They find each other at the addresses that the
-hosts file gives, without multicast, which often ends at a router, an access point or a bridge.
+Every host runs its share of the same plan, from the same run record. The processes find each other at the addresses
+in the hosts file, without multicast, which routers, access points and bridges often do not pass on.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from msg_analysis.model.problems import ExperimentError, problem, show, translat
 from msg_analysis.model.spec import expected
 
 LEASE = 60.0
-"""s without a word after which a participant is taken for gone, and what is under way to it is lost. So long may a
-host be cut off."""
+"""s of silence after which a participant counts as gone, and messages on their way to it are lost: the longest time for
+which a host may be cut off."""
 
-ANNOUNCEMENT = 3.0  # s between two announcements of a participant, to every place where another may be
-VISITORS = 8  # participants of a host besides those of the run: who watches it
+ANNOUNCEMENT = 3.0  # s between two announcements of a participant to all possible peers
+VISITORS = 8  # participants on a host besides those of the run, such as tools that watch it
 _NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
 _RANGE = re.compile(r"([0-9]+)-([0-9]+)")
 
 
 def _numbers(value: object) -> list[int]:
-    """Numbers of agents: a list of numbers and of ranges."""
+    """Agent numbers from a list of numbers and of ranges."""
     wanted = expected("a list of numbers of agents, from 1, and of ranges such as 3-5")
     if not isinstance(value, list):
         raise wanted
@@ -78,61 +78,21 @@ class HostsSpec(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Hosts:
-    """A hosts file that fits an experiment.
+    """A hosts file that fits an experiment."""
 
-    Attributes
-    ----------
-    domain
-        ROS_DOMAIN_ID
-    recorder
-        name of the host with recorder and switcher
-    addresses
-        of the hosts, by name, as numbers
-    agents
-        indices from 0 of the agents on each host, ascending, by name
-    """
-
-    domain: int
-    recorder: str
-    addresses: dict[str, str]
-    agents: dict[str, tuple[int, ...]]
+    domain: int  # ROS_DOMAIN_ID
+    recorder: str  # name of the host with recorder and switcher
+    addresses: dict[str, str]  # IPv4 addresses by host
+    agents: dict[str, tuple[int, ...]]  # indices from 0, ascending, by host
 
     @classmethod
     def load(cls, path: Path, experiment: Experiment) -> Hosts:
-        """Read a hosts file (YAML).
-
-        Parameters
-        ----------
-        path
-            of the file
-        experiment
-            whose agents are spread
-
-        Raises
-        ------
-        InputError
-            it cannot be read, or does not fit the experiment; names every mistake
-        """
+        """Read a hosts file (YAML); InputError if it cannot be read or does not fit the experiment."""
         return cls.parse(read_yaml(path), experiment, source=str(path))
 
     @classmethod
     def parse(cls, document: Any, experiment: Experiment, source: str = "hosts") -> Hosts:
-        """Check a document and make it hosts. See ``load``.
-
-        Parameters
-        ----------
-        document
-            as a YAML reader gives it
-        experiment
-            whose agents are spread
-        source
-            where it came from, for messages
-
-        Raises
-        ------
-        ExperimentError
-            names every mistake in the document
-        """
+        """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
         if not isinstance(document, dict):
             raise ExperimentError(
                 source, ["expected the keys domain, recorder and hosts: see `msg-agents host --help`"]
@@ -168,22 +128,7 @@ class Hosts:
         return cls(spec.domain, spec.recorder, addresses, agents)
 
     def share(self, name: str, *, discovery_timeout: float, patience: float) -> Share:
-        """What runs on one host.
-
-        Parameters
-        ----------
-        name
-            of the host
-        discovery_timeout
-            s to wait for the other hosts
-        patience
-            s after which the others are left alone when a host has left them
-
-        Raises
-        ------
-        InputError
-            there is no such host, or nothing to do on it
-        """
+        """What runs on the host ``name``; times in s. InputError: no such host, or nothing to do on it."""
         if name not in self.agents:
             known = ", ".join(self.agents)
             raise InputError(f"--name: {name}: no such host in the hosts file: expected one of {known}")
@@ -192,24 +137,12 @@ class Hosts:
         return Share(self.agents[name], name == self.recorder, discovery_timeout, patience)
 
     def participants(self, experiment: Experiment) -> int:
-        """Places per host where participants are looked for: more than are on any.
-
-        Parameters
-        ----------
-        experiment
-            that is run
-        """
+        """How many participants to look for on each host: more than run on any."""
         most = max(most_processes(experiment, len(agents)) for agents in self.agents.values())
         return min(most + 2 + VISITORS, MOST_PARTICIPANTS)
 
     def profile(self, experiment: Experiment) -> str:
-        """The profile of Fast DDS with which the processes of all hosts find each other.
-
-        Parameters
-        ----------
-        experiment
-            that is run
-        """
+        """The Fast DDS profile with which the processes of all hosts find each other."""
         ET.register_namespace("", _NAMESPACE)
         tree = ET.parse(LOOPBACK_PROFILE)  # drops its comments, which are about another profile
         addresses = list(dict.fromkeys(("127.0.0.1", *self.addresses.values())))
@@ -233,15 +166,7 @@ class Hosts:
         return ET.tostring(tree.getroot(), encoding="unicode", xml_declaration=True) + "\n"
 
     def environment(self, experiment: Experiment, folder: Path) -> dict[str, str]:
-        """The environment of the processes; where the user has chosen a profile, that stays.
-
-        Parameters
-        ----------
-        experiment
-            of the run
-        folder
-            in which the profile is written
-        """
+        """Environment of the processes, with the profile written to ``folder``; the user's own profile is kept."""
         profile = folder / "hosts.xml"
         profile.write_text(self.profile(experiment), encoding="utf-8")
         others = [address for address in self.addresses.values() if address != "127.0.0.1"]
@@ -253,7 +178,7 @@ def _tag(name: str) -> str:
 
 
 def _mistakes(spec: HostsSpec, agents: int) -> list[str]:
-    """What is wrong with the hosts as a whole."""
+    """Mistakes in the assignment of agents and recorder to hosts."""
     problems = []
     if spec.recorder not in spec.hosts:
         names = ", ".join(spec.hosts)
@@ -289,5 +214,5 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def this_host() -> str:
-    """The name of this machine."""
+    """Host name of this machine."""
     return socket.gethostname()

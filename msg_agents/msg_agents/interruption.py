@@ -1,4 +1,4 @@
-"""Being asked to end by a signal: Ctrl-C, ``kill``, the end of the terminal."""
+"""Orderly handling of the signals that end a process: Ctrl-C, ``kill``, the end of the terminal."""
 
 from __future__ import annotations
 
@@ -10,21 +10,15 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interruption:
-    """Keeps signals until they are asked for, as a context.
+    """Keeps the first signal until ``check``, as a context.
 
-    An exception that a handler raises comes up wherever the process is, and is lost where nothing can be raised: in a
-    generator that is being closed, for example, or in a callback of an executor. SIGHUP stays ignored where ``nohup``
-    has it so. SIGINT does not: a script that starts us in the background has it ignored, and then ends us by
-    ``kill -INT``.
-
-    Attributes
-    ----------
-    caught
-        number of the first signal that came; None: none
+    An exception that a handler raises appears wherever the process is, and is lost where nothing can be raised, such as
+    in a generator that is being closed or in a callback of an executor. SIGHUP stays ignored under ``nohup``.
+    SIGINT does not: scripts ignore it for what they start in the background, and then end that by ``kill -INT``.
     """
 
     def __init__(self) -> None:
-        self.caught: int | None = None
+        self.caught: int | None = None  # number of the first signal
         self._handlers: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -40,15 +34,7 @@ class Interruption:
             signal.signal(number, handler)
 
     def check(self) -> None:
-        """End if a signal has asked for it.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            by Ctrl-C
-        SystemExit
-            by another signal
-        """
+        """Raise KeyboardInterrupt after Ctrl-C, SystemExit after another signal."""
         if self.caught == signal.SIGINT:
             raise KeyboardInterrupt
         if self.caught is not None:

@@ -1,4 +1,4 @@
-"""Being stopped and continued by a shell: Ctrl-Z, ``fg``, ``bg``."""
+"""Stopping and continuing by a shell: Ctrl-Z, ``fg``, ``bg``."""
 
 from __future__ import annotations
 
@@ -9,16 +9,10 @@ from typing import Any, Self
 
 
 class JobControl:
-    """Puts things in order before the process is stopped by Ctrl-Z, and after it goes on, as a context.
+    """Calls ``before`` when Ctrl-Z is to stop the process, and ``after`` when it continues, as a context.
 
-    It does so when asked to ``check``, not in the handler: that might come in the middle of drawing, of which both are.
-
-    Parameters
-    ----------
-    before
-        called before it stops; not for SIGSTOP, of which no process hears
-    after
-        called when it goes on, in the foreground or in the background
+    Both are called by ``check``, not in a signal handler, which might come in the middle of drawing. There is no call
+    before SIGSTOP, which no process can catch. ``after`` is called in the foreground and in the background.
     """
 
     def __init__(self, *, before: Callable[[], None], after: Callable[[], None]) -> None:
@@ -28,7 +22,7 @@ class JobControl:
 
     def __enter__(self) -> Self:
         self._handlers[signal.SIGCONT] = signal.signal(signal.SIGCONT, self._go_on)
-        if signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL:  # otherwise somebody wants Ctrl-Z to be ignored
+        if signal.getsignal(signal.SIGTSTP) is signal.SIG_DFL:  # else it is ignored or handled on purpose
             self._handlers[signal.SIGTSTP] = signal.signal(signal.SIGTSTP, self._ask)
         return self
 
@@ -39,20 +33,20 @@ class JobControl:
             signal.signal(number, handler)
 
     def check(self) -> None:
-        """Stop, if that was asked for; put things in order, if the process has gone on. To be called often."""
+        """Stop if Ctrl-Z was typed; call ``after`` if the process has continued. To be called often."""
         if self._asked:
             self._asked = False
             self._before()
             signal.signal(signal.SIGTSTP, signal.SIG_DFL)
-            signal.raise_signal(signal.SIGTSTP)  # here it stands: of one sent by kill, another thread may hear, later
+            signal.raise_signal(signal.SIGTSTP)  # stops here; one sent by kill may reach another thread, later
             signal.signal(signal.SIGTSTP, self._ask)
-            self._resumed = True  # also where the system did not stop it, since no shell could make it go on (setsid)
+            self._resumed = True  # even if the system did not stop it: under setsid no shell could continue it
         if self._resumed:
             self._resumed = False
             self._after()
 
     def continued(self) -> bool:
-        """Whether the process has been stopped, and gone on, since this was asked last."""
+        """Whether the process has been stopped and continued since the last call."""
         was, self._continued = self._continued, False
         return was
 

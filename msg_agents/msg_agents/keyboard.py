@@ -1,4 +1,4 @@
-"""Single keys from the terminal, which is left as it was found."""
+"""Single keys from the terminal, whose settings are restored afterwards."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _NAMES = {b" ": "space", b"s": "step", b"\n": "step"} | {
 
 
 class Keyboard:
-    """Keys typed at the terminal, one by one and without echo, as a context; none where stdin is no terminal.
+    """Keys typed at the terminal, one by one and without echo, as a context; none where stdin is not a terminal.
 
-    Ctrl-C and Ctrl-Z do what they always do. While the process is in the background, it does not touch the terminal.
-    Around a stop, call ``let_go`` and ``listen``.
+    Ctrl-C and Ctrl-Z work as usual. In the background the process does not touch the terminal. Call ``let_go`` before a
+    stop and ``listen`` after it.
     """
 
     def __init__(self) -> None:
         self._descriptor: int | None = None
-        self._saved: list[Any] = []  # how the terminal was; nothing while it is as it was
-        self._ours: list[Any] = []  # how we set it
+        self._saved: list[Any] = []  # original settings; empty while they are in force
+        self._ours: list[Any] = []  # our settings
         with contextlib.suppress(ValueError, OSError, AttributeError):  # no stdin, or not a file
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor):
@@ -39,7 +39,7 @@ class Keyboard:
 
     @property
     def available(self) -> bool:
-        """Whether there is a terminal to type at."""
+        """Whether stdin is a terminal."""
         return self._descriptor is not None
 
     def __enter__(self) -> Self:
@@ -52,19 +52,19 @@ class Keyboard:
         self.let_go()
 
     def listen(self) -> None:
-        """Have the terminal give single keys, where it is ours; again after others may have changed it."""
+        """Switch the terminal to single keys if we are in the foreground, also after others have changed it."""
         if self._descriptor is None or not self._in_front():
             return
         with contextlib.suppress(termios.error):
             found = termios.tcgetattr(self._descriptor)
-            if self._saved and found == self._ours:  # nobody has changed it: what was saved is still what was there
+            if self._saved and found == self._ours:  # unchanged: what was saved is still the original
                 return
             self._saved = found
             tty.setcbreak(self._descriptor, termios.TCSADRAIN)
             self._ours = termios.tcgetattr(self._descriptor)
 
     def let_go(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the settings of the terminal, if we are in the foreground."""
         if self._saved and self._in_front():
             assert self._descriptor is not None
             with contextlib.suppress(termios.error):
@@ -72,12 +72,9 @@ class Keyboard:
         self._saved = []
 
     def wait(self, seconds: float) -> list[str]:
-        """What was typed: ``space``, ``step`` (right arrow, s, enter), ``up``, ``down``; at once, or at the end.
+        """Wait at most so many seconds for keys: ``space``, ``step`` (right arrow, s, enter), ``up``, ``down``.
 
-        Parameters
-        ----------
-        seconds
-            to wait if nothing was typed [s]
+        Returns as soon as anything is typed; other keys are left out.
         """
         if not self._saved:
             self.listen()  # it may have been started in the background
@@ -95,7 +92,7 @@ class Keyboard:
         return [_NAMES[key] for key in _KEYS.findall(typed) if key in _NAMES]
 
     def _in_front(self) -> bool:
-        """Whether the terminal is ours: otherwise the system would stop whoever reads from it or changes it."""
+        """Whether we are in the foreground: the system stops background processes that use the terminal."""
         with contextlib.suppress(OSError):
             return self._descriptor is not None and os.tcgetpgrp(self._descriptor) == os.getpgrp()
         return False

@@ -1,7 +1,7 @@
-"""What launch files do, without ``launch``: which processes, what each end of one means, what comes after the run.
+"""What the launch files do, without ``launch``: which processes, what the end of each one means, what follows the run.
 
-The plan is that of ``msg-agents run`` (``network``). What ``launch`` does itself is left to it: starting processes,
-signals, output. Processes that were killed are not started again here.
+The plan is that of ``msg-agents run`` (``network``). ``launch`` itself starts the processes and handles signals and
+output. Killed processes are not started again here.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NETWORK_ARGUMENTS = {
     "namespace": ("", "Of all nodes and topics, such as /lab."),
     "use_sim_time": ("false", "Whether to take the time from /clock (realtime)."),
 }
-"""Name of each argument of network.launch.py, its default, and what it is."""
+"""Default and description of each argument of network.launch.py."""
 REPLAY_ARGUMENTS = {
     "bag": ("", "The bag: a directory, or one of its files."),
     "rate": ("1", "Seconds of the bag per second, or max: as fast as readers take it."),
@@ -46,28 +46,15 @@ REPLAY_ARGUMENTS = {
     "clock": ("", "Hz at which to publish the time of the bag on /clock; empty: not."),
     "loop": ("false", "Whether to begin again at the end, for ever; not together with live."),
 }
-"""The same of replay.launch.py."""
+"""The same for replay.launch.py."""
 
 
 class LaunchFailedError(Exception):
-    """A process has failed: the launch is to end, and to say so by its exit code."""
+    """A process has failed: the launch is to end with a failure as exit code."""
 
 
 def flag(arguments: Mapping[str, str], name: str) -> bool:
-    """An argument that is true or false.
-
-    Parameters
-    ----------
-    arguments
-        of the launch
-    name
-        of one of them
-
-    Raises
-    ------
-    InputError
-        it is neither
-    """
+    """A launch argument that must be true or false; InputError if it is neither."""
     word = arguments[name].strip().lower()
     if word not in TRUE | FALSE:
         raise InputError(f"{name}: {arguments[name]}: expected true or false")
@@ -75,19 +62,10 @@ def flag(arguments: Mapping[str, str], name: str) -> bool:
 
 
 def find_experiment(name: str, share: Path) -> Path:
-    """The experiment file: of this path, or else the example of this name.
+    """The experiment file: the path ``name``, or else the example of this name in ``share``.
 
-    Parameters
-    ----------
-    name
-        path, or name of an example
-    share
-        directory of msg_agents_bringup's data
-
-    Raises
-    ------
-    InputError
-        neither of them is there
+    ``share`` is the data directory of msg_agents_bringup. A path with a suffix is not checked here; else
+    InputError if there is neither file nor example.
     """
     path = Path(name).expanduser()
     examples = share / "experiments"
@@ -100,20 +78,7 @@ def find_experiment(name: str, share: Path) -> Path:
 
 
 def load_experiment(arguments: Mapping[str, str], share: Path) -> Experiment:
-    """The experiment with what the arguments of the launch say instead of the file.
-
-    Parameters
-    ----------
-    arguments
-        of the launch, by the names of NETWORK_ARGUMENTS
-    share
-        directory of msg_agents_bringup's data
-
-    Raises
-    ------
-    InputError
-        an argument or the experiment is wrong, or asks for what is not available
-    """
+    """The experiment with the changes of the launch arguments; InputError if it is wrong or cannot be run."""
     changes: dict[str, Any] = {}
     for name, kind in (("seed", int), ("duration", float), ("speed", float)):
         if text := arguments[name].strip():
@@ -132,28 +97,10 @@ def load_experiment(arguments: Mapping[str, str], share: Path) -> Experiment:
 
 
 class LaunchedNetwork:
-    """A run whose processes somebody else starts.
+    """A run whose processes ``launch`` starts.
 
-    Parameters
-    ----------
-    arguments
-        of the launch, by the names of NETWORK_ARGUMENTS
-    share
-        directory of msg_agents_bringup's data
-
-    Attributes
-    ----------
-    processes
-        to be started, as nodes; ``arguments[0]`` of each is its executable
-    bag
-        directory that the recorder makes; None: nothing is recorded
-    namespace
-        of all nodes
-
-    Raises
-    ------
-    InputError
-        the arguments or the experiment are wrong; nothing has been written
+    Takes the arguments of the launch by the names of NETWORK_ARGUMENTS, and the data directory of msg_agents_bringup.
+    InputError: the arguments or the experiment are wrong; no bag has been made.
     """
 
     def __init__(self, arguments: Mapping[str, str], share: Path) -> None:
@@ -166,13 +113,14 @@ class LaunchedNetwork:
         folder = self._stack.enter_context(workshop())
         self._run_file = folder / "run.json"
         self._run_file.write_text(new_record(experiment).to_json(), encoding="utf-8")
-        self.bag: Path | None = None
+        self.bag: Path | None = None  # directory that the recorder makes
         try:
-            plan_network(experiment, self._run_file, None)  # too many processes? Before anything is made
+            plan_network(experiment, self._run_file, None)  # rejects too many processes before anything is made
             if record:
                 out = Path(arguments["out"]).expanduser().absolute()
                 out.mkdir(parents=True, exist_ok=True)
                 self.bag = make_bag_directory(experiment, out)
+            # Of each, ``arguments[0]`` is the executable.
             self.processes: list[ProcessPlan] = plan_network(
                 experiment, self._run_file, self.bag, use_sim_time=use_sim_time
             )
@@ -183,27 +131,13 @@ class LaunchedNetwork:
         self._over = False
 
     def ended(self, name: str, code: int) -> bool:
-        """Take note of the end of a process.
+        """Take note of the end of a process; True if it was the last one and the run is complete.
 
-        Parameters
-        ----------
-        name
-            of the process
-        code
-            its exit code, or minus the signal that killed it
-
-        Returns
-        -------
-        bool
-            True if this was the last one and the run is complete, else False
-
-        Raises
-        ------
-        LaunchFailedError
-            it has not done its part; not said again of those who are ended because of that
+        ``code`` is its exit code, or minus the signal that killed it. The first failure raises LaunchFailedError; later
+        ones do not, since they follow from it.
         """
         self._running.discard(name)
-        # After its part a process may hang in the middleware's farewell; then it ends itself by an alarm.
+        # A process that is done but hangs while it leaves the middleware ends itself by an alarm (``process.leave``).
         if code not in (0, -signal.SIGALRM) and not self._over:
             self._over = True
             how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
@@ -215,58 +149,36 @@ class LaunchedNetwork:
 
     @property
     def analysis(self) -> list[str] | None:
-        """Arguments for ``msg-analysis`` after a complete run; None: nothing is to be analysed."""
+        """Arguments of ``msg-analysis`` after a complete run; None: no analysis."""
         if not self._analyse or self.bag is None:
             return None
         return ["compare", str(self.bag), "--report", str(self.bag / REPORT_FILE)]
 
     def analysed(self, code: int) -> None:
-        """Take note of the end of the analysis.
-
-        Parameters
-        ----------
-        code
-            exit code of ``msg-analysis compare``
-
-        Raises
-        ------
-        LaunchFailedError
-            it does not say that the run agrees with the prediction
-        """
+        """Take note of the exit code of ``msg-analysis compare``; LaunchFailedError unless the run agrees."""
         if code:
             verdict = {1: "the run disagrees with the prediction", 3: "data are incomplete: no verdict"}
             raise LaunchFailedError(f"msg-analysis: {verdict.get(code, f'exit code {code}')}")
 
     def close(self) -> None:
-        """Keep the run record with the bag, and remove what was there for this run only. May be called again."""
+        """Keep the run record with the bag, and remove temporary files. May be called again."""
         if self.bag is not None:
             if (self.bag / f"{self.bag.name}_0.mcap").exists() and self._run_file.exists():
                 with suppress(OSError):
                     (self.bag / "log").mkdir(exist_ok=True)
                     (self.bag / "log" / "run.json").write_bytes(self._run_file.read_bytes())
             with suppress(OSError):
-                self.bag.rmdir()  # if nothing came of it
+                self.bag.rmdir()  # if it is empty
         self._stack.close()
 
 
 def environment() -> dict[str, str]:
-    """What the nodes need on top of the launch's environment: their arithmetic is too small for threads."""
+    """Additions to the launch's environment: the nodes' arithmetic is too small for threads."""
     return {name: os.environ.get(name, "1") for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")}
 
 
 def replay_commands(arguments: Mapping[str, str]) -> list[tuple[str, list[str]]]:
-    """Executable and arguments of each node of a replay.
-
-    Parameters
-    ----------
-    arguments
-        of the launch, by the names of REPLAY_ARGUMENTS
-
-    Raises
-    ------
-    InputError
-        no bag, or what does not go together
-    """
+    """Executable and arguments of each node of a replay; InputError if the arguments are wrong."""
     bag, live = arguments["bag"].strip(), flag(arguments, "live")
     if not bag or not Path(bag).expanduser().exists():
         raise InputError(f"bag: {bag or 'not given'}: expected the directory of a bag, or one of its files: bag:=...")

@@ -29,78 +29,50 @@ from msg_analysis.model.steptime import SECOND, StepClock
 
 ESTIMATE_TOPIC = "estimate"
 PERIOD = 1.0  # s between two estimates
-FAREWELL = 5.0  # s for readers of the last estimate to say that they have it
-SILENCE = 5  # estimates without any state, after which a run of which there is nothing but its experiment is over
+FAREWELL = 5.0  # s for readers to acknowledge the last estimate
+SILENCE = 5  # estimates without any state, after which a run that has ended or has no publishers is over
 
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """What has been seen of a network.
-
-    Attributes
-    ----------
-    record
-        of the run
-    report
-        the numbers
-    finished
-        whether the run was followed to its last step
-    """
+    """What has been seen of a network."""
 
     record: RunRecord
     report: LiveReport
-    finished: bool
+    finished: bool  # followed to its last step
 
 
 class Live(Watcher):
     """Reads the states of the first network that it hears of, and publishes its running estimates.
 
-    Parameters
-    ----------
-    reliable
-        whether to miss no state, and so hold the network back where this node does not keep up
-    on_report
-        told of every estimate, with the number of steps per second
-    on_note
-        told what somebody should know
-
-    Attributes
-    ----------
-    outcome
-        what was seen, in the end; None: no network
+    With ``reliable`` it misses no state, and the network waits for this node where it is too slow.
     """
 
     def __init__(
         self,
         *,
         reliable: bool,
-        on_report: Callable[[Watched, float], None],
+        on_report: Callable[[Watched, float], None],  # the float: steps per second
         on_note: Callable[[str], None],
     ) -> None:
         super().__init__("live", on_note=on_note)
-        self.outcome: Watched | None = None
+        self.outcome: Watched | None = None  # set at the end
         self._qos = STREAM if reliable else LISTEN
         self._on_report = on_report
         self._estimate: LiveEstimate | None = None
-        self._before = (-1, time.monotonic())  # newest step, and when that was
-        self._silent = 0  # estimates in a row that no newer state has come before
+        self._before = (-1, time.monotonic())  # newest step of the last estimate, and its time
+        self._silent = 0  # estimates in a row without a newer state
         self._writer = self.create_publisher(EstimateMsg, ESTIMATE_TOPIC, NEWEST)
 
     def follow(self) -> None:
-        """Read the states of the run that has been found.
-
-        Raises
-        ------
-        InputError
-            there is no prediction for it (too large, unbounded)
-        """
+        """Read the states of the run; InputError if its prediction fails (too large, unbounded)."""
         assert self.record is not None
         record, experiment = self.record, self.record.experiment
         topic, width = state_topic, experiment.run.replicas
         if experiment.truth:
             topic, width = truth_topic, experiment.width
         frame = StateFrame(record.run.bytes, width, longest_heard(record))
-        # Before the prediction, which takes its time: what comes meanwhile waits in the middleware.
+        # Before the prediction, which takes some time: states that come meanwhile wait in the middleware.
         for agent in range(experiment.agents):
             self._topics.append(topic(agent))
             self.create_subscription(AgentStateMsg, topic(agent), self._receiver(agent, frame), self._qos, raw=True)
@@ -119,7 +91,7 @@ class Live(Watcher):
         return Watched(self.record, report, self._estimate.steps.newest >= last)
 
     def _receiver(self, agent: int, frame: StateFrame) -> Callable[[bytes], None]:
-        """The callback for the states of an agent (index from 0): this is the hot path."""
+        """The callback for the states of an agent (index from 0; hot path)."""
         unwrap, refused = frame.unwrap, self._refused
 
         def receive(data: bytes) -> None:
@@ -143,7 +115,7 @@ class Live(Watcher):
         last = watched.record.experiment.steps
         assert self._estimate is not None
         self._silent = self._silent + 1 if newest == before else 0
-        # All is there; or nothing comes any more, because the run is over or whoever published it has gone.
+        # All states are here, or no more come because the run has ended or its publishers have gone.
         quiet = self._silent >= (1 if newest >= 0 else SILENCE)
         over = self._estimate.steps.whole >= last or (quiet and (self._ended or not self._anybody()))
         if over and not self.done.done():
@@ -183,32 +155,15 @@ def _number(value: float | None) -> float:
 def watch(
     *,
     reliable: bool = False,
-    timeout: float | None = None,
+    timeout: float | None = None,  # s to wait for a network; None: forever
     on_report: Callable[[Watched, float], None] = lambda *_: None,
     on_note: Callable[[str], None] = lambda _: None,
-    on_look: Callable[[], None] = lambda: None,
+    on_look: Callable[[], None] = lambda: None,  # called a few times a second
 ) -> Watched | None:
-    """Watch a network in this process until it is over, or until Ctrl-C or another signal.
+    """Watch a network until it is over or a signal ends it; what was seen, or None without a network.
 
-    Parameters
-    ----------
-    reliable, on_report, on_note
-        see ``Live``
-    timeout
-        s to wait for a network; None: for ever
-    on_look
-        called a few times a second
-
-    Returns
-    -------
-    Watched | None
-        What was seen; None: no network. Where the run was seen to be over, the node is still there: end the process at
-        once
-
-    Raises
-    ------
-    InputError
-        no network came in time, or there is no prediction for it
+    If the run is over, the node still exists: end the process at once. InputError: no network in time, or its
+    prediction fails.
     """
     node = run_watcher(
         lambda: Live(reliable=reliable, on_report=on_report, on_note=on_note),

@@ -1,4 +1,4 @@
-"""The agent in lockstep: it makes a step as soon as it has all that the step needs."""
+"""The agent in lockstep: it makes a step as soon as it has all inputs of the step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from msg_analysis.model.protocols import ProtocolError
 
 
 class LockstepAgent(Agent):
-    """Moves numbers between topics, the synchronizer and the law. Parameters: see Agent."""
+    """Connects topics, synchronizer and law; options as in Agent."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -37,13 +37,13 @@ class LockstepAgent(Agent):
         self._turns.join(self)
 
     def _ask_again(self) -> None:
-        """Ask every peer of another process for what it sent since the last step at which it can have been behind."""
+        """Ask the peers in other processes for their states of the last WINDOW + 1 steps: none is further behind."""
         since = max(0, self._law.step - WINDOW - 1)
         for j in self._far:
             self._group.ask_again(j, since)
 
     def health(self) -> Health:
-        """See NetworkNode. Whoever does not get on says what he waits for, and asks for it again."""
+        """See NetworkNode. A stalled agent says what it waits for, and asks for it again from time to time."""
         step, pace = self._law.step, self._pace
         overdue = pace.look(step)
         values = {"step": str(step), "steps per second": f"{pace.rate:.1f}"}
@@ -53,14 +53,14 @@ class LockstepAgent(Agent):
             return Health(f"at step {step}", values=values)
         waiting = self._synchronizer.waiting_for()
         if overdue and step == 0 and self.get_name() in self.namesakes():
-            self._group.fail(self.clash([self.get_name()], pace.stalled))  # the others have begun without this one
+            self._group.fail(self.clash([self.get_name()], pace.stalled))  # the others have started without this one
         elif overdue:
             self.get_logger().warning(f"no step for {pace.stalled:.0f} s at step {step}: waiting for {waiting}")
             self._ask_again()
         return Health(f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting})
 
     def _receiver(self, peer: int) -> Callable[[bytes], None]:
-        """The callback for one peer's states: this is the hot path."""
+        """The callback for a peer's states (hot path)."""
         unwrap = self._frame.unwrap
         offer = self._synchronizer.offer
         ready = self._synchronizer.ready
@@ -99,7 +99,7 @@ class LockstepAgent(Agent):
             self._advance()
         except ProtocolError as error:
             if not self.done.done():
-                traceback.print_exception(error, file=sys.stderr)  # in full in what the process prints, its log
+                traceback.print_exception(error, file=sys.stderr)  # in full in the log of the process
             self._group.fail(error)
 
     def _advance(self) -> None:

@@ -22,42 +22,30 @@ from msg_analysis.bags.cdr import AgentState, StateFrame
 from msg_analysis.errors import InputError
 
 MARKERS_TOPIC = "markers"
-RATE = 10.0  # markers a second
+RATE = 10.0  # pictures per second of wall time
 LOOK = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Of states only the newest is looked at, and nobody waits for that."""
+"""Only the newest state is drawn, and no writer waits for this reader."""
 
 SPACING = 1.0  # m between neighbours on the circle
 AGENT_SIZE, EDGE_WIDTH, TEXT_SIZE = 0.4, 0.05, 0.35  # m
-MOST_NAMES = 100  # agents up to which each has its number beside it
-FULL_COLOUR = 2.0  # root mean squares from the middle at which the colour is full
-FADING = 0.02  # share of the newest picture in that mean square
-FAREWELL = 2.0  # s for readers to take the last picture
-SILENCE = 3.0  # s without any state, once the run has ended or nobody publishes any more
+MOST_NAMES = 100  # agents up to which each one is labelled with its number
+FULL_COLOUR = 2.0  # distance from the middle with full colour, in root mean squares of all distances
+FADING = 0.02  # weight of the newest picture in that mean square
+FAREWELL = 2.0  # s for readers to acknowledge the last picture
+SILENCE = 3.0  # s without a newer state, once the run has ended or has no publishers
 Colour = tuple[float, float, float]
 LOW, MIDDLE, HIGH = (0.13, 0.40, 0.67), (0.97, 0.97, 0.97), (0.70, 0.09, 0.17)
 
 
 def circle(agents: int) -> list[tuple[float, float]]:
-    """Places of the agents [m], on a circle, the first at the top, clockwise; neighbours ``SPACING`` apart.
-
-    Parameters
-    ----------
-    agents
-        m
-    """
+    """Positions (x, y) of the agents [m] on a circle, clockwise from the top, neighbours ``SPACING`` apart."""
     radius = SPACING / (2 * math.sin(math.pi / agents)) if agents > 1 else 0.0
     angles = [math.pi / 2 - 2 * math.pi * i / agents for i in range(agents)]
     return [(radius * math.cos(angle), radius * math.sin(angle)) for angle in angles]
 
 
 def colour(value: float) -> Colour:
-    """From blue (-1 and less) over white (0) to red (1 and more).
-
-    Parameters
-    ----------
-    value
-        how far, in units of what is usual
-    """
+    """From blue (-1 and less) over white (0) to red (1 and more)."""
     end, part = (HIGH, value) if value > 0 else (LOW, -value)
     part = min(part, 1.0)
     red, green, blue = (middle + part * (full - middle) for middle, full in zip(MIDDLE, end, strict=True))
@@ -65,39 +53,24 @@ def colour(value: float) -> Colour:
 
 
 class Markers(Watcher):
-    """Draws the newest state of every agent, and the links by which it came about.
+    """Draws the newest state of every agent, and the links of the step that led to it.
 
-    Parameters
-    ----------
-    rate
-        pictures a second of the wall
-    replica
-        index from 0 of the replica that is drawn
-    frame
-        of reference, for the header
-    on_note
-        told what somebody should know
+    ``rate``: pictures per second of wall time. ``replica`` counts from 0. ``frame``: frame id of the markers.
     """
 
     def __init__(self, *, rate: float, replica: int, frame: str, on_note: Callable[[str], None]) -> None:
         super().__init__("markers", on_note=on_note)
         self._rate, self._replica, self._frame = rate, replica, frame
-        self._newest: list[bytes | None] = []  # by agent, as it came: most are never looked at
+        self._newest: list[bytes | None] = []  # raw messages by agent: most are never decoded
         self._places: list[tuple[float, float]] = []
-        self._links: list[list[list[int]]] = []  # whom an agent hears, by mode and agent
+        self._links: list[list[list[int]]] = []  # agents heard, by mode and agent, all from 0
         self._square = 0.0  # mean square of the distance from the middle
         self._drawn: list[int] = []  # steps of the last picture
         self._moved = time.monotonic()
         self._writer = self.create_publisher(MarkerArray, MARKERS_TOPIC, NEWEST)
 
     def follow(self) -> None:
-        """See Watcher.
-
-        Raises
-        ------
-        InputError
-            there is no such replica
-        """
+        """See Watcher; InputError if there is no such replica."""
         assert self.record is not None
         experiment = self.record.experiment
         if self._replica >= experiment.run.replicas:
@@ -122,7 +95,7 @@ class Markers(Watcher):
 
         def keep(data: bytes) -> None:
             frame = unwrap(data)
-            if frame is not None and frame[0] == agent + 1:  # else it is a stranger's
+            if frame is not None and frame[0] == agent + 1:  # else not a state of this agent
                 newest[agent] = data
 
         return keep
@@ -157,7 +130,7 @@ class Markers(Watcher):
         return marker
 
     def _agents(self, states: Sequence[AgentState | None]) -> Marker:
-        """A ball for each agent that has been heard, coloured by how far it is from the middle."""
+        """A sphere for each agent that has been heard, coloured by its distance from the mean (or the reference)."""
         assert self.record is not None
         values = [None if state is None else float(state.state[self._replica]) for state in states]
         known = [value for value in values if value is not None]
@@ -185,7 +158,7 @@ class Markers(Watcher):
         marker = self._marker("links", Marker.LINE_LIST, EDGE_WIDTH)
         for link in sorted(links):
             marker.points += [Point(x=self._places[agent][0], y=self._places[agent][1]) for agent in link]
-        if not links:  # RViz refuses a list of lines without points
+        if not links:  # RViz rejects a list of lines without points
             marker.action = Marker.DELETE
         return marker
 
@@ -203,7 +176,7 @@ class Markers(Watcher):
         return marker
 
     def _name(self, agent: int) -> Marker:
-        """The number of an agent, outside of the circle."""
+        """The number of an agent, outside the circle."""
         marker = self._marker("names", Marker.TEXT_VIEW_FACING, TEXT_SIZE, agent)
         x, y = self._places[agent]
         away = 1 + AGENT_SIZE / max(math.hypot(x, y), AGENT_SIZE)
@@ -221,29 +194,14 @@ def _at(x: float, y: float) -> Pose:
 def show_markers(
     *,
     rate: float = RATE,
-    replica: int = 0,
+    replica: int = 0,  # from 0
     frame: str = "network",
-    timeout: float | None = None,
+    timeout: float | None = None,  # s to wait for a network; None: forever
     on_note: Callable[[str], None] = lambda _: None,
 ) -> bool:
-    """Publish markers of the network in this process until it is over, or until Ctrl-C or another signal.
+    """Publish markers of the network until it is over or a signal ends it; whether it was seen to be over.
 
-    Parameters
-    ----------
-    rate, replica, frame, on_note
-        see ``Markers``
-    timeout
-        s to wait for a network; None: for ever
-
-    Returns
-    -------
-    bool
-        Whether the run was seen to be over; the node is then still there: end the process at once
-
-    Raises
-    ------
-    InputError
-        no network came in time, or it has no such replica
+    In that case the node still exists: end the process at once. InputError: no network in time, or no such replica.
     """
     node = run_watcher(
         lambda: Markers(rate=rate, replica=replica, frame=frame, on_note=on_note), timeout=timeout, on_note=on_note

@@ -1,4 +1,4 @@
-"""What is shown of a run at one moment, to whom it may be: a terminal or a browser."""
+"""A snapshot of a run, for a terminal or a browser."""
 
 from __future__ import annotations
 
@@ -16,23 +16,17 @@ if TYPE_CHECKING:
     from msg_analysis.model.experiment import Experiment
 
 WINDOW = 3.0  # s over which speeds are measured
-GRAIN = 0.25  # s
+GRAIN = 0.25  # s; least time between two measurements
 
 
 class Speeds:
-    """Steps per second of every agent over the last seconds."""
+    """Steps per second of every agent over the last ``WINDOW`` seconds."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[float, list[int]]] = deque()
 
     def add(self, steps: Sequence[int]) -> None:
-        """Take the newest step of every agent.
-
-        Parameters
-        ----------
-        steps
-            of agent 1, agent 2, ...
-        """
+        """Take the newest step of every agent, by index."""
         now = time.monotonic()
         if self._seen and now - self._seen[-1][0] < GRAIN:
             return
@@ -41,7 +35,7 @@ class Speeds:
             self._seen.popleft()
 
     def rates(self) -> list[float]:
-        """Of every agent; empty before there is anything to go by."""
+        """Steps per second of every agent; empty before the second measurement."""
         if len(self._seen) < 2:
             return []
         (then, before), (now, after) = self._seen[0], self._seen[-1]
@@ -49,26 +43,14 @@ class Speeds:
 
 
 class Path:
-    """The sojourns of a run, in order: which one a step is in.
-
-    Parameters
-    ----------
-    experiment
-        that is run
-    """
+    """The sojourns of a run in order, to find that of a step."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._rest: Iterator[Sojourn] = sojourns(experiment, first_graph(experiment))
         self._now = next(self._rest, None)
 
     def at(self, step: int) -> Sojourn | None:
-        """The sojourn of the step k -> k+1; steps must not go back.
-
-        Parameters
-        ----------
-        step
-            k
-        """
+        """The sojourn of the step k -> k+1; steps must not decrease from call to call."""
         while self._now is not None and step > self._now.last_step:
             following = next(self._rest, None)
             if following is None:  # the end of the run
@@ -79,33 +61,15 @@ class Path:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """How a run stands.
+    """The state of a run at one time."""
 
-    Attributes
-    ----------
-    steps
-        newest step of every agent; empty before the start
-    rates
-        steps per second of every agent; empty where not known
-    sojourn
-        of the graph that the slowest agent is in; None before the start
-    seconds
-        since the first state [s]
-    left
-        s until the end at this speed; None where not known
-    report
-        the errors up to now; None where there are none yet
-    note
-        what is to be said of that
-    """
-
-    steps: list[int]
-    rates: list[float] = field(default_factory=list)
-    sojourn: Sojourn | None = None
-    seconds: float = 0.0
-    left: float | None = None
-    report: LiveReport | None = None
-    note: str | None = None
+    steps: list[int]  # newest step of every agent, -1: none; empty before the start
+    rates: list[float] = field(default_factory=list)  # steps per second of every agent; empty where not known
+    sojourn: Sojourn | None = None  # of the slowest agent's next step; None before the start
+    seconds: float = 0.0  # s since all agents were first seen to have a state
+    left: float | None = None  # s until the end at the speed of the slowest agent; None where not known
+    report: LiveReport | None = None  # the errors up to now
+    note: str | None = None  # about the errors
 
     @property
     def reached(self) -> int:
@@ -114,18 +78,12 @@ class Moment:
 
     @property
     def rate(self) -> float:
-        """Steps per second of the slowest."""
+        """Steps per second of the slowest agent."""
         return min(self.rates, default=0.0)
 
 
 class Clockwork:
-    """Makes moments of what the agents report.
-
-    Parameters
-    ----------
-    experiment
-        that is run
-    """
+    """Makes moments from the steps that the agents have reached."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._steps = experiment.steps
@@ -133,15 +91,7 @@ class Clockwork:
         self._began: float | None = None
 
     def moment(self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None) -> Moment:
-        """How it stands now.
-
-        Parameters
-        ----------
-        steps
-            newest step of every agent, -1: none; empty before the start
-        report, note
-            see ``Moment``
-        """
+        """The moment now, from the newest step of every agent (-1: none; empty before the start)."""
         reached = min(steps, default=-1)
         if reached < 0:
             return Moment(list(steps), note=note)
@@ -155,13 +105,7 @@ class Clockwork:
 
 
 def setting(experiment: Experiment) -> dict[str, Any]:
-    """What does not change in a run, for a page that draws it: agents, graphs, places.
-
-    Parameters
-    ----------
-    experiment
-        that is run
-    """
+    """What does not change in a run, for a page that draws it: agents, graphs, positions."""
     from msg_analysis.report.layout import places
 
     where = places(experiment.graph_list)
@@ -187,13 +131,7 @@ def setting(experiment: Experiment) -> dict[str, Any]:
 
 
 def moment_document(moment: Moment) -> dict[str, Any]:
-    """A moment for a page; numbers that are not there are None.
-
-    Parameters
-    ----------
-    moment
-        that is shown
-    """
+    """A moment for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1."""
     report, sojourn = moment.report, moment.sojourn
     latest = report.latest if report else None
     return {
