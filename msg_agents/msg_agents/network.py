@@ -1,4 +1,4 @@
-"""The plan of a network: which nodes run in which processes. One source for the runner and for launch files."""
+"""The plan of a network: which nodes run in which processes. The runner and the launch files both use it."""
 
 from __future__ import annotations
 
@@ -14,85 +14,43 @@ from msg_analysis.model.experiment import Experiment
 
 RECORDER, SWITCHER = "recorder", "switcher"
 SMALL = 8
-"""Agents up to which each one gets a process of its own, and which a process has at least in larger networks."""
+"""Of ``processes: auto``: up to so many agents, each has a process of its own; beyond, there is one process per so many
+agents, but not more than the machine has cores."""
 MOST_PROCESSES = 90
-"""Agent processes. Participants of one domain find each other on one machine up to the ``maxInitialPeersRange`` of
-loopback.xml, of which switcher, recorder and what the user watches the run with need some."""
+"""Agent processes. Discovery on one machine finds up to ``maxInitialPeersRange`` of loopback.xml participants, of which
+the switcher, the recorder and the user's own tools need some."""
 
 
 def agent_name(agent: int) -> str:
-    """Name of the node, and namespace of the topics, of an agent.
-
-    Parameters
-    ----------
-    agent
-        index from 0
-    """
+    """Name of the node, and namespace of the topics, of an agent (index from 0; the name counts from 1)."""
     return f"agent_{agent + 1}"
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessPlan:
-    """One process of a network.
-
-    Attributes
-    ----------
-    name
-        what people call it
-    arguments
-        of the command ``msg-agents`` that runs it
-    agents
-        indices from 0 of the agents in it
-    resumes
-        whether the same command takes over when the process has been killed
-    """
+    """One process of a network."""
 
     name: str
-    arguments: tuple[str, ...]
-    agents: tuple[int, ...] = ()
-    resumes: bool = False
+    arguments: tuple[str, ...]  # of the command ``msg-agents``
+    agents: tuple[int, ...] = ()  # indices from 0
+    resumes: bool = False  # whether the same command takes over after the process was killed
 
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """What one host runs of a network that is spread over several.
+    """What one host runs of a network that is spread over several hosts."""
 
-    Attributes
-    ----------
-    agents
-        indices from 0, ascending
-    home
-        whether recorder and switcher are here
-    discovery_timeout
-        s for which nodes look for those of other hosts, which people start
-    patience
-        s after which nodes end that have been left alone
-    """
-
-    agents: tuple[int, ...]
-    home: bool
-    discovery_timeout: float
-    patience: float
+    agents: tuple[int, ...]  # indices from 0, ascending
+    home: bool  # whether recorder and switcher run here
+    discovery_timeout: float  # s for which nodes look for those of other hosts, which the user starts
+    patience: float  # s that companions may be gone before a node ends itself
 
 
 def count_processes(experiment: Experiment, agents: int | None = None) -> int:
-    """Agent processes that an experiment asks for.
-
-    Parameters
-    ----------
-    experiment
-        what is run
-    agents
-        how many of them are on this machine; None: all
-
-    Raises
-    ------
-    InputError
-        more than discovery can handle
-    """
+    """Number of processes for ``agents`` agents (None: all) on this machine; InputError: too many for discovery."""
     agents, wanted = experiment.agents if agents is None else agents, experiment.run.processes
     if wanted == "auto":
-        # A message to another process costs more than the step that it is for: no more processes than can run at once.
+        # A message to another process costs more than the step it is for: no more processes than can run at once.
         return agents if agents <= SMALL else min(math.ceil(agents / SMALL), MOST_PROCESSES, os.cpu_count() or 1)
     count = agents if wanted == "one_per_agent" else min(int(wanted), agents)
     if count > MOST_PROCESSES:
@@ -104,68 +62,32 @@ def count_processes(experiment: Experiment, agents: int | None = None) -> int:
 
 
 def most_processes(experiment: Experiment, agents: int) -> int:
-    """Agent processes that an experiment may have for so many agents, on a machine of any number of cores.
-
-    Parameters
-    ----------
-    experiment
-        that is run
-    agents
-        that are to be spread over them
-    """
+    """Most processes that an experiment may have for so many agents, on a machine of any number of cores."""
     wanted = experiment.run.processes
     return min(agents, MOST_PROCESSES, int(wanted) if isinstance(wanted, int) else agents)
 
 
 def discovery_timeout(agents: int, processes: int) -> float:
-    """Seconds after which a node of a network says whom it has not found.
+    """Seconds after which a node of a network of so many agents and processes gives up on the missing ones.
 
-    Who is started first waits for who is started last; processes start at two or more a second, and in large ones it
-    takes a while until every endpoint is known everywhere.
-
-    Parameters
-    ----------
-    agents
-        m
-    processes
-        of the whole network
+    The first process waits for the last one: two or more start per second, and many endpoints take longer to discover.
     """
     return max(DISCOVERY_TIMEOUT, 2.0 * processes + 0.1 * agents)
 
 
 def plan_network(
     experiment: Experiment,
-    run_file: Path,
-    bag: Path | None,
-    checkpoints: Path | None = None,
+    run_file: Path,  # run record, read by every node
+    bag: Path | None,  # directory to record to; None: no recorder
+    checkpoints: Path | None = None,  # directory of the states for a takeover; None: killed processes cannot resume
     *,
     use_sim_time: bool = False,
     storage: Storage = DEFAULT,
     share: Share | None = None,
 ) -> list[ProcessPlan]:
-    """The processes of a run, in the order in which they should be started.
+    """The processes of a run, in the order in which to start them; with ``share``, those of this host only.
 
-    Parameters
-    ----------
-    experiment
-        what is run
-    run_file
-        the run record that every node is given
-    bag
-        directory to record to; None: no recorder
-    checkpoints
-        directory for what agents and switcher need to go on after being killed; None: they cannot
-    use_sim_time
-        whether the nodes take the time from ``/clock``
-    storage
-        how the recorder stores the bag
-    share
-        what of it runs on this host, of several, one of which records; None: all
-
-    Raises
-    ------
-    InputError
-        more processes than discovery can handle
+    InputError: more processes than discovery can handle.
     """
     here = tuple(range(experiment.agents)) if share is None else share.agents
     count = count_processes(experiment, len(here))
@@ -187,7 +109,7 @@ def plan_network(
             files += ("--split-size", repr(storage.split_size / MEGABYTE))
         plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
     for index in range(count):
-        # Neighbouring numbers share a process: in most graphs they are neighbours, and their messages stay inside.
+        # Consecutive agents share a process: in most graphs they are neighbours, and their messages stay inside.
         agents = here[index * len(here) // count : (index + 1) * len(here) // count]
         numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
         first, last = agents[0] + 1, agents[-1] + 1

@@ -1,4 +1,4 @@
-"""What all nodes of a network have in common."""
+"""What all nodes of a network have in common: topics, reasons for refusing messages, the base class."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PROGRESS_TOPIC = "progress"
 END_TOPIC = "end"
 EPOCH_TOPIC = "epoch"
 RESEND_TOPIC = "resend"
-FAREWELL = 4.0  # s for readers to acknowledge what was last; more than the 3 s between two heartbeats of Fast DDS
+FAREWELL = 4.0  # s for readers to acknowledge the last messages; more than Fast DDS's default heartbeat period, 3 s
 NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
 OTHER_RUN, UNDECODABLE = "other run", "undecodable"
 UNKNOWN_AGENT, OTHER_AGENT = "unknown agent", "of another agent than its topic"
@@ -40,41 +40,17 @@ REPEATS = {Refusal.OLD, Refusal.KNOWN, RECORDED}
 
 
 def state_topic(agent: int) -> str:
-    """Topic of an agent's states (index from 0).
-
-    Parameters
-    ----------
-    agent
-        index from 0
-    """
+    """Topic of an agent's states (index from 0)."""
     return f"{agent_name(agent)}/state"
 
 
 def truth_topic(agent: int) -> str:
-    """Topic of an agent's states as they are, where it publishes them with noise (index from 0).
-
-    Parameters
-    ----------
-    agent
-        index from 0
-    """
+    """Topic of an agent's true states (index from 0), if others hear a noisy state or only a part of it."""
     return f"{agent_name(agent)}/truth"
 
 
 def why_not(data: bytes, record: RunRecord, agent: int, length: int) -> str:
-    """What is wrong with a message that the readers of a topic could not take.
-
-    Parameters
-    ----------
-    data
-        CDR bytes
-    record
-        of the run that the readers belong to
-    agent
-        whose topic it is (index from 0)
-    length
-        of the states there
-    """
+    """Why the readers of an agent's topic (index from 0) cannot take a message; ``length``: of the states there."""
     try:
         message = AgentState.decode(data)
     except CdrError:
@@ -89,19 +65,9 @@ def why_not(data: bytes, record: RunRecord, agent: int, length: int) -> str:
 
 
 class NetworkNode(QuietNode):
-    """A node of a run.
+    """A node of a run; ``record.run`` marks every message of the run. ``done`` ends the node, with an error or without.
 
-    Parameters
-    ----------
-    name
-        of the node
-    record
-        of the run; the run id is the mark of every message that belongs to it
-
-    Raises
-    ------
-    InputError
-        its name was changed by arguments of ROS 2: by their names the nodes of a run find each other
+    InputError: arguments of ROS 2 changed its name, by which the nodes of a run find each other.
     """
 
     def __init__(self, name: str, *, record: RunRecord) -> None:
@@ -120,16 +86,9 @@ class NetworkNode(QuietNode):
         self._leaving: list[NetworkNode] = [self]
 
     def refuse(self, reason: str, topic: str) -> None:
-        """Count a message that is no part of this run; say so the first time on this topic for this reason.
+        """Count a message that is not part of this run, and warn at the first one per topic and reason.
 
-        What is here already is only counted: agents send again what one of them may have missed.
-
-        Parameters
-        ----------
-        reason
-            a few words
-        topic
-            that it came on
+        Repeated messages are only counted: agents send again what a restarted one may have missed.
         """
         if reason in REPEATS:
             self.repeated += 1
@@ -139,44 +98,36 @@ class NetworkNode(QuietNode):
             self.get_logger().warning(f"refused a message on {topic}: {reason} (further ones are only counted)")
 
     def health(self) -> Health:
-        """How this node is, asked about once a second."""
+        """State of this node; called about once a second."""
         raise NotImplementedError
 
     def found(self) -> bool:
-        """Whether all nodes have been found that should read what this node publishes. Asked again and again."""
+        """Whether all nodes that should read what this node publishes have been discovered; polled."""
         return True
 
     def awaited(self) -> list[str]:
-        """Names of those who have not been found yet."""
+        """Names of the nodes that have not been discovered yet."""
         return []
 
     def companions(self) -> list[str]:
-        """Names of those without whom the run cannot go on. Whom agents hear would be too many to ask after."""
+        """Names of the nodes without which the run cannot go on; the peers of an agent would be too many to check."""
         return [SWITCHER]
 
     def awaited_clock(self) -> list[str]:
-        """Who should tell the time and has not been found."""
+        """The publisher of ``/clock``, if one is needed and has not been discovered."""
         if not self.get_parameter("use_sim_time").value or self.count_publishers(CLOCK_TOPIC):
             return []
         return [f"a publisher of {CLOCK_TOPIC}"]
 
     def namesakes(self) -> list[str]:
-        """Names of nodes of this run that more than one node bears."""
+        """Names of this run that more than one node has."""
         here = self.get_namespace()
         count = Counter(name for name, namespace in self.get_node_names_and_namespaces() if namespace == here)
         names = [*map(agent_name, range(self.record.experiment.agents)), SWITCHER, RECORDER]
         return [name for name in names if count[name] > 1]
 
     def clash(self, names: Iterable[str], seconds: float) -> InputError:
-        """The error of a node that has not been alone with these names for some time.
-
-        Parameters
-        ----------
-        names
-            of nodes that somebody else has too
-        seconds
-            for which that has been so [s]
-        """
+        """The error after several nodes have had the same name for so many seconds."""
         return InputError(
             f"after {seconds:.0f} s there was still more than one {', '.join(names)} in the same ROS_DOMAIN_ID "
             f"({os.environ.get('ROS_DOMAIN_ID', '0')}): is this run, or another one, under way there? End it, or "
@@ -184,40 +135,23 @@ class NetworkNode(QuietNode):
         )
 
     def begin(self) -> None:
-        """Everyone has been found: start."""
+        """Start: all nodes have been discovered."""
 
     def finish(self, *, complete: bool, deadline: float) -> None:
-        """The process is about to end: the node has done its part, or (not complete) was interrupted.
+        """The process is about to end; ``complete``: the node has done its part (False: it was interrupted).
 
-        Parameters
-        ----------
-        complete
-            whether it has done its part
-        deadline
-            until when it may wait for others, by the monotonic clock [s]
+        It may wait for other nodes until ``deadline`` [s of the monotonic clock].
         """
 
     def fail(self, error: Exception) -> None:
-        """End the process with an error.
-
-        Parameters
-        ----------
-        error
-            that the process is to end with
-        """
+        """End the process with an error."""
         if not self.done.done():
             self.done.set_exception(error)
 
     def leave_at_end(self, nodes: Iterable[NetworkNode] | None = None) -> None:
-        """Be done, with the other nodes of the process, when the switcher says that everybody is.
+        """End these nodes of the process (default: this one) when the switcher announces the end of the run.
 
-        Whoever leaves earlier may take with it what others still need: unread messages, or the acknowledgements that
-        they wait for.
-
-        Parameters
-        ----------
-        nodes
-            of this process; None: this one alone
+        A node that leaves earlier may take with it what others need: unread messages, or acknowledgements.
         """
         self._leaving = [self] if nodes is None else list(nodes)
         self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LATCHED, raw=True)
@@ -229,15 +163,7 @@ class NetworkNode(QuietNode):
                     node.done.set_result(None)
 
     def decode_progress(self, data: bytes, topic: str) -> Progress | None:
-        """A Progress message of this run; None (and counted) if it is no such thing.
-
-        Parameters
-        ----------
-        data
-            CDR bytes
-        topic
-            that it came on
-        """
+        """A Progress message of this run; None, and counted, if the bytes are not one."""
         try:
             progress = Progress.decode(data)
         except CdrError:
@@ -252,38 +178,16 @@ class NetworkNode(QuietNode):
         return progress
 
     def progress(self, agent: int, step: int) -> bytes:
-        """A Progress message: number of the agent from 1 (or NOT_AN_AGENT), and step.
-
-        Parameters
-        ----------
-        agent
-            number from 1, or NOT_AN_AGENT
-        step
-            k
-        """
+        """Bytes of a Progress message; ``agent``: number from 1, or NOT_AN_AGENT."""
         return Progress(self._step_clock.nanoseconds(step), self.run, agent, step).encode()
 
     def has_readers(self, publisher: Publisher, expected: Sequence[str]) -> bool:
-        """Whether all the expected nodes read a topic of ours.
-
-        Parameters
-        ----------
-        publisher
-            of this node
-        expected
-            names of nodes
-        """
-        # Names come out of a look at every endpoint of the network: not before they can all be there.
+        """Whether all the expected nodes read a topic of this node."""
+        # Reading the names inspects every endpoint of the network: only once enough readers are there.
         return publisher.get_subscription_count() >= len(expected) and not self.missing_readers(publisher, expected)
 
     def has_guests(self, publisher: Publisher) -> bool:
-        """Whether somebody who does not belong to the run wants all of a topic of ours.
-
-        Parameters
-        ----------
-        publisher
-            of this node
-        """
+        """Whether a node that is not part of the run reads a topic of this node reliably."""
         own = {RECORDER, *map(agent_name, range(self.record.experiment.agents))}
         return any(
             reader.node_name not in own and reader.qos_profile.reliability == ReliabilityPolicy.RELIABLE
@@ -291,20 +195,12 @@ class NetworkNode(QuietNode):
         )
 
     def missing_readers(self, publisher: Publisher, expected: Sequence[str]) -> list[str]:
-        """Names of the expected nodes that do not read a topic of ours yet.
-
-        Parameters
-        ----------
-        publisher
-            of this node
-        expected
-            names of nodes
-        """
+        """Names of the expected nodes that do not read a topic of this node yet."""
         readers = self.get_subscriptions_info_by_topic(publisher.topic_name)
         found = {reader.node_name for reader in readers}
         missing = [name for name in expected if name not in found]
-        # Strangers who ask for less than is offered are matched too: all must be, for ours to be among them. Those who
-        # ask for history of a topic that keeps none never will be.
+        # Other readers are matched too: all must be, so that ours are among them. Readers that ask for history of a
+        # topic that keeps none are never matched.
         latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         matching = sum(latched or r.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL for r in readers)
         if not missing and publisher.get_subscription_count() < matching:

@@ -1,4 +1,4 @@
-"""Follows a run beside it: its errors up to now, from what the agents keep, in a thread that goes last."""
+"""Errors of a run while it goes on, from the states that its agents keep, in a thread of low priority."""
 
 from __future__ import annotations
 
@@ -17,29 +17,17 @@ from msg_analysis.model.record import RunRecord
 if TYPE_CHECKING:
     from msg_analysis.inference.online import LiveEstimate, LiveReport
 
-PERIOD = 0.5  # s between two looks
-FAREWELL = 2.0  # s for what has not been looked at when the run ends
-NICE = 10  # of the thread: on a machine that has nothing left, the network goes first
+PERIOD = 0.5  # s between two updates
+FAREWELL = 2.0  # s for the states that are left when the run ends
+NICE = 10  # of the thread: on a busy machine the network goes first
 MOST_NODES = 20
-"""Agents up to which each gets a standard error; beyond, that would take the network's time."""
+"""Up to this many agents, each gets a standard error; for more it would cost the network too much CPU time."""
 
 
 class Observer:
-    """Works out the errors of a run while it goes on.
+    """Estimates the errors of a run; ``checkpoints``: directory in which its agents keep their states.
 
-    Parameters
-    ----------
-    record
-        of the run
-    checkpoints
-        directory in which its agents keep their states
-
-    Attributes
-    ----------
-    report
-        the newest numbers; None before the first
-    note
-        why there are none; None where there are
+    Its thread sets ``report`` (the newest numbers; None before the first) and ``note`` (why there are none).
     """
 
     def __init__(self, record: RunRecord, checkpoints: Path) -> None:
@@ -52,17 +40,11 @@ class Observer:
         self._thread.start()
 
     def look(self, reached: int) -> None:
-        """Tell which state all agents have published.
-
-        Parameters
-        ----------
-        reached
-            its step; -1: none
-        """
+        """Set the newest step that all agents have published (-1: none)."""
         self._reached = reached
 
     def end(self) -> None:
-        """Take in what is there by now, as far as that does not take long, and stop; the last report stays."""
+        """Process what is there by now, for about ``FAREWELL`` s at most, and stop; the last report stays."""
         self._over.set()
         self._thread.join()
 
@@ -71,7 +53,7 @@ class Observer:
 
         from msg_analysis.inference.online import LiveEstimate  # takes long to import, while the network starts
 
-        with suppress(OSError, AttributeError):  # each thread has its own on Linux
+        with suppress(OSError, AttributeError):  # on Linux each thread has its own priority
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         try:
             with threadpool_limits(1):

@@ -1,4 +1,4 @@
-"""Does something get on? Steps per second, and when it is time to say that there are none."""
+"""Stall detection: steps per second, and when to warn that there are none."""
 
 from __future__ import annotations
 
@@ -8,29 +8,15 @@ PATIENCE = 5.0  # s
 
 
 class Pace:
-    """Looks at a step counter now and then.
-
-    Attributes
-    ----------
-    rate
-        steps per second between the last two looks
-    stalled
-        s for which there has been no step; 0.0 if there was one since the last look
-    """
+    """Rate of a step counter between two calls of ``look``."""
 
     def __init__(self) -> None:
         self._step, self._time = 0, time.monotonic()
         self._patience = PATIENCE
-        self.rate = self.stalled = 0.0
+        self.rate = self.stalled = 0.0  # steps/s between the last two looks; s without a step
 
     def look(self, step: int) -> bool:
-        """Whether it is time to complain: after ``PATIENCE`` s without a step, and then ever more rarely.
-
-        Parameters
-        ----------
-        step
-            that everybody has reached
-        """
+        """Whether to warn now: after ``PATIENCE`` s without a step, and again whenever the stall has doubled."""
         now = time.monotonic()
         elapsed, made = now - self._time, step - self._step
         self._step, self._time = step, now

@@ -1,4 +1,4 @@
-"""A run on a terminal: how far it is, which graph is active, and its errors beside the prediction."""
+"""A run on a terminal: progress, active graph, and errors beside the prediction."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from msg_analysis.inference.estimates import Estimate
     from msg_analysis.model.experiment import Experiment
 
-HALF = 1.959963984540054
+HALF = 1.959963984540054  # standard errors from the middle to the end of a 95 % interval
 COLOURS = (
     "blue",
     "yellow",
@@ -33,17 +33,7 @@ _LEGEND = "  ● measured ◆ predicted"
 
 
 def show(moment: Moment, experiment: Experiment, *, width: int, height: int) -> RenderableType:
-    """The panel.
-
-    Parameters
-    ----------
-    moment
-        of the run
-    experiment
-        that is run
-    width, height
-        of the terminal, in characters
-    """
+    """The panel, for a terminal of ``width`` by ``height`` characters."""
     agents = "1 agent" if experiment.agents == 1 else f"{experiment.agents} agents"
     title = Text(f"{experiment.name}: {agents}, {experiment.run.pace}", style="bold")
     if moment.reached < 0:
@@ -59,15 +49,7 @@ def show(moment: Moment, experiment: Experiment, *, width: int, height: int) -> 
 
 
 def plain_line(moment: Moment, experiment: Experiment) -> str:
-    """The same in a line.
-
-    Parameters
-    ----------
-    moment
-        of the run
-    experiment
-        that is run
-    """
+    """The same as one line of text."""
     parts = [f"step {moment.reached} of {experiment.steps}", f"{moment.rate:.0f} steps/s"]
     if moment.sojourn is not None:
         parts.append(f"graph {experiment.graph_list[moment.sojourn.mode].name}")
@@ -97,7 +79,7 @@ def _graph(moment: Moment, experiment: Experiment) -> Text:
     graph = experiment.graph_list[sojourn.mode]
     text.append(graph.name, style=f"bold {COLOURS[sojourn.mode % len(COLOURS)]}")
     now, dt = moment.reached, experiment.step_length
-    # Where the run ends, the sojourn does not.
+    # The end of the run cuts the last sojourn short.
     end = "the end" if sojourn.last_step == experiment.steps - 1 else f"{sojourn.last_step + 1}"
     held = (now - sojourn.first_step) * dt
     text.append(f"  for {held:.3g} units of time, steps {sojourn.first_step} to {end}, after {sojourn.sequence} jumps")
@@ -123,15 +105,7 @@ def _system(moment: Moment, width: int) -> list[RenderableType]:
 
 
 def gauge(estimate: Estimate, width: int) -> Text:
-    """The 95 % interval of an error, and its prediction, on one line: ``├───●──◆───┤``.
-
-    Parameters
-    ----------
-    estimate
-        measured, predicted, and standard error
-    width
-        of the line
-    """
+    """The 95 % interval of an error, and its prediction, in ``width`` characters: ``├───●──◆───┤``."""
     measured, predicted, error = estimate.measured, estimate.predicted, estimate.standard_error
     if measured is None or predicted is None or not error or not math.isfinite(error) or width < 10:
         return Text()
@@ -154,7 +128,7 @@ def gauge(estimate: Estimate, width: int) -> Text:
 
 
 def _agents(moment: Moment, experiment: Experiment, room: int) -> list[RenderableType]:
-    """A row each; of many, how they are spread and who is furthest off."""
+    """One row per agent; of many, a summary and the rows that are furthest off, or slowest."""
     nodes = moment.report.nodes if moment.report else []
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
     for name in ("agent", "step", "steps/s", "error", "predicted", "z"):

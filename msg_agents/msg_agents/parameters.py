@@ -1,8 +1,7 @@
 """The options of a command that is a ROS 2 node, as parameters of its nodes.
 
 An option is declared once, for the command line. Name, type, range, default and description of the ROS parameter follow
-from it, and what is given by ``--ros-args -p`` or ``--params-file`` is checked by the same code. What the command line
-says wins over parameters, as everywhere in ROS 2.
+from it, and the same code checks what ``--ros-args -p`` or ``--params-file`` give. The command line takes precedence.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ if TYPE_CHECKING:
     from rclpy.parameter import Parameter
 
 NAMES = {"run_record": "run", "readers": "await", "subscribers": "wait_for_subscribers", "remaps": "remap"}
-"""Parameters that are not called like the argument of the command's function."""
+"""Parameters that have another name than the argument of the command's function."""
 NO_PARAMETERS = {"use_sim_time", "domain", "as_json", "help"}
-"""Options that rclpy declares itself, that are settled before there is a node, or that are about the terminal."""
+"""Options that rclpy declares itself, that are used before there is a node, or that concern the terminal."""
 QOS_OVERRIDES = "qos_overrides"
 ROS_OWN = {"use_sim_time", "start_type_description_service"}
 GIVES_PARAMETERS = {"-p", "--param", "--params-file"}
@@ -40,31 +39,15 @@ LARGEST_INTEGER = 2**63 - 1
 
 @dataclass(slots=True)
 class ProcessParameters:
-    """What this process was told, for the nodes that it makes.
+    """The options of this process, for the nodes that it makes."""
 
-    Attributes
-    ----------
-    values
-        by name of the option in the command's function
-    options
-        which of them are parameters
-    qos_overrides
-        whether somebody may have asked for another quality of service
-    """
-
-    values: dict[str, Any] = field(default_factory=dict)
-    options: Sequence[click.Parameter] = ()
-    qos_overrides: bool = False
+    values: dict[str, Any] = field(default_factory=dict)  # by argument name in the command's function
+    options: Sequence[click.Parameter] = ()  # those that are parameters
+    qos_overrides: bool = False  # whether the arguments mention another quality of service
     _declarations: list[tuple[str, Any, ParameterDescriptor]] = field(default_factory=list, init=False)
 
     def declare(self, node: Node) -> None:
-        """Declare all of them on a node, with the values that hold, for ``ros2 param`` and the like.
-
-        Parameters
-        ----------
-        node
-            of this process
-        """
+        """Declare all parameters on a node, with their values, for ``ros2 param`` and similar tools."""
         if not self._declarations:  # the same for every node of the process
             self._declarations = [
                 (name_of(option), _ros_value(option, self.values.get(option.name or "")), describe(option))
@@ -74,17 +57,11 @@ class ProcessParameters:
 
 
 PROCESS = ProcessParameters()
-"""Like rclpy's default context, one for the process, which has one command line."""
+"""One per process, as rclpy's default context: a process has one command line."""
 
 
 def options_of(command: click.Command) -> list[click.Parameter]:
-    """The options and arguments of a command that are parameters of its nodes.
-
-    Parameters
-    ----------
-    command
-        that is a node
-    """
+    """The options and arguments of a command that are parameters of its nodes."""
     return [
         each
         for each in command.params
@@ -93,25 +70,13 @@ def options_of(command: click.Command) -> list[click.Parameter]:
 
 
 def name_of(option: click.Parameter) -> str:
-    """Name of its parameter.
-
-    Parameters
-    ----------
-    option
-        of such a command
-    """
+    """Name of the parameter of an option."""
     name = option.name or ""
     return NAMES.get(name, name)
 
 
 def describe(option: click.Parameter) -> ParameterDescriptor:
-    """Type, range, description. All are read-only: a node does not change what it is in the middle of a run.
-
-    Parameters
-    ----------
-    option
-        of such a command
-    """
+    """Type, range and description; all are read-only, because a node does not change during a run."""
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
     kind, constraints = option.type, ""
@@ -143,7 +108,7 @@ def _type_of(option: click.Parameter) -> Parameter.Type:
 
 
 def _ros_value(option: click.Parameter, value: Any) -> Any:
-    """A value as rclpy takes it; of what has none, the type."""
+    """A value as rclpy takes it; its type if there is no value."""
     if value is None or value == ():
         return _type_of(option)
     if isinstance(value, tuple):
@@ -153,13 +118,7 @@ def _ros_value(option: click.Parameter, value: Any) -> Any:
 
 @contextlib.contextmanager
 def ros_arguments() -> Iterator[None]:
-    """Say what is wrong with arguments for ROS 2 that rcl does not take.
-
-    Raises
-    ------
-    InputError
-        rcl does not take them; its reason is in the text
-    """
+    """Turn an error of rcl about arguments for ROS 2 into an InputError with its reason."""
     from msg_agents.errors import RCLError
 
     try:
@@ -177,40 +136,22 @@ def ros_arguments() -> Iterator[None]:
 
 
 def mention_qos(arguments: Sequence[str]) -> bool:
-    """Whether somebody may have asked for another quality of service, for any node.
-
-    Parameters
-    ----------
-    arguments
-        of ROS 2, from ``--ros-args`` on
-    """
+    """Whether arguments of ROS 2 (from ``--ros-args`` on) mention another quality of service, for any node."""
     if any(QOS_OVERRIDES in word for word in arguments):
         return True
     for option, file in itertools.pairwise(arguments):
         if option == "--params-file":
-            with contextlib.suppress(OSError, UnicodeDecodeError):  # rcl says what is wrong with it
+            with contextlib.suppress(OSError, UnicodeDecodeError):  # rcl reports the error
                 if QOS_OVERRIDES in Path(file).read_text(encoding="utf-8"):
                     return True
     return False
 
 
 def given(node_name: str, arguments: Sequence[str]) -> dict[str, Parameter]:
-    """The parameters that the arguments of ROS 2 give to a node, its namespace and remapping considered.
+    """The parameters that arguments of ROS 2 (from ``--ros-args`` on) give to a node; InputError: rcl rejects them.
 
-    rcl alone knows which these are, and says so to a node only: to one of no network, in a context of its own that
-    is gone before the process joins the network of the run.
-
-    Parameters
-    ----------
-    node_name
-        of the node
-    arguments
-        of ROS 2, from ``--ros-args`` on
-
-    Raises
-    ------
-    InputError
-        rcl does not take them
+    Only rcl resolves namespaces and remappings, and only for a node: this makes one without discovery, in a context of
+    its own, and destroys it. ``os.environ`` is changed meanwhile.
     """
     import rclpy
     from rclpy.context import Context
@@ -233,7 +174,7 @@ def given(node_name: str, arguments: Sequence[str]) -> dict[str, Parameter]:
                 allow_undeclared_parameters=True,
                 automatically_declare_parameters_from_overrides=True,
             )
-        except ValueError as error:  # the type of nothing cannot be told
+        except ValueError as error:  # an empty list has no type
             raise InputError("--ros-args: a parameter is an empty list: leave it out") from error
         found = dict(node.get_parameters_by_prefix(""))
         node.destroy_node()
@@ -249,23 +190,9 @@ def given(node_name: str, arguments: Sequence[str]) -> dict[str, Parameter]:
 def merge(
     ctx: click.Context, options: Sequence[click.Parameter], parameters: Mapping[str, Parameter], known: Iterable[str]
 ) -> dict[str, Any]:
-    """Values of the options that are given as parameters and not on the command line.
+    """Values of the options that are given as parameters and not on the command line, by argument name.
 
-    Parameters
-    ----------
-    ctx
-        of the command
-    options
-        of the command that are parameters
-    parameters
-        given by the arguments of ROS 2, by name
-    known
-        names of the parameters of all our nodes: a file may be for several of them
-
-    Raises
-    ------
-    InputError
-        an unknown name, a wrong type, a value that the option would not take
+    ``known``: parameters of all our nodes, since one file may be for several. InputError: unknown name or bad value.
     """
     own = {name_of(option): option for option in options}
     known = set(known) | own.keys()

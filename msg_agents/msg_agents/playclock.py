@@ -1,4 +1,4 @@
-"""Which time of the bag it is while a bag is played. Without ROS."""
+"""The time of a bag while it is played. No ROS."""
 
 from __future__ import annotations
 
@@ -10,18 +10,9 @@ from msg_analysis.model.steptime import SECOND
 
 
 class PlayClock:
-    """Time of a bag, at some rate of the wall's; it can be stopped, and held back.
+    """Time of a bag [ns], at ``rate`` seconds of the bag per second of wall time (inf: as fast as possible).
 
-    Parameters
-    ----------
-    start
-        time of the bag [ns] at which it begins
-    rate
-        seconds of the bag per second of the wall; inf: as fast as it goes
-    paused
-        whether it stands at first
-    wall
-        seconds that pass
+    It can be paused, and held back while nothing is played.
     """
 
     def __init__(
@@ -34,24 +25,16 @@ class PlayClock:
 
     @property
     def rate(self) -> float:
-        """Seconds of the bag per second of the wall."""
+        """Seconds of the bag per second of wall time."""
         return self._rate
 
     @property
     def paused(self) -> bool:
-        """Whether it stands."""
+        """Whether it is paused."""
         return self._paused
 
     def now(self, limit: int) -> int:
-        """Time of the bag [ns], but not after ``limit``, the time of what is to be played next.
-
-        So whoever takes the time from here never sees a message of the past.
-
-        Parameters
-        ----------
-        limit
-            time of the bag [ns] of what is to be played next
-        """
+        """Time of the bag [ns], at most ``limit`` (of the next message): no message is older than the clock."""
         if self._paused:
             return self._then
         if math.isinf(self._rate):
@@ -59,13 +42,7 @@ class PlayClock:
         return min(limit, self._then + round((self._wall() - self._since) * self._rate * SECOND))
 
     def until(self, when: int) -> float:
-        """Seconds of the wall until a time of the bag [ns]: inf while it stands, 0 or less if it has come.
-
-        Parameters
-        ----------
-        when
-            time of the bag [ns]
-        """
+        """Seconds of wall time until a time of the bag [ns]: inf while paused, 0 or less if it has come."""
         if self._paused:
             return math.inf
         if math.isinf(self._rate):
@@ -73,49 +50,21 @@ class PlayClock:
         return (when - self._then) / (self._rate * SECOND) - (self._wall() - self._since)
 
     def jump(self, when: int) -> None:
-        """Go to a time of the bag [ns].
-
-        Parameters
-        ----------
-        when
-            time of the bag [ns]
-        """
+        """Go to a time of the bag [ns]."""
         self._set(when)
 
     def hold(self, seconds: float) -> None:
-        """What has just passed on the wall did not count: nobody took what was played.
-
-        Parameters
-        ----------
-        seconds
-            of the wall [s]
-        """
+        """Do not count the last so many seconds of wall time: nothing was played in them."""
         self._since += seconds
 
     def pause(self, paused: bool, limit: int) -> None:
-        """Stand, or go on from there; ``limit`` as in ``now``.
-
-        Parameters
-        ----------
-        paused
-            whether to stand
-        limit
-            as in ``now`` [ns]
-        """
+        """Pause, or go on from the same time; ``limit`` as in ``now``."""
         if paused != self._paused:
             self._set(self.now(limit))
             self._paused = paused
 
     def change_rate(self, factor: float, limit: int) -> None:
-        """Go faster or slower from now on; ``limit`` as in ``now``.
-
-        Parameters
-        ----------
-        factor
-            on the rate that it has
-        limit
-            as in ``now`` [ns]
-        """
+        """Multiply the rate by ``factor`` from now on; ``limit`` as in ``now``. The rate inf stays."""
         if not math.isinf(self._rate):
             self._set(self.now(limit))
             self._rate *= factor

@@ -34,121 +34,54 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.steptime import SECOND
 
 POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
-LOOK = 0.05  # s between two looks at the keyboard
-STOPPED = 1.0  # s without a look around, after which the process was stopped, or as good as that
+LOOK = 0.05  # s between two checks of the keyboard
+STOPPED = 1.0  # s without a check, after which the process is taken to have been stopped
 SHOW = 0.2  # s between two reports of progress
 ACK_SLICE = 0.2  # s
-PATIENCE = 5.0  # s in which readers acknowledge the end; the middleware may ask for that no sooner than after 3 s
-BLOCKED = 0.05  # s that one message takes to publish, from which on it is a reader who holds the player back
-REFUSED = 0.05  # s; a reader that does not keep up blocks for 100 ms
+PATIENCE = 5.0  # s for readers to acknowledge the end before a note; the middleware may ask them only after 3 s
+BLOCKED = 0.05  # s to publish one message, from which on a reader is holding the player back
+REFUSED = 0.05  # s; an error that comes sooner is final: a slow reader blocks for 100 ms
 RATE_STEP = 1.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayOptions:
-    """How a bag is played.
+    """How a bag is played."""
 
-    Attributes
-    ----------
-    rate
-        seconds of the bag per second; inf: as fast as the readers take it
-    start_offset, duration
-        s of the bag left out at the beginning, and played (None: all of the rest)
-    loop
-        whether to begin again at the end
-    paused
-        whether to stand at first
-    clock
-        Hz at which ``/clock`` is published; None: not
-    topics, exclude
-        see ``select_topics``
-    remaps
-        see ``parse_remaps``
-    subscribers
-        how many readers every topic must have before it begins
-    readers
-        names of nodes that must read every topic before it begins
-    wait_timeout
-        s to wait for them
-    """
-
-    rate: float = 1.0
-    start_offset: float = 0.0
-    duration: float | None = None
+    rate: float = 1.0  # seconds of the bag per second; inf: as fast as the readers take it
+    start_offset: float = 0.0  # s of the bag left out at the beginning
+    duration: float | None = None  # s of the bag that are played; None: all of the rest
     loop: bool = False
-    paused: bool = False
-    clock: float | None = None
-    topics: Sequence[str] = ()
+    paused: bool = False  # whether to start paused
+    clock: float | None = None  # Hz at which ``/clock`` is published; None: not
+    topics: Sequence[str] = ()  # see ``select_topics``, also for ``exclude``
     exclude: Sequence[str] = ()
-    remaps: Sequence[str] = ()
-    subscribers: int = 0
-    readers: Sequence[str] = ()
-    wait_timeout: float = 30.0
+    remaps: Sequence[str] = ()  # see ``parse_remaps``
+    subscribers: int = 0  # readers that every topic must have before playing begins; latched ones need none
+    readers: Sequence[str] = ()  # names of nodes that must read every such topic
+    wait_timeout: float = 30.0  # s to wait for them
 
 
 @dataclass(slots=True)
 class Played:
-    """What has been played so far.
+    """What has been played so far."""
 
-    Attributes
-    ----------
-    messages
-        published
-    seconds
-        of the wall since the first message [s]
-    held_back
-        s of them in which readers did not take what was published
-    now
-        time of the bag, s from its start
-    length
-        s of the bag, all of it
-    rate
-        at which it is played [s of the bag per second]
-    paused
-        whether it stands
-    begun
-        whether the readers who are waited for were there
-    """
-
-    messages: int = 0
-    seconds: float = 0.0
-    held_back: float = 0.0
-    now: float = 0.0
-    length: float = 0.0
-    rate: float = 1.0
+    messages: int = 0  # published
+    seconds: float = 0.0  # of wall time since playing began
+    held_back: float = 0.0  # s of these in which readers did not take what was published
+    now: float = 0.0  # s from the start of the bag
+    length: float = 0.0  # s of the whole bag
+    rate: float = 1.0  # s of the bag per second
     paused: bool = False
-    begun: bool = False
+    begun: bool = False  # whether the required readers were there
 
 
 class Player(QuietNode):
-    """Publishes the messages of a bag: the same bytes, in the same order on each topic, and none is lost.
+    """Publishes the messages of a bag: the same bytes, in the same order on each topic, without loss.
 
-    All topics are reliable and keep-all, whatever they were recorded with: any reader gets them then, and one that does
-    not keep up holds the player back. Those recorded as latched are latched. In this node nothing is ever received, so
-    nothing spins.
-
-    Parameters
-    ----------
-    bag
-        to be played
-    options
-        how
-    keyboard
-        for pause, step and rate
-    jobs
-        says when the process had been stopped
-    interruption
-        says when it is to end
-    on_progress
-        told a few times a second how far it is
-    on_note
-        told what somebody should know
-
-    Raises
-    ------
-    InputError
-        it begins behind the end of the bag, nothing is left to play, or a topic is to have a name that ROS 2 does not
-        take
+    All topics are reliable and keep-all, however they were recorded: best-effort readers match too, and a slow reliable
+    one holds the player back. Topics recorded as latched are latched. The node receives nothing, so nothing spins.
+    InputError: nothing to play from ``start_offset`` on or among the topics, or a bad remapping.
     """
 
     def __init__(
@@ -157,9 +90,9 @@ class Player(QuietNode):
         bag: Playback,
         options: PlayOptions,
         keyboard: Keyboard,
-        jobs: JobControl,
-        interruption: Interruption,
-        on_progress: Callable[[Played], None],
+        jobs: JobControl,  # tells when the process had been stopped
+        interruption: Interruption,  # tells when it is to end
+        on_progress: Callable[[Played], None],  # called a few times a second
         on_note: Callable[[str], None],
     ) -> None:
         super().__init__("player")
@@ -200,15 +133,7 @@ class Player(QuietNode):
         self.played = Played(length=(bag.end - bag.start) / SECOND)
 
     def play(self) -> None:
-        """Play the bag, once or for ever.
-
-        Raises
-        ------
-        InputError
-            readers that were to be waited for did not come
-        KeyboardInterrupt, SystemExit
-            by Ctrl-C or another signal
-        """
+        """Play the bag, once or (``loop``) until a signal ends it; InputError: required readers did not come."""
         early = self._publish_early()
         self._on_progress(self.played)
         options = self._options
@@ -235,20 +160,20 @@ class Player(QuietNode):
         self._wait_until_taken()
 
     def _heed(self) -> None:
-        """End, or stop, if a signal has asked for it."""
+        """End or stop the process if a signal has asked for it."""
         self._interruption.check()
         self._jobs.check()
 
     def _bide(self) -> None:
-        """Take some time, before it begins."""
+        """Wait a little before the start: signals, keyboard, progress."""
         self._heed()
         self._press(self._keyboard.wait(POLL), self._first)
         self._on_progress(self.played)
 
     def _publish_early(self) -> int:
-        """Publish what a latched topic holds at the start, before anything else; how many messages these are.
+        """Publish what latched topics hold at the start, before anything else; the number of messages.
 
-        Whoever needs it to know what else to read (which run it is, for example) can then get ready in time.
+        A reader that needs it to set up its other subscriptions (which run it is, for example) gets it in time.
         """
         count = 0
         if self._latched:
@@ -260,7 +185,7 @@ class Player(QuietNode):
         return count
 
     def _play_once(self, early: int) -> None:
-        """Play the bag, without so many messages of latched topics at the beginning, which have been published."""
+        """Play the bag without its first ``early`` messages of latched topics, which have been published."""
         for message in self._bag.messages(self._writers.keys(), self._last):
             self._heed()
             latched = message.topic in self._latched
@@ -275,13 +200,13 @@ class Player(QuietNode):
             took = time.monotonic() - before
             if took > BLOCKED:
                 self._time.hold(took)
-                self._jobs.continued()  # in that time, of which none counts
+                self._jobs.continued()  # a stop in that time is not counted again
                 self.played.held_back += took
                 self._awake = before + took
             self.played.messages += 1
 
     def _send(self, message: Message) -> None:
-        """Publish a message until it goes through; one that is refused without any waiting never will."""
+        """Publish a message, again while readers block; one that is refused without waiting never goes through."""
         writer = self._writers[message.topic]
         while True:
             before = time.monotonic()
@@ -298,7 +223,7 @@ class Player(QuietNode):
             self._heed()
 
     def _wait_for(self, message: Message) -> None:
-        """Until it is its turn, see to everything else."""
+        """Wait until a message is due; handle signals, keyboard, ``/clock`` and progress meanwhile."""
         while True:
             now = time.monotonic()
             wait = self._time.until(message.time)
@@ -317,7 +242,7 @@ class Player(QuietNode):
             self._heed()
 
     def _look_around(self, now: float, next_time: int) -> None:
-        # Nothing is hurried through after a stop. We may hear of it late: any thread of ours may get the signal.
+        # The time of a stop does not count. We may notice it late: any thread of the process may get the signal.
         if self._jobs.continued() or now - self._awake > STOPPED:
             now = time.monotonic()
             self._time.hold(now - self._awake)
@@ -333,7 +258,7 @@ class Player(QuietNode):
             self._report(here)
 
     def _next_tick(self) -> float:
-        """When ``/clock`` is to be published again."""
+        """Monotonic time [s] at which ``/clock`` is published next."""
         return self._ticked + 1.0 / (self._options.clock or math.inf)
 
     def _press(self, keys: Iterable[str], next_time: int) -> None:
@@ -354,7 +279,7 @@ class Player(QuietNode):
         self._on_progress(played)
 
     def _wait_until_taken(self) -> None:
-        """Until all readers have acknowledged everything: what they have not would go with this process."""
+        """Wait until all readers have acknowledged everything: the rest would be lost with this process."""
         self._report(self._last)
         waiting = list(self._writers.values())
         began, noted = time.monotonic(), False
@@ -374,30 +299,12 @@ def play(
     *,
     on_progress: Callable[[Played], None] = lambda _: None,
     on_note: Callable[[str], None] = lambda _: None,
-    on_stop: Callable[[], None] = lambda: None,
-    on_continue: Callable[[], None] = lambda: None,
+    on_stop: Callable[[], None] = lambda: None,  # before Ctrl-Z stops the process
+    on_continue: Callable[[], None] = lambda: None,  # when it goes on
 ) -> Played:
-    """Play a bag in this process; what has been played comes back, also when that was interrupted.
+    """Play a bag (or one of its files) in this process; BagError or InputError: not a bag, or not playable like that.
 
-    Parameters
-    ----------
-    path
-        of the bag, or of one of its files
-    options
-        how
-    on_progress
-        told a few times a second how far it is
-    on_note
-        told what somebody should know
-    on_stop, on_continue
-        called before the process is stopped by Ctrl-Z, and when it goes on
-
-    Raises
-    ------
-    BagError, InputError
-        no bag, or it cannot be played like that
-    KeyboardInterrupt, SystemExit
-        by Ctrl-C or another signal
+    Ctrl-C raises KeyboardInterrupt, another signal SystemExit: only ``on_progress`` then tells how far it came.
     """
     bag = Playback(path)
     for line in bag.damage:

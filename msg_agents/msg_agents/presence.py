@@ -1,4 +1,4 @@
-"""Whether those without whom a run cannot go on are still there."""
+"""Ends a process when nodes without which its run cannot go on have left the network."""
 
 from __future__ import annotations
 
@@ -8,29 +8,23 @@ from msg_agents.node import NetworkNode
 from msg_agents.timers import every
 from msg_analysis.errors import InputError
 
-PERIOD = 1.0  # s between two looks
+PERIOD = 1.0  # s between two checks
 
 
 class LeftAloneError(InputError):
-    """Others have left the run before its end."""
+    """Companions left the run before its end."""
 
 
 class Presence:
-    """Ends a process whose companions have left the network, or have been out of reach for longer than their lease.
+    """Ends the process of a node that has begun when a companion has been gone for longer than ``patience`` s.
 
-    On one machine a supervisor ends all processes when one is lost. Nobody does that for those of other hosts.
-
-    Parameters
-    ----------
-    node
-        of the process; it has begun
-    patience
-        s that they may be away, for example to be started again
+    A companion is gone when it has left the network or its lease has ended; ``patience`` allows for a restart. On one
+    machine the supervisor ends all processes when one is lost; across hosts nothing else does.
     """
 
     def __init__(self, node: NetworkNode, patience: float) -> None:
         self._node, self._patience = node, patience
-        self._since: dict[str, float] = {}  # they have been away, by name
+        self._since: dict[str, float] = {}  # monotonic time [s] since which a companion is gone, by name
         every(node, PERIOD, self._look)
 
     def _look(self) -> None:

@@ -28,7 +28,7 @@ GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a sma
 SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wakes up
 GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collections find nothing
 LEAVE_GRACE = 5  # s
-INTERRUPTED_GRACE = 15  # s; longer, since what ends by it has not ended in order
+INTERRUPTED_GRACE = 15  # s; longer, because a process that ends by it has failed
 LIFELINE_GRACE = 5.0  # s
 USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
 
@@ -38,12 +38,9 @@ class NotFoundError(InputError):
 
 
 def make_executor(kind: str = "events") -> Executor:
-    """The events executor where this rclpy has it (a third of the CPU per message), else the single-threaded one.
+    """The events executor where this rclpy has it (a third of the CPU time per message), else the single-threaded one.
 
-    Parameters
-    ----------
-    kind
-        "events" or "single"; "single" is there for comparison
+    ``kind``: "events" or "single"; "single" is for comparison.
     """
     if kind == "events":
         try:
@@ -56,23 +53,17 @@ def make_executor(kind: str = "events") -> Executor:
 
 
 def prefer_throughput() -> None:
-    """Tell the scheduler that this process is after throughput, not after being woken at once (Linux: SCHED_BATCH).
+    """Ask the scheduler for throughput instead of immediate wake-ups (Linux: SCHED_BATCH).
 
-    A lockstep network keeps every core busy with processes that wake each other with every message; when each wake-up
-    interrupts whoever is running, a third of the time goes into the change. Threads made later inherit the policy.
+    In lockstep all cores are busy with processes that wake each other with every message; if each wake-up preempts the
+    running process, a third of the time goes into the switches. Threads made later inherit the policy.
     """
     with contextlib.suppress(AttributeError, OSError):  # other systems have no such policy
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 def hold_lifeline(descriptor: int) -> None:
-    """End this process when the other end of a pipe closes, that is when the parent is gone, however it went.
-
-    Parameters
-    ----------
-    descriptor
-        of the end of the pipe that this process has
-    """
+    """End this process when the other end of a pipe closes: its parent has ended, for whatever reason."""
 
     def watch() -> None:
         while os.read(descriptor, 1):
@@ -85,45 +76,18 @@ def hold_lifeline(descriptor: int) -> None:
 
 
 def run_nodes(
-    make_nodes: Callable[[], Sequence[NetworkNode]],
+    make_nodes: Callable[[], Sequence[NetworkNode]],  # called after rclpy.init
     *,
-    executor: str = "events",
-    discovery_timeout: float,
-    throughput: bool = True,
+    executor: str = "events",  # or "single"
+    discovery_timeout: float,  # s
+    throughput: bool = True,  # see ``prefer_throughput``
     use_sim_time: bool = False,
-    account: Path | None = None,
-    patience: float | None = None,
+    account: Path | None = None,  # file of what the nodes refused and wait for, written once a second and at the end
+    patience: float | None = None,  # s, see ``Presence``; None: never ends for lack of companions
 ) -> bool:
-    """Run nodes in this process until each has done its part.
+    """Run nodes until each has done its part; False if the process was told to stop (SIGINT, SIGTERM) before.
 
-    Parameters
-    ----------
-    make_nodes
-        called once ROS is up
-    executor
-        "events" or "single"
-    discovery_timeout
-        s to wait for the other nodes of the run
-    throughput
-        whether much work in little time counts for more than being woken at once
-    use_sim_time
-        whether the nodes take the time from ``/clock``; as the ROS parameter of that name
-    account
-        file that says once a second, and at the end, what the nodes have refused and what they wait for
-    patience
-        s after which it ends when it has been left alone; None: never
-
-    Returns
-    -------
-    bool
-        True if all nodes did their part, False if the process was told to stop (SIGINT, SIGTERM) before
-
-    Raises
-    ------
-    NotFoundError
-        with the names of who is missing
-    InputError
-        what a node failed with, or the names of who is there twice
+    NotFoundError: names the missing nodes. InputError: names that several nodes have, or what a node failed with.
     """
     # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
     # installed on top, ends the spin between two callbacks.
@@ -142,7 +106,7 @@ def run_nodes(
         for node in nodes:
             spinner.add_node(node)
         _gate(nodes, discovery_timeout)
-        # All that stands now stands until the end: the garbage collector need not look at it again, at every step.
+        # All objects made so far live until the end: the garbage collector need not scan them again and again.
         gc.collect()
         gc.freeze()
         gc.set_threshold(GC_THRESHOLD)
@@ -157,7 +121,7 @@ def run_nodes(
         complete = True
     except ExternalShutdownException:
         pass
-    except (RuntimeError, NotInitializedException):  # RCLError among them: of whatever a signal has come in between
+    except (RuntimeError, NotInitializedException):  # RCLError among them: a signal came in the middle of a call
         if rclpy.ok():
             raise
     finally:
@@ -171,18 +135,11 @@ def run_nodes(
 
 
 def leave(nodes: Sequence[Node], *, complete: bool) -> None:
-    """Take the nodes off the network, so that nobody waits for them, and see to it that the process ends.
+    """Take the nodes off the network, so that no other node waits for them, and make sure that the process ends.
 
     When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
-    interpreter's lock or after the interpreter has gone. Only what runs in C helps then: an alarm, whose default action
-    ends the process. All that the process owed to others it has given by now, so nothing is lost.
-
-    Parameters
-    ----------
-    nodes
-        of this process
-    complete
-        whether they have done their part
+    interpreter's lock held or after the interpreter has gone. Then only C code helps: an alarm, whose default action
+    ends the process. Nothing is lost, because a complete process has delivered everything by now.
     """
     if complete:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -197,7 +154,7 @@ def leave(nodes: Sequence[Node], *, complete: bool) -> None:
 def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
     """Wait until the publishers of all nodes have found their readers, and every name belongs to one node only.
 
-    Readers are told by their names. Where two bear the same one, a run might start without the one that belongs to it.
+    Readers are identified by name: with duplicates, a run might start without the node that belongs to it.
     """
     deadline = time.monotonic() + timeout
     waiting = list(nodes)

@@ -1,11 +1,10 @@
-"""Quality of service of every topic, in one place, as ROS objects.
+"""Quality of service of the topics of a run, as ROS objects.
 
-All are reliable and keep-all: a slow reader holds the writer back end to end (``publish`` raises when nobody takes what
-it wrote). Keep-last, of any depth, loses messages silently to a busy reader.
+STREAM and LATCHED are reliable and keep-all: a slow reader holds the writer back end to end (``publish`` raises when no
+reader takes what it wrote). Keep-last, of any depth, loses messages silently to a busy reader.
 
-What is rare and needed by whoever comes is latched (transient-local): a reader that comes late still gets it. States
-are not: the start gate waits for their readers, and a writer that keeps thousands of old ones works in cold memory,
-which costs a network a tenth of its speed.
+Rare messages that late readers need are latched (transient-local). States are not: the start gate waits for their
+readers, and a writer that keeps thousands of old ones works in cold memory, which costs a network a tenth of its speed.
 """
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -23,4 +22,4 @@ LATCHED = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Of what replaces what came before: nobody is waited for, and who comes late gets the newest."""
+"""For values that replace earlier ones: the writer never waits, and a late reader gets the newest."""

@@ -1,4 +1,4 @@
-"""Nodes without what ROS 2 gives every node and nobody needs here."""
+"""Nodes without the services that ROS 2 gives every node and that are not needed here."""
 
 from __future__ import annotations
 
@@ -19,23 +19,18 @@ from msg_agents.parameters import PROCESS
 from msg_analysis.errors import InputError
 
 LOSSLESS = ("history", "reliability", "durability", "lifespan")
-"""What must stay as it is where nothing may be lost, except that a publisher may be latched that was not."""
+"""Policies that must not change where nothing may be lost, except that a publisher may become latched."""
 
 
 class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
     """A node without parameter services, type descriptions and /rosout.
 
-    Each node would bring eight services and /rosout: with many nodes they cost more than the network. Parameters are
-    declared all the same, and who wants to see them asks for the services (``parameter_services``).
-
-    Parameters
-    ----------
-    name
-        of the node
+    Each node would have seven services and /rosout, which cost more than the network if there are many nodes.
+    Parameters are declared all the same; the option ``parameter_services`` brings their services back.
     """
 
     def __init__(self, name: str) -> None:
-        self._takes_overrides = False  # not for what every node has: rclpy is not ready for it then
+        self._takes_overrides = False  # rclpy cannot handle overrides yet when it makes the node's own topics
         super().__init__(
             name,
             start_parameter_services=bool(PROCESS.values.get("parameter_services")),
@@ -46,7 +41,7 @@ class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that myp
         PROCESS.declare(self)
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Publisher:
-        """See rclpy; with the user's overrides of the quality of service, as far as no message would be lost."""
+        """As in rclpy; with the user's overrides of the quality of service, as far as no message would be lost."""
         kinds = [
             QoSPolicyKind.DEADLINE,
             QoSPolicyKind.LIFESPAN,
@@ -58,7 +53,7 @@ class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that myp
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[[Any], None], qos_profile: Any, **options: Any
     ) -> Subscription:
-        """See rclpy and ``create_publisher``."""
+        """As in rclpy; overrides as in ``create_publisher``."""
 
         def create(msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Subscription:
             return super(QuietNode, self).create_subscription(msg_type, topic, callback, qos_profile, **options)
@@ -79,9 +74,9 @@ class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that myp
         qos = copy.copy(qos) if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)  # rclpy changes it in place
         before, publishes = copy.copy(qos), bool(kinds)
         kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY, *kinds]
-        if before.history != HistoryPolicy.KEEP_ALL:  # of those the depth says nothing
+        if before.history != HistoryPolicy.KEEP_ALL:  # depth has no meaning there
             kinds.append(QoSPolicyKind.DEPTH)
-        # Whether the parameters are taken is asked by the name that the topic has in the end.
+        # The parameters go by the resolved name of the topic.
         final = self.resolve_topic_name(topic)
 
         def check(profile: QoSProfile) -> SetParametersResult:
@@ -100,21 +95,13 @@ class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that myp
             raise InputError(f"parameter qos_overrides.{final}.{side}: {reason}") from error
 
     def publish(self, publisher: Publisher, data: bytes) -> None:
-        """Publish bytes until they go through.
+        """Publish CDR bytes on a reliable, keep-all publisher, again until they go through.
 
-        A reader that does not keep up blocks a reliable keep-all writer; after 100 ms the middleware gives up and
-        raises, and the message has not been written.
-
-        Parameters
-        ----------
-        publisher
-            reliable, keep-all
-        data
-            CDR bytes
+        A slow reader blocks such a writer; after 100 ms the middleware raises, and the message has not been written.
         """
         while True:
             try:
-                # What Publisher.publish comes down to for bytes, without taking hold of the handle each time.
+                # What Publisher.publish does with bytes, without entering the handle's context each time.
                 publisher.handle.publish_raw(data)
                 return
             except RCLError:
@@ -123,17 +110,7 @@ class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that myp
 
 
 def objection(before: QoSProfile, after: QoSProfile, *, publishes: bool) -> str:
-    """Why a quality of service may not be overridden so; empty if it may.
-
-    Parameters
-    ----------
-    before
-        what our code asks for
-    after
-        what it would become
-    publishes
-        whether it is that of a publisher; a publisher may offer more than it has to
-    """
+    """Why a quality of service may not be overridden so, or empty text; publishers may become latched."""
     if before.history != HistoryPolicy.KEEP_ALL:  # messages may be lost there anyway
         return ""
     for policy in LOSSLESS:

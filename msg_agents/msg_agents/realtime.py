@@ -1,4 +1,4 @@
-"""The agent in real time: it makes a step when its time has come, with the newest that it has heard."""
+"""The agent in real time: it makes each step when it is due, with the newest values that it has."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from msg_analysis.model.realtime import phases
 from msg_analysis.model.steptime import SECOND
 
 AT_ONCE = 64
-"""Late steps that are made before the middleware gets its turn: messages, timers, signals."""
+"""Late steps that are made in a row before the executor gets its turn: messages, timers, signals."""
 
 OTHER_EPOCH = "another epoch than the one of this run"
 Value = tuple[bytes, int]  # a state, and the simulated time [ns] at which it was made
 
 
 class RealtimeAgent(Agent):
-    """Moves numbers between topics and the law, by a timer on the clock of the node. Parameters: see Agent."""
+    """An agent that steps by a timer on the clock of its node; parameters as in ``Agent``."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -48,17 +48,17 @@ class RealtimeAgent(Agent):
             start=self._law.step,
         )
         self._made = stamp_ns(self._resumed) if self._resumed else 0  # simulated time [ns] of the newest state
-        self._margin = round(MARGIN * SECOND * self._speed)  # the same of others may be so much ahead of our clock
-        self._late = 0  # most since the last look [ns of simulated time]
-        self._looked = 0  # what the clock said when it was last asked why nothing happens
+        self._margin = round(MARGIN * SECOND * self._speed)  # the stamps of others may be so much ahead of our clock
+        self._late = 0  # largest lateness since the last report [ns of simulated time]
+        self._looked = 0  # time of the clock at the last call of ``_waiting_for`` [ns]
         self._missed = self._missed_before = 0  # steps made later than the next one was due
 
     def _reach(self) -> int:
-        """The newest step that anybody can have reached: before the epoch nobody can say."""
+        """Newest step that any agent can have reached by now; no limit before the epoch is known."""
         return self._schedule.reach(self._timer.now()) if self._schedule else self.record.experiment.steps
 
     def host(self, agents: Sequence[Agent]) -> None:
-        """See Agent: the epoch."""
+        """Subscribe to the epoch, for all agents of the process."""
 
         def receive(data: bytes) -> None:
             progress = self.decode_progress(data, EPOCH_TOPIC)
@@ -74,20 +74,14 @@ class RealtimeAgent(Agent):
         self.create_subscription(ProgressMsg, EPOCH_TOPIC, receive, LATCHED, raw=True)
 
     def start(self, epoch: int) -> None:
-        """Simulated time is 0 when the clock says ``epoch`` [ns].
-
-        Parameters
-        ----------
-        epoch
-            time of the clock [ns]
-        """
+        """Set the epoch, the time of the clock [ns] at which simulated time is 0; another one later is refused."""
         if self._schedule:
             if self._schedule.epoch != epoch:
                 self.refuse(OTHER_EPOCH, EPOCH_TOPIC)
             return
         self._schedule = Schedule(epoch=epoch, speed=self._speed, step_length=self._dt, phase=self._phase)
         self._newest.review()
-        # Who takes over is late already: within a period everybody else will have said where he is.
+        # After a takeover steps are overdue; by the time of the next step all others have published their state.
         self._set_timer(self._timer.now())
 
     def _set_timer(self, now: int) -> None:
@@ -96,7 +90,7 @@ class RealtimeAgent(Agent):
             self._timer.set(self._schedule.clock_time(self._schedule.next_step(now, after=self._law.step)))
 
     def _advance(self) -> None:
-        """Make every step that is due: this is the hot path."""
+        """Make every step that is due. Hot path."""
         schedule, newest, law = self._schedule, self._newest, self._law
         assert schedule is not None
         now = self._timer.now()
@@ -117,11 +111,11 @@ class RealtimeAgent(Agent):
             self._report()
 
     def _step(self, mode: int, inputs: Sequence[tuple[int, Value | None]], now: int) -> None:
-        """Make a step; ``now`` is simulated time [ns]."""
+        """Make a step at simulated time ``now`` [ns]."""
         law = self._law
         newest = max((value[1] for _, value in inputs if value), default=0)
-        # News from others can outrun the news of the time (``/clock``, or clocks of hosts that disagree). What came out
-        # of something is later than it all the same, so that the log can be read in the order of its stamps.
+        # A message can arrive before our clock shows its stamp (``/clock`` is late, or clocks of hosts disagree). The
+        # new state is stamped later than its inputs all the same (up to the margin): the log is in causal order.
         self._made = max(now, self._made + 1, min(newest, now + self._margin) + 1)
         own = law.state
         law.advance(mode, [value[0] if value else own for _, value in inputs])
@@ -131,22 +125,20 @@ class RealtimeAgent(Agent):
         self._send(law.step, law.state, message)
 
     def _send(self, step: int, state: bytes, message: bytes) -> None:
-        """See Agent. What is heard is the truth: there is no noise on the air in real time."""
+        """Publish the state and hand it to the agents of the process; in real time no noise is added to it."""
         self.publish(self._states, message)
         for hear in self._listeners:
             hear(self._law.agent, step, (state, stamp_ns(message)))
 
-    def send_again(self, since: int) -> None:  # noqa: ARG002  only the newest value is of use to anybody
-        """See Agent."""
+    def send_again(self, since: int) -> None:  # noqa: ARG002  only the newest value is of use
+        """Publish the newest state again; older ones are of no use."""
         self._repeat(self._law.step)
 
     def _ask_again(self) -> None:
-        """See Agent."""
         for j in self._far:
             self._group.ask_again(j, self._law.step)
 
     def _receiver(self, peer: int) -> Callable[[bytes], None]:
-        """See Agent."""
         unwrap = self._frame.unwrap
         offer = self._newest.offer
         topic, replicas = state_topic(peer), self.record.experiment.run.replicas
@@ -164,17 +156,17 @@ class RealtimeAgent(Agent):
         return receive
 
     def hear(self, peer: int, step: int, value: Value) -> None:
-        """See Agent."""
+        """Take the state of an agent of the same process."""
         self._newest.offer(peer, step, value)
 
     def learn(self, graph: ActiveGraph) -> str | None:
-        """See Agent."""
+        """Take a graph; None if taken, else the reason."""
         if not 1 <= graph.mode <= len(self._inputs):
             return OTHER_RUN
         return self._newest.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step)
 
     def health(self) -> Health:
-        """See NetworkNode. Whoever is late says so; whoever does not get on at all says what he waits for."""
+        """How late the agent is, or what it waits for."""
         step, pace = self._law.step, self._pace
         overdue = pace.look(step)
         missed, late = self._missed - self._missed_before, self._late / self._speed / 1e6
@@ -199,7 +191,7 @@ class RealtimeAgent(Agent):
         return Health(message, waiting=missed > 0, values=values)
 
     def _waiting_for(self) -> str | None:
-        """What keeps the agent from a step that is due, or its clock from getting there; None if it is only early."""
+        """What keeps the agent from a due step, or its clock from reaching it; None if the step is not yet due."""
         now = self._timer.now()
         if not now:
             return "the time on /clock"

@@ -1,4 +1,4 @@
-"""The recorder node: every message of the run, as it came, into an MCAP bag."""
+"""The recorder node: writes every message of the run, unchanged, into an MCAP bag."""
 
 from __future__ import annotations
 
@@ -42,47 +42,38 @@ from msg_analysis.model.payload import all_finite
 from msg_analysis.model.record import RunRecord
 
 TELLING = {WRONG_LENGTH, OTHER_LAYOUT}
-"""What is wrong with states that are recorded all the same: they are of this run, and the reader of the bag tells."""
-BATCH = 16  # states collected before they are written: cheaper than one by one, and nobody waits long for the core
-WRITE_PERIOD = 0.1  # s of wall time between two looks at what has been collected, in slow runs and at the end
+"""Faults of states that are recorded all the same: they are of this run, and the reader of the bag reports them."""
+BATCH = 16  # states collected before they are written: cheaper than one by one, and the core is not held for long
+WRITE_PERIOD = 0.1  # s of wall time after which fewer are written, in slow runs and at the end
 FLUSH_PERIOD = 1.0
-"""s of wall time. What a killed recorder loses at most, where a chunk takes longer to fill."""
+"""s of wall time: a killed recorder loses at most so much, even if a chunk takes longer to fill."""
 
 
 class Recorder(NetworkNode):
-    """Records a run and knows when it has all of it.
+    """Records a run into ``directory`` (new or empty), and detects when the run is complete.
 
-    Messages are stamped with simulated time, so that equal runs give equal bags whatever the machine was doing.
-
-    Parameters
-    ----------
-    record
-        of the run
-    directory
-        of the bag; must not exist
-    storage
-        compression and size of its files
+    Messages are stamped with simulated time, so that equal runs give equal bags whatever the load of the machine.
     """
 
     def __init__(self, *, record: RunRecord, directory: Path, storage: Storage = DEFAULT) -> None:
         super().__init__("recorder", record=record)
         experiment = record.experiment
-        # In the bag every topic has its own name, also where it is remapped: by that readers of bags find it.
+        # In the bag topics keep their own names, even if they are remapped: readers of bags look for these.
         self._root = self.get_namespace().rstrip("/") + "/"
         topics = network_topics(experiment.agents, self._root, truth=experiment.truth)
         self._last = experiment.steps
         kinds = [(state_topic, experiment.run.replicas)]
         if experiment.truth:
             kinds.append((truth_topic, experiment.width))
-        self._sources = [  # of states: agent, a topic of his, and what is on it
+        self._sources = [  # of states: agent (from 0), topic in the bag, layout of its messages
             (agent, self._root + topic(agent), StateFrame(self.run, width, longest_heard(record)))
             for topic, width in kinds
             for agent in range(experiment.agents)
         ]
         self._known: list[dict[int, int]] = [{} for _ in self._sources]  # step -> hash of what was written
-        self._row = [-1] * len(self._sources)  # newest step up to which all came one after the other
-        self._seen: set[bytes] = set()  # all but the states that have been written
-        self._pending: list[tuple[int, bytes]] = []  # states collected and not yet written, with their sources
+        self._row = [-1] * len(self._sources)  # newest step up to which none is missing
+        self._seen: set[bytes] = set()  # messages written, except for states
+        self._pending: list[tuple[int, bytes]] = []  # source and bytes of states not yet written
         # Topics whose last message (last state, last sojourn, experiment) has not come.
         self._awaiting = {topic.name for topic in topics}
         self.create_subscription(String, EXPERIMENT_TOPIC, self._record_experiment, LATCHED, raw=True)
@@ -97,17 +88,17 @@ class Recorder(NetworkNode):
         every(self, FLUSH_PERIOD, self._guarded(self.bag.flush))
 
     def health(self) -> Health:
-        """See NetworkNode."""
+        """Number of recorded messages."""
         values = {"messages": str(self.bag.messages), "topics without their last message": str(len(self._awaiting))}
         return Health(f"{self.bag.messages} messages recorded", values=values)
 
     def finish(self, *, complete: bool, deadline: float) -> None:  # noqa: ARG002  an interrupted bag is closed just as well
-        """Close the bag: it is complete only if the recorder saw the end of the run."""
+        """Close the bag; it is complete only if the recorder saw the end of the run."""
         self._guarded(self._write_states)()
         self.bag.close(complete=not self._awaiting)
 
     def _collector(self, source: int) -> Callable[[bytes], None]:
-        """The callback for one topic of states: this is the hot path."""
+        """The callback for one topic of states. Hot path."""
         pending, write_states = self._pending, self._guarded(self._write_states)
 
         def collect(data: bytes) -> None:
@@ -118,12 +109,12 @@ class Recorder(NetworkNode):
         return collect
 
     def _write_states(self) -> None:
-        """Write what has been collected. Many at once: that needs a fraction of the time that one by one would."""
+        """Write the collected states, many at once: a fraction of the time of writing each on arrival."""
         write, last = self.bag.write, self._last
         for source, data in self._pending:
             agent, topic, layout = self._sources[source]
             frame = layout.unwrap(data)
-            if frame is None or frame[0] != agent + 1:  # not what the agents of this run send: have a closer look
+            if frame is None or frame[0] != agent + 1:  # not what the agents of this run send: find out why
                 reason = why_not(data, self.record, agent, layout.replicas)
                 self.refuse(reason, topic)
                 if reason not in TELLING:
@@ -139,8 +130,8 @@ class Recorder(NetworkNode):
     def _objection(self, source: int, step: int, data: bytes) -> str | None:
         """Why a state is not written; None if it is.
 
-        Agents send theirs again when one of them was killed, none older than ``AGAIN`` steps. Where two say different
-        things of a step, one is forged: both are written, and the reader of the bag takes neither.
+        After a restart agents send states again, none older than ``AGAIN`` steps. Of two different states of one step,
+        one is forged: both are written, and the reader of the bag takes neither.
         """
         known, mark, row = self._known[source], hash(data), self._row[source]
         before = known.get(step)

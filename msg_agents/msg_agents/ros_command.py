@@ -13,16 +13,8 @@ from msg_agents.parameters import GIVES_PARAMETERS, PROCESS, given, mention_qos,
 class RosCommand(click.Command):
     """Takes arguments for ROS 2 as any ROS node does: ``--ros-args ... [--]``.
 
-    rclpy finds them by itself. Parameters among them stand for options that are not on the command line.
-
-    Parameters
-    ----------
-    *args
-        see click.Command
-    node_name
-        by which parameters are found, where they are given to a certain node; the command's name by default
-    **options
-        see click.Command
+    rclpy reads these itself; parameters among them replace options that are not on the command line. Those given to one
+    node are found by ``node_name`` (default: the name of the command).
     """
 
     def __init__(self, *args: Any, node_name: str | None = None, **options: Any) -> None:
@@ -30,9 +22,9 @@ class RosCommand(click.Command):
         self.node_name = node_name or self.name or ""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """See click.Command."""
+        """As in click; with the parameters that the arguments of ROS 2 give."""
         ours, ros = split_arguments(args)
-        if ctx.resilient_parsing:  # a shell asks how the line could go on, perhaps behind an option without its value
+        if ctx.resilient_parsing:  # completion in a shell, perhaps after an option that has no value yet
             while ours and ours[-1].startswith("-"):
                 ours.pop()
             return super().parse_args(ctx, ours)
@@ -44,13 +36,13 @@ class RosCommand(click.Command):
         return rest
 
     def invoke(self, ctx: click.Context) -> Any:
-        """See click.Command."""
+        """As in click; without ``--domain``, ROS_DOMAIN_ID is checked first."""
         if ctx.params.get("domain") is None:
             check_domain()
         return super().invoke(ctx)
 
     def _parse_with_parameters(self, ctx: click.Context, ours: list[str], ros: list[str]) -> list[str]:
-        # Whether something is missing turns out only when the parameters have been read.
+        # Parameters may supply what is required: check that after they have been read.
         required = [each for each in self.params if each.required]
         for each in required:
             each.required = False
@@ -73,13 +65,7 @@ class RosCommand(click.Command):
 
 
 def split_arguments(args: list[str]) -> tuple[list[str], list[str]]:
-    """Arguments of the command, and those for ROS 2 with their ``--ros-args``.
-
-    Parameters
-    ----------
-    args
-        as the user has typed them
-    """
+    """Split what the user typed into arguments of the command and those for ROS 2, with their ``--ros-args``."""
     ours, ros = list(args), list[str]()
     while "--ros-args" in ours:
         start = ours.index("--ros-args")

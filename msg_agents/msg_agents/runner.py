@@ -47,21 +47,23 @@ class RunResult:
     Attributes
     ----------
     bag
-        directory; None if nothing was recorded
+        directory; None if nothing was to be recorded on this host
     failures
         what went wrong, one line each
     interrupted
-        whether the user ended the run
+        whether a signal (Ctrl-C, for example) ended the run
     wall_time
-        s from the first state to the last one
+        s from the first state of the slowest agent to its last one, as reported a few times a second
     rate
-        steps per second of wall time
+        steps of the slowest agent per second of wall time
     restarts
-        what was killed and started again, one line each
+        processes that were killed, or crashed, and were started again, one line each
     strangers
-        what the nodes refused: "node", "topic", "reason", "count"
-    trajectory, comparison
-        of the bag, if it could be read
+        messages that the nodes refused: dictionaries with "node", "topic", "reason", "count"
+    trajectory
+        states of the bag; None if there is none or it could not be read
+    comparison
+        with the prediction; None before ``conclude``
     """
 
     bag: Path | None
@@ -76,15 +78,7 @@ class RunResult:
 
 
 def make_bag_directory(experiment: Experiment, out: Path) -> Path:
-    """Make an empty directory for a new bag, <out>/<name>_<time>, which no other run can take any more.
-
-    Parameters
-    ----------
-    experiment
-        whose name
-    out
-        directory that is there
-    """
+    """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name."""
     stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
     candidate, number = out / stem, 2
     while True:
@@ -113,6 +107,8 @@ def run_network(
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
 
+    To be called from the main thread, since it handles signals; the callbacks and ``view`` are called from there.
+
     Parameters
     ----------
     experiment
@@ -120,28 +116,29 @@ def run_network(
     out
         directory in which a new bag is made; None: do not record
     domain
-        ROS_DOMAIN_ID; a free one is chosen if not given
+        ROS_DOMAIN_ID; None: a free one is chosen
     restarts
-        how often, in all, agents or the switcher are started again when they were killed; once more ends the run
+        how often, in all, processes of agents and the switcher are started again when they were killed (or crashed for
+        the first time); one more failure ends the run. 0: no states are kept for a restart
     use_sim_time
-        whether the nodes take the time from ``/clock``, which somebody else publishes in the same domain
+        whether the nodes take the time from ``/clock``, which another process publishes in the same domain
     storage
-        compression of the bag and size of its files
+        compression and file size of the bag
     pin
-        whether the processes of a run in lockstep keep to one core each, where they are more than the cores
+        whether each process of a run in lockstep keeps to one core, if there are more processes than cores
     on_progress
-        called a few times a second with the step that every agent has reached
+        called about 20 times a second, once all agents have started, with the step that every agent has reached
     on_note
-        called with a line about what happens: a restart, a standstill
+        called with a line of text about each restart or stall
     view
         shows the run while it goes on
     environment
         changes to the environment of the processes
     record
-        of the run; a new one is made if not given
+        record of the run; None: a new one is made
     share
-        what of it this host runs, of several; None: all. Where there is no recorder, only the logs are kept in the
-        directory of the bag
+        what this host runs, of several hosts; None: all. Without the recorder only the logs are kept, in the
+        directory that would hold the bag
 
     Returns
     -------
@@ -151,7 +148,7 @@ def run_network(
     Raises
     ------
     NotAvailableError, InputError
-        the experiment cannot be run; nothing was started or written
+        the experiment cannot be run, or no domain is free; nothing was started, and no bag or log is left
     """
     experiment.require_available()
     count_processes(experiment, None if share is None else len(share.agents))
@@ -189,7 +186,7 @@ def run_network(
                 _watch(supervisor, experiment.steps, result, restarts, interruption, on_progress, on_note, view)
                 if view is not None:
                     view.end()
-                # Before the others are ended: what ends because we end it has not failed.
+                # Before the supervisor ends the rest: what ends because we end it has not failed.
                 _collect_failures(supervisor, result, interruption, restarts)
             result.strangers = supervisor.account().strangers()
             if bag is not None:
@@ -199,7 +196,7 @@ def run_network(
     finally:
         if directory is not None:
             with suppress(OSError):
-                directory.rmdir()  # if nothing came of it
+                directory.rmdir()  # if it is empty
     return result
 
 
@@ -213,7 +210,7 @@ def _watch(
     on_note: Callable[[str], None],
     view: RunView | None = None,
 ) -> None:
-    """Until all have done their part, one has failed for good, or the user has had enough."""
+    """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
     began: float | None = None
     pace = Pace()
     while interruption.caught is None and _revive(supervisor, result, restarts, on_note) and supervisor.awaited:
@@ -236,19 +233,19 @@ def _watch(
 
 
 def _standstill(supervisor: Supervisor) -> str:
-    """Where it waits, as far as anybody says; a process that says nothing is stopped, or waits for one that is."""
+    """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
     words = [f"{node}: {message}" for node, message in sorted(supervisor.account().waiting.items())]
     silent = [child.plan.name for child in supervisor.silent]
     if silent:
         words.append("nothing heard from " + ", ".join(silent))
-    if not words and supervisor.steps:  # whoever knows is on another host
+    if not words and supervisor.steps:  # the processes that know are on another host
         last = min(supervisor.steps)
         words.append(f"the last to get on is agent {supervisor.steps.index(last) + 1}, at step {last}")
     return "; ".join(words) or "nobody says why"
 
 
 def _revive(supervisor: Supervisor, result: RunResult, restarts: int, on_note: Callable[[str], None]) -> bool:
-    """Start again who has been killed; False if somebody cannot be."""
+    """Start killed processes again; False if one cannot be."""
     for child in supervisor.failures:
         if not child.resumes or len(result.restarts) >= restarts:
             return False
@@ -281,14 +278,14 @@ def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
     try:
         shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS))
     except OSError as error:
-        # Of a tree, the error is a list of (from, to, why).
+        # The argument of shutil.Error is a list of (from, to, reason).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)
         shutil.rmtree(directory, ignore_errors=True)
         result.failures.append(f"the logs of the processes could not be kept: {reason}")
 
 
 def _settle(bag: Path, result: RunResult) -> None:
-    """Make the bag whole if its recorder could not, read it, and tell how far everybody came."""
+    """Salvage the bag if its recorder did not close it, read it, and say how far each agent came."""
     try:
         if (bag / RECORDING_MARKER).exists():
             report = salvage_in_place(bag)
@@ -310,12 +307,19 @@ def _settle(bag: Path, result: RunResult) -> None:
 
 
 def conclude(result: RunResult) -> None:
-    """Compare the bag of a run with its prediction; write report.html and result.json beside it.
+    """Compare the bag of a run with its prediction, and write report.html into the bag.
+
+    Does nothing if there is no bag or it could not be read.
 
     Parameters
     ----------
     result
-        of ``run_network``; ``comparison`` is set in it
+        from ``run_network``; its ``comparison`` is set
+
+    Raises
+    ------
+    InputError
+        there is no prediction (too large, unbounded), the bag lacks what is needed, or the report cannot be written
     """
     if result.trajectory is None or result.bag is None:
         return

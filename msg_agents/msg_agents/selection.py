@@ -1,4 +1,4 @@
-"""Which topics of a bag are played, and what they are called then. Without ROS."""
+"""Which topics of a bag are played, and under which names. No ROS."""
 
 from __future__ import annotations
 
@@ -9,21 +9,9 @@ from msg_analysis.errors import InputError
 
 
 def select_topics(topics: Iterable[str], wanted: Sequence[str], excluded: Sequence[str]) -> list[str]:
-    """The names that are wanted and not excluded, in the order given.
+    """Names that are wanted (none given: all) and not excluded, by name or pattern such as ``/agent_*/state``.
 
-    Parameters
-    ----------
-    topics
-        names of all topics
-    wanted
-        names, or patterns such as ``/agent_*/state``; none: all
-    excluded
-        the same
-
-    Raises
-    ------
-    InputError
-        a name that no topic has, or nothing is left
+    InputError: a name or pattern that no topic has, or no topic is left.
     """
     names = list(topics)
     for option, patterns in (("--topics", wanted), ("--exclude", excluded)):
@@ -46,19 +34,9 @@ def _fits(name: str, pattern: str) -> bool:
 
 
 def parse_remaps(remaps: Sequence[str], topics: Sequence[str]) -> dict[str, str]:
-    """New names of all topics that are played, by their old ones.
+    """New names of all topics that are played, by old name; each of ``remaps`` is ``old:=new``.
 
-    Parameters
-    ----------
-    remaps
-        ``old:=new``; names without a slash at the beginning get one
-    topics
-        that are played
-
-    Raises
-    ------
-    InputError
-        not of this form, or a topic that is not played
+    Names get a missing slash in front. InputError: not of this form, or a topic that is not played.
     """
     names = {name: name for name in topics}
     for remap in remaps:

@@ -1,10 +1,10 @@
-"""Who runs a node now, and who did before: the next process takes the dead one off the network at once.
+"""Takeover of a node: the new process removes its killed predecessor from the network at once.
 
-The middleware gives up a process that was killed only when it has been silent for 20 s (its lease). Until then
-everybody keeps what it never acknowledged, and after 5,000 messages waits. A shorter lease would take a process for
-dead that is only stopped or starved, and what is on its way to it would be lost. But whoever takes over *knows*: it
-holds a lock that goes with the process that held it before. So it says on behalf of the dead what that would have said,
-had it left in order: the RTPS message by which a participant disposes of itself (DDSI-RTPS 2.3, 8.5.3 and 9.6.3.9).
+The middleware drops a killed process only after 20 s of silence (its lease); until then writers keep what it never
+acknowledged, and block after 5,000 messages. A shorter lease would also drop processes that are only stopped or
+starved, and lose messages to them. The successor knows that the process is gone: it holds a lock that ends with the
+process that held it. So it sends, in the name of the dead process, the RTPS message by which a participant disposes of
+itself (DDSI-RTPS 2.3, 8.5.3 and 9.6.3.9).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from msg_agents.environment import MOST_PARTICIPANTS, PEERS_VARIABLE
 from msg_analysis.errors import InputError
 
 PREFIX_SIZE = 12  # bytes of a GUID that all endpoints of a participant share
-_HEADER = b"RTPS\x02\x03\x01\x0f"  # version 2.3, vendor eProsima: who speaks for a Fast DDS participant
+_HEADER = b"RTPS\x02\x03\x01\x0f"  # version 2.3, vendor eProsima, as of a Fast DDS participant
 _DATA, _LITTLE_ENDIAN, _INLINE_QOS = 0x15, 0x01, 0x02
 _PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
 _KEY_HASH, _STATUS_INFO, _SENTINEL = 0x70, 0x71, 0x01
@@ -35,22 +35,9 @@ _REPEATS = 3  # datagrams may be lost
 
 
 class Succession:
-    """The right to run a node, which one process has at a time.
+    """The right to run a node, which one process has at a time: a lock on the file ``path``, made if there is none.
 
-    Parameters
-    ----------
-    path
-        of a file that names the process; made if there is none
-
-    Attributes
-    ----------
-    predecessor
-        prefix of the GUIDs of the process before; empty if there was none
-
-    Raises
-    ------
-    InputError
-        another process is running the node
+    ``predecessor``: GUID prefix of the last process; empty if there was none. InputError: another process has the lock.
     """
 
     def __init__(self, path: Path) -> None:
@@ -65,30 +52,14 @@ class Succession:
         self.predecessor = os.read(self._descriptor, PREFIX_SIZE)
 
     def enter(self, prefix: bytes) -> None:
-        """Note whom the next process will follow.
-
-        Parameters
-        ----------
-        prefix
-            of the identifiers of this process's endpoints
-        """
+        """Store the GUID prefix of this process for its successor."""
         os.pwrite(self._descriptor, prefix, 0)
 
 
 def succeed(directory: Path | None, names: Iterable[str]) -> list[Succession]:
-    """The right to run these nodes; processes that ran them before are taken off the network.
+    """Take the right to run these nodes, and take the processes that ran them before off the network.
 
-    Parameters
-    ----------
-    directory
-        where every node has a file of its name; None: nobody will follow
-    names
-        of the nodes
-
-    Raises
-    ------
-    InputError
-        another process is running one of the nodes
+    ``directory`` has a file per node; None: no takeover. InputError: another process is running one of the nodes.
     """
     if directory is None:
         return []
@@ -100,35 +71,19 @@ def succeed(directory: Path | None, names: Iterable[str]) -> list[Succession]:
 
 
 def enter(successions: Sequence[Succession], node: Node) -> None:
-    """Note the name of this process, which the endpoints of its nodes bear, for the one that will follow.
-
-    Parameters
-    ----------
-    successions
-        of the nodes of this process
-    node
-        one of them
-    """
+    """Store the GUID prefix of this process, read from the endpoints of one of its nodes, for its successor."""
     if not successions:
         return
     own = (node.get_name(), node.get_namespace())
     endpoints = [p for topic in node.publishers for p in node.get_publishers_info_by_topic(topic.topic_name)]
     prefixes = {bytes(p.endpoint_gid[:PREFIX_SIZE]) for p in endpoints if (p.node_name, p.node_namespace) == own}
-    if len(prefixes) == 1:  # else somebody bears the same name: nobody is buried for him
+    if len(prefixes) == 1:  # else another node has the same name: store nothing rather than a wrong prefix
         for succession in successions:
             succession.enter(*prefixes)
 
 
 def farewell(prefix: bytes, number: int = _LATE) -> bytes:
-    """The message by which a participant takes itself off the network.
-
-    Parameters
-    ----------
-    prefix
-        of its GUIDs, 12 bytes
-    number
-        sequence number of the message
-    """
+    """The message by which the participant with this GUID prefix (12 bytes) takes itself off the network."""
     parameters = (
         struct.pack("<HH", _KEY_HASH, 16)
         + prefix
@@ -145,20 +100,12 @@ def farewell(prefix: bytes, number: int = _LATE) -> bytes:
 
 
 def bury(prefix: bytes, domain: int) -> None:
-    """Tell every participant of the hosts of the run that one is gone. Other machines wait for its lease to end.
-
-    Parameters
-    ----------
-    prefix
-        of its GUIDs, 12 bytes
-    domain
-        ROS_DOMAIN_ID
-    """
+    """Tell every participant on the hosts of the run that one is gone; other machines wait for its lease to end."""
     base = PORT_BASE + PORTS_PER_DOMAIN * domain + 10  # the RTPS rule for the ports of discovery
     addresses = {"127.0.0.1", *os.environ.get(PEERS_VARIABLE, "").split()}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for repeat in range(_REPEATS):
             message = farewell(prefix, _LATE + repeat)
             for address, participant in product(addresses, range(MOST_PARTICIPANTS)):
-                with contextlib.suppress(OSError):  # nobody there
+                with contextlib.suppress(OSError):  # no participant there
                     sender.sendto(message, (address, base + 2 * participant))

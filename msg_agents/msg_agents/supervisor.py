@@ -24,40 +24,28 @@ ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0)
 """Signals and the seconds that a process has to obey each."""
 
 POLL = 0.02  # s
-SILENCE = 3.0  # s; accounts are kept once a second
-CRASHED = 1  # exit code of Python after an exception that nobody expected
+SILENCE = 3.0  # s; accounts are written once a second
+CRASHED = 1  # exit code of Python after an uncaught exception
 ACCOUNTS = "accounts"
 
 
 @dataclass(slots=True)
 class Child:
-    """A process of the network.
-
-    Attributes
-    ----------
-    plan
-        what it is
-    process
-        the running process
-    log
-        file with what it printed
-    number
-        how many times it has been started
-    """
+    """A process of the network."""
 
     plan: ProcessPlan
     process: subprocess.Popen[bytes]
-    log: Path
-    number: int = 1
+    log: Path  # file of what it printed
+    number: int = 1  # of this start; 2: restarted once
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether it has not ended."""
         return self.process.poll() is None
 
     @property
     def age_of_account(self) -> float:
-        """Seconds since it has last said how it is."""
+        """Seconds since it last wrote its account; inf: never."""
         path = self.log.parent / ACCOUNTS / f"{self.plan.name}.{self.number}.json"
         try:
             return time.time() - path.stat().st_mtime
@@ -66,14 +54,14 @@ class Child:
 
     @property
     def ended_well(self) -> bool:
-        """Whether it has done its part."""
+        """Whether it has ended and done its part."""
         return self.process.poll() is not None and self.failure is None
 
     @property
     def failure(self) -> str | None:
-        """How it ended, if not well, in words."""
+        """How it failed, in words; None if it is running or has ended well."""
         code = self.process.poll()
-        # A process that has done its part and hangs in the middleware's farewell ends itself by an alarm.
+        # A process that has done its part and hangs in the middleware ends itself by an alarm: see ``leave``.
         if code is None or code in (0, -signal.SIGALRM):
             return None
         if code < 0:
@@ -82,10 +70,10 @@ class Child:
 
     @property
     def resumes(self) -> bool:
-        """Whether it is worth while to start it again, and it then takes over from itself.
+        """Whether it can take over from itself, and starting it again makes sense.
 
-        It is when it was killed, by whomever. A crash of its own most probably comes again: one more try. Bad input,
-        a node that was not found or an order to stop remain what they are.
+        It does for a process that was killed, for whatever reason. A crash of its own will probably repeat: one more
+        try. It does not after bad input, failed discovery or an order to stop.
         """
         code = self.process.poll()
         if not self.plan.resumes or code is None:
@@ -102,57 +90,32 @@ class Child:
 
 @dataclass(slots=True)
 class Supervisor:
-    """The processes of one run.
+    """The processes of one run; at the end of the context they are ended.
 
-    Children live in sessions of their own, so that Ctrl-C in the terminal reaches the parent only, which then ends
-    them in order. Each holds the reading end of a pipe whose writing end only the parent has: when the parent goes,
-    however it goes, the pipe closes and the child leaves.
-
-    Attributes
-    ----------
-    logs
-        directory for what the children print
-    environment
-        theirs
-    children
-        in the order of their start
-    steps
-        newest step of every agent as far as reported
-    cores
-        the core that a child keeps to, by name; the others run where the scheduler likes
+    Children run in sessions of their own, so that Ctrl-C in the terminal reaches the parent only, which then ends them
+    in order. Each holds the reading end of a pipe whose writing end only the parent has: when the parent ends, for
+    whatever reason, the pipe closes and the child leaves.
     """
 
-    logs: Path
-    environment: Mapping[str, str]
-    children: list[Child] = field(default_factory=list)
-    steps: list[int] = field(default_factory=list)
-    cores: Mapping[str, int] = field(default_factory=dict)
+    logs: Path  # directory for what the children print
+    environment: Mapping[str, str]  # of the children
+    children: list[Child] = field(default_factory=list)  # as started; a restarted one keeps its place
+    steps: list[int] = field(default_factory=list)  # newest step of every agent, as reported
+    cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _status: tuple[int, int] = field(default=(-1, -1), init=False)
     _pending: bytes = field(default=b"", init=False)
-    _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts
+    _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
 
     def start(self, plans: Sequence[ProcessPlan]) -> None:
-        """Start all processes.
-
-        Parameters
-        ----------
-        plans
-            of ``plan_network``
-        """
+        """Start all processes."""
         self._lifeline = os.pipe()
         self._status = os.pipe()
         os.set_blocking(self._status[0], False)
         self.children += [self._start(plan) for plan in plans]
 
     def restart(self, child: Child) -> None:
-        """Start again what has been killed.
-
-        Parameters
-        ----------
-        child
-            that is gone
-        """
+        """Start a process that has ended again; the new child takes its place in ``children``."""
         self.children[self.children.index(child)] = self._start(child.plan, child.number + 1)
 
     def _start(self, plan: ProcessPlan, number: int = 1) -> Child:
@@ -180,7 +143,7 @@ class Supervisor:
         return Child(plan, process, log, number)
 
     def read_status(self) -> None:
-        """Take in what the switcher has reported since the last call."""
+        """Read what the switcher has reported since the last call; does not block."""
         with contextlib.suppress(BlockingIOError):
             while chunk := os.read(self._status[0], 1 << 16):
                 self._pending += chunk
@@ -190,7 +153,7 @@ class Supervisor:
 
     @property
     def running(self) -> list[Child]:
-        """Those that have not ended."""
+        """Children that have not ended."""
         return [child for child in self.children if child.running]
 
     def account(self) -> Account:
@@ -199,12 +162,12 @@ class Supervisor:
 
     @property
     def silent(self) -> list[Child]:
-        """Those that run and have kept no account lately."""
+        """Running children that have not written their account lately."""
         return [child for child in self.running if child.age_of_account > SILENCE]
 
     @property
     def over(self) -> bool:
-        """Whether all have done their part: nobody leaves before, and the switcher only after it has said so."""
+        """Whether all have done their part: no process leaves before, and the switcher only after it has said so."""
         ended = {child.plan.name for child in self.children if child.ended_well}
         rest = {child.plan.name for child in self.children} - ended
         if all(child.plan.name != SWITCHER for child in self.children):  # it is on another host
@@ -213,19 +176,19 @@ class Supervisor:
 
     @property
     def awaited(self) -> list[Child]:
-        """Those that have not ended and have something to do; who came back after the end has not."""
+        """Running children that have something to do; one that was restarted after the end has not."""
         return [child for child in self.running if child.number == 1 or not self.over]
 
     @property
     def failures(self) -> list[Child]:
-        """Those that ended, and not well. Who is killed after the end has done its part, except for the recorder."""
+        """Children that failed; after the end of the run, only the recorder can still fail."""
         failed = [child for child in self.children if child.failure]
         if failed and self.over:
             return [child for child in failed if child.plan.name == RECORDER]
         return failed
 
     def stop(self) -> None:
-        """End everybody: the agents and the switcher first, so that the recorder gets all that they sent."""
+        """End all: first the agents and the switcher, so that the recorder gets all that they sent."""
         self._end([child for child in self.children if child.plan.name != RECORDER])
         self._end([child for child in self.children if child.plan.name == RECORDER])
 

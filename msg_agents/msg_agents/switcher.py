@@ -1,6 +1,6 @@
 """The switcher node: publishes the experiment and the path of the active graph.
 
-In lockstep it keeps ahead of the agents; in real time it publishes the epoch and every sojourn at its time.
+In lockstep it keeps ahead of the agents; in real time it publishes the epoch, and each sojourn when it begins.
 """
 
 from __future__ import annotations
@@ -37,51 +37,35 @@ from msg_analysis.model.step import Wiring
 from msg_analysis.model.steptime import SECOND
 
 AHEAD = 1000
-"""Sojourns that are published before the slowest agent reaches them. Enough never to be waited for; bounded, so that a
-long run keeps little in memory, and below the 5,000 messages that a late reader is given."""
+"""Sojourns that are published before the slowest agent reaches them: enough that no agent waits for one; bounded, so
+that a long run takes little memory, and below the 5,000 messages that a late reader gets."""
 
 AHEAD_LEAST, AHEAD_BYTES = 50, 1 << 22
-"""Graphs of many agents take long to send and read, and their agents are slow: fewer sojourns, but never fewer than
-this, once they are more than so many bytes."""
+"""Graphs of many agents are large messages, and their agents are slow: only as many sojourns ahead as fit
+AHEAD_BYTES, but at least AHEAD_LEAST."""
 
 BEHIND = 5000
-"""Sojourns that a reader may be behind: what the middleware keeps of a writer."""
+"""Sojourns that a reader may be behind: the number of messages that the middleware keeps of a writer."""
 
 REPORT_PERIOD = 0.1  # s
 
 NAMESAKE = "a second node of this name"
 HEAD_START = SECOND // 2
-"""ns of the clock from the publication of the epoch to the epoch: by then everybody should know it."""
+"""ns of the clock from the publication of the epoch to the epoch: time for all nodes to receive it."""
 
 
 class Switcher(NetworkNode):
-    """Draws the exact path of the chain; when it publishes what of it, is a matter of its pace.
-
-    Parameters
-    ----------
-    record
-        of the run
-    model
-        its step model, or wiring
-    readers
-        names of the nodes, besides the agents, that must read the graph before the run starts
-    on_progress
-        called with the newest step of every agent (-1: none yet) a few times a second, if one has reported
-    checkpoints
-        directory in which it leaves a mark; whoever finds one there takes over from a process that has gone
-    farewell
-        s to wait for everybody to say that the end has been heard
-    """
+    """Draws the exact path of the chain; subclasses, one per pace, decide when to publish which part of it."""
 
     def __init__(
         self,
         *,
         record: RunRecord,
         model: Wiring,
-        readers: list[str],
-        on_progress: Callable[[Sequence[int]], None] = lambda _: None,
-        checkpoints: Path | None = None,
-        farewell: float = FAREWELL,
+        readers: list[str],  # nodes, besides the agents, that must read the graph before the run starts
+        on_progress: Callable[[Sequence[int]], None] = lambda _: None,  # newest step of every agent, -1: none yet
+        checkpoints: Path | None = None,  # directory for a mark; finding one there means a takeover
+        farewell: float = FAREWELL,  # s to wait for acknowledgements of the end
     ) -> None:
         super().__init__("switcher", record=record)
         self._farewell = farewell
@@ -93,7 +77,7 @@ class Switcher(NetworkNode):
         self._heard = False  # from an agent since the last call of on_progress
         self._recorded = RECORDER not in readers
         self._on_progress = on_progress
-        self._namesakes: set[str] = set()  # at the last look
+        self._namesakes: set[str] = set()  # names seen at the last check
         self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
         self._expected = [agent_name(i) for i in range(model.agents)] + readers
         self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LATCHED)
@@ -103,21 +87,21 @@ class Switcher(NetworkNode):
         every(self, REPORT_PERIOD, self._report)
 
     def found(self) -> bool:
-        """See NetworkNode."""
+        """Whether all expected nodes are there."""
         return not self.awaited()
 
     def awaited(self) -> list[str]:
-        """See NetworkNode. All that it publishes is latched: it is enough that the others are there."""
+        """Names of nodes that are not there yet; all its topics are latched, so being there is enough."""
         here = self.get_namespace()
         there = {name for name, namespace in self.get_node_names_and_namespaces() if namespace == here}
         return [name for name in self._expected if name not in there]
 
     def companions(self) -> list[str]:
-        """See NetworkNode."""
+        """All agents and the required readers."""
         return self._expected
 
     def health(self) -> Health:
-        """See NetworkNode."""
+        """Progress of the slowest agent, or which agents have not started."""
         self._look_for_namesakes()
         values = {"step of the slowest agent": str(self._slowest)}
         if self._slowest < 0:
@@ -126,11 +110,11 @@ class Switcher(NetworkNode):
         return self._how(values)
 
     def _how(self, values: dict[str, str]) -> Health:
-        """How it is once all agents have started; ``values`` are what there is to say anyway."""
+        """Health once all agents have started; ``values``: facts to include."""
         raise NotImplementedError
 
     def _look_for_namesakes(self) -> None:
-        """Say who is there twice, once it has been seen twice: someone that was killed may not be gone yet."""
+        """Warn of a duplicate node when it is seen twice in a row: a killed one may not be gone yet."""
         there = set(self.namesakes())
         for name in there & self._namesakes:
             if not self.refused[name, NAMESAKE]:
@@ -139,14 +123,14 @@ class Switcher(NetworkNode):
         self._namesakes = there
 
     def begin(self) -> None:
-        """Publish the experiment, to begin with."""
+        """Publish the experiment."""
         self.publish(self._experiment, encode_string(self.record.to_json()))
 
     def _moved(self) -> None:
-        """The slowest agent has got further."""
+        """Called when the slowest agent has advanced."""
 
-    def finish(self, *, complete: bool, deadline: float) -> None:  # noqa: ARG002  it has a patience of its own
-        """See NetworkNode. Nobody needs anything but the end any more, and who has left has had it."""
+    def finish(self, *, complete: bool, deadline: float) -> None:  # noqa: ARG002  it has a time limit of its own
+        """Wait until the end is acknowledged; readers need nothing else any more, and those that left have had it."""
         if complete:
             self._end.wait_for_all_acked(Duration(seconds=self._farewell))
 
@@ -174,7 +158,7 @@ class Switcher(NetworkNode):
             self._on_progress(self._reached)
 
     def _publish_sojourn(self, sojourn: Sojourn) -> int:
-        """Publish a sojourn; the bytes of its message."""
+        """Publish a sojourn; the size of its message [bytes]."""
         message = self._message(sojourn).encode()
         self.publish(self._graph, message)
         return len(message)
@@ -194,17 +178,16 @@ class Switcher(NetworkNode):
 
 
 class LockstepSwitcher(Switcher):
-    """Keeps a bounded number of sojourns ahead of the agents. Parameters: see Switcher."""
+    """Keeps a bounded number of sojourns ahead of the agents; parameters as in ``Switcher``."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        # Part of the path has been published if there is a mark, and nobody says how much.
+        # A mark means that part of the path has been published; how much is not known.
         self._behind = bool(self._mark and self._mark.exists())
-        self._ahead: deque[int] = deque()  # first steps of the published sojourns that the slowest has not reached
+        self._ahead: deque[int] = deque()  # first steps of published sojourns that the slowest agent has not reached
         self._most_ahead = AHEAD
 
     def _how(self, values: dict[str, str]) -> Health:
-        """See Switcher."""
         values["sojourns ahead of it"] = str(len(self._ahead))
         return Health(f"{len(self._ahead)} sojourns ahead of step {self._slowest}", values=values)
 
@@ -216,10 +199,9 @@ class LockstepSwitcher(Switcher):
         self._moved()
 
     def _moved(self) -> None:
-        """See Switcher: keep ahead."""
         slowest = self._slowest
         if self._behind:
-            if slowest < 0:  # not everybody has said yet where he is
+            if slowest < 0:  # not all agents have reported yet
                 return
             self._catch_up(slowest)
         while self._ahead and self._ahead[0] <= slowest:
@@ -231,7 +213,7 @@ class LockstepSwitcher(Switcher):
             self._go_ahead(sojourn)
 
     def _catch_up(self, slowest: int) -> None:
-        """Publish again what may still have been under way when the process before this one went."""
+        """Publish again what may not have been delivered when the process before this one ended."""
         recent: deque[Sojourn] = deque(maxlen=BEHIND)
         for sojourn in self._path:
             recent.append(sojourn)
@@ -248,7 +230,7 @@ class LockstepSwitcher(Switcher):
 
 
 class RealtimeSwitcher(Switcher):
-    """Says when simulated time begins, and publishes each sojourn when it begins. Parameters: see Switcher."""
+    """Sets the epoch of simulated time, and publishes each sojourn when it begins; parameters as in ``Switcher``."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -257,7 +239,6 @@ class RealtimeSwitcher(Switcher):
         self._next = next(self._path, None)
 
     def _how(self, values: dict[str, str]) -> Health:
-        """See Switcher."""
         if self._schedule is None:
             return Health("waiting for the time on /clock", waiting=True, values=values)
         late = self._next is not None and self._timer.now() - self._schedule.clock_time(self._next.first_step)
@@ -265,7 +246,7 @@ class RealtimeSwitcher(Switcher):
         return Health(f"step of the slowest agent: {self._slowest}", values=values)
 
     def begin(self) -> None:
-        """Publish the experiment; and after another process, what that one has published of epoch and path."""
+        """Publish the experiment and, after a takeover, the epoch and the path so far."""
         super().begin()
         text = self._mark.read_text(encoding="ascii") if self._mark and self._mark.exists() else ""
         if text:
@@ -276,14 +257,14 @@ class RealtimeSwitcher(Switcher):
         now = self._timer.now()
         if self._schedule is None and self._slowest >= 0 and now:
             epoch = now + HEAD_START
-            if self._mark:  # whole or not at all: whoever takes over must go on with this epoch
+            if self._mark:  # whole or not at all: a process that takes over must go on with this epoch
                 draft = self._mark.with_suffix(".draft")
                 draft.write_text(str(epoch), encoding="ascii")
                 draft.replace(self._mark)
             self._start(epoch)
 
     def _start(self, epoch: int) -> None:
-        """Publish the epoch, and the path as far as it has come."""
+        """Publish the epoch, and the path so far."""
         experiment = self.record.experiment
         self._schedule = Schedule(epoch=epoch, speed=experiment.run.speed, step_length=experiment.step_length)
         publisher = self.create_publisher(ProgressMsg, EPOCH_TOPIC, LATCHED)
@@ -291,7 +272,7 @@ class RealtimeSwitcher(Switcher):
         self._keep_up()
 
     def _keep_up(self) -> None:
-        """Publish every sojourn whose time has come, the first one before."""
+        """Publish every sojourn that has begun; the first one before the epoch."""
         assert self._schedule is not None
         simulated = self._schedule.simulated(self._timer.now())
         come: deque[Sojourn] = deque(maxlen=BEHIND)

@@ -1,9 +1,9 @@
-"""When may an agent make its next step? The distributed lockstep, without ROS and without arithmetic.
+"""When an agent may make its next step: the distributed lockstep. No ROS, no arithmetic.
 
 Agent i makes step k (from x(k) to x(k+1)) when it knows the graph g(k), has x_j(k) from every j that row i of W_g(k)
-uses, and nobody whom it can ever exchange states with is more than ``window`` steps behind it. There is no barrier
-and no master. The last rule bounds every buffer even while the graph is disconnected, and it cannot deadlock: whoever
-is furthest behind is ahead of nobody, and all that it waits for has been published.
+uses, and no agent that it can ever exchange states with is more than ``window`` steps behind it. There is no barrier
+and no master. The last rule bounds every buffer even while the graph is disconnected, and it cannot cause a deadlock:
+the agent that is furthest behind is ahead of none, and all that it waits for has been published.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from typing import Generic, TypeVar
 Value = TypeVar("Value")
 
 WINDOW = 64
-"""Steps that an agent may be ahead of a peer. Small enough for a burst to fit a socket's receive buffer."""
+"""Steps that an agent may be ahead of a peer; small enough for a burst to fit a socket's receive buffer."""
 
 AGAIN = 6000
-"""Steps that agents keep, and send again when one of them was killed. What is older nobody sends."""
+"""Most steps that an agent keeps, and sends again when another one was killed; older ones are never sent again."""
 
 KEPT = WINDOW
-"""Steps for which a value is kept after its use. Whoever is given another one for the same step notices: one of the two
-is forged, and as the true one may be the second, it comes when its sender, up to a window behind, makes that step."""
+"""Steps for which a value is kept after its use, to notice a different one for the same step: one of the two is forged.
+The true one may come second, when its sender, up to a window behind, makes that step."""
 
 
 class Refusal:
-    """Why something offered was not taken."""
+    """Why a state or a sojourn was not taken."""
 
     STRANGER = "not a peer"
     OLD = "a step already done or already here"
@@ -41,45 +41,24 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """Steps up to the last one use this mode."""
+    """Mode of the steps up to ``last``."""
 
     mode: int
     last: int
 
 
 class Synchronizer(Generic[Value]):
-    """The lockstep of one agent. Steps count from 0; x(0) is the start, the run ends at x(steps).
-
-    Parameters
-    ----------
-    agent
-        index of the agent
-    steps
-        N, steps of the run
-    inputs
-        for each mode, the other agents whose states the agent's row uses, ascending
-    peers
-        every other agent that the agent ever hears or is heard by (of which ``inputs`` are some)
-    window
-        steps that the agent may be ahead of a peer, >= 0
-    start
-        step that the agent is at already, where it takes over from a process that has gone
-
-    Raises
-    ------
-    ValueError
-        numbers that do not go together: a mistake of the caller
-    """
+    """The lockstep of one agent. Steps count from 0; x(0) is the start, the run ends at x(steps)."""
 
     def __init__(
         self,
         *,
         agent: int,
-        steps: int,
-        inputs: Sequence[Sequence[int]],
-        peers: Collection[int],
-        window: int = WINDOW,
-        start: int = 0,
+        steps: int,  # N
+        inputs: Sequence[Sequence[int]],  # per mode, the other agents that the agent's row uses, ascending
+        peers: Collection[int],  # every other agent that it ever hears or is heard by; includes ``inputs``
+        window: int = WINDOW,  # steps that it may be ahead of a peer, >= 0
+        start: int = 0,  # the current step, after a takeover
     ) -> None:
         self.agent = agent
         self.step = start
@@ -90,7 +69,7 @@ class Synchronizer(Generic[Value]):
         self._newest = dict.fromkeys(self._buffers, -1)
         self._limit = window - 1 if peers else steps
         self._known: deque[_Known] = deque()
-        # Of the next sojourn. Who takes over comes into the middle, and takes the sojourn of its step for the first.
+        # Of the next sojourn; None: after a takeover, when the sojourn that contains the step counts as the first.
         self._sequence: int | None = 0 if start == 0 else None
         self._unplanned = start  # first step whose graph is not known
         self._mode = 0  # of the next step, if its graph is known
@@ -101,24 +80,9 @@ class Synchronizer(Generic[Value]):
             raise ValueError(f"agent {agent} uses {sorted(missing)}, who are not among its peers {sorted(peers)}")
 
     def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
-        """Take note of a sojourn of the graph.
+        """Take a sojourn (steps ``first_step`` to ``last_step``); None if taken, else a ``Refusal``.
 
-        Parameters
-        ----------
-        sequence
-            of the sojourn, from 0
-        mode
-            graph, from 0
-        first_step
-            that uses it
-        last_step
-            that uses it
-
-        Returns
-        -------
-        str | None
-            None if taken, else the reason (a ``Refusal``). Sojourns must come in sequence, each where the last one
-            ended.
+        Sojourns must come in sequence, each where the last one ended.
         """
         if self._sequence is None:
             if last_step < self.step:
@@ -137,27 +101,12 @@ class Synchronizer(Generic[Value]):
         return None
 
     def offer(self, agent: int, step: int, value: Value) -> str | None:
-        """Take x_agent(step).
-
-        Parameters
-        ----------
-        agent
-            index from 0
-        step
-            k
-        value
-            x_agent(k), as the law takes it
-
-        Returns
-        -------
-        str | None
-            None if taken, else the reason (a ``Refusal``).
-        """
+        """Take x_agent(step); None if taken, else a ``Refusal``."""
         buffer = self._buffers.get(agent)
         if buffer is None:
             return Refusal.STRANGER
         if step < self.step or step in buffer:
-            # A peer that is behind is heard of here too: its value is of no use, its progress is.
+            # Also of a peer that is behind: its value is of no use, but it shows the progress of the peer.
             if step in buffer and buffer[step] != value:
                 return Refusal.CONTRADICTION
             if step < self.step - self._window - AGAIN:
@@ -180,18 +129,12 @@ class Synchronizer(Generic[Value]):
         return not self._missing and (self.step <= self._limit or self._within_window())
 
     def inputs(self) -> tuple[int, list[Value]]:
-        """What the step that is ready needs.
-
-        Returns
-        -------
-        tuple[int, list[Value]]
-            mode and the states x_j(step), j ascending, of the agents that the row of this mode uses, and of nobody else
-        """
+        """Mode of the step that is ready, and the states x_j(step) of the agents that its row uses, j ascending."""
         step, buffers = self.step, self._buffers
         return self._mode, [buffers[j][step] for j in self._needed]
 
     def advance(self) -> None:
-        """The step that was ready has been made: move on to x(step + 1)."""
+        """Move on to x(step + 1): the step that was ready has been made."""
         step = self.step
         for buffer in self._buffers.values():
             buffer.pop(step - KEPT, None)
@@ -201,7 +144,7 @@ class Synchronizer(Generic[Value]):
         self._plan()
 
     def _plan(self) -> None:
-        """Find out whom the next step needs, and count who of them has not been heard."""
+        """Find out which agents the next step needs, and count those whose state is missing."""
         if not self._known or self.step >= self.steps:
             self._needed, self._missing = (), 1
             return
@@ -222,7 +165,7 @@ class Synchronizer(Generic[Value]):
         return self.step >= self.steps
 
     def waiting_for(self) -> str:
-        """What keeps the agent from its next step, for people (agents from 1)."""
+        """What keeps the agent from its next step, as text (agents from 1)."""
         if self.finished:
             return "nothing, it has finished"
         if not self._known:

@@ -1,6 +1,6 @@
-"""States of a running network, read where its agents keep them for whoever takes over from them.
+"""Reads the states of a running network from the checkpoint files of its agents.
 
-Nothing is sent for it, and nobody waits: it costs the network no more than the time of the processor that reads.
+Nothing is sent and nothing waits: the network pays only for the CPU time of the reader.
 """
 
 from __future__ import annotations
@@ -17,24 +17,11 @@ from msg_analysis.model.record import RunRecord
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
 BLOCK = 2000
-"""Steps that are taken at once: what comes of a large network stays small in memory."""
+"""Steps that are taken at once: limits the memory that a large network needs."""
 
 
 class Tap:
-    """Reads whole steps out of the checkpoints of the agents, each at most once, in order.
-
-    Parameters
-    ----------
-    record
-        of the run
-    directory
-        of the checkpoints
-
-    Attributes
-    ----------
-    missed
-        steps that had been written over before they were read
-    """
+    """Reads whole steps from the checkpoints of the agents, each at most once, in order."""
 
     def __init__(self, record: RunRecord, directory: Path) -> None:
         experiment = record.experiment
@@ -44,10 +31,10 @@ class Tap:
         self._size, self._capacity = size, self._total // self._slot
         self._rings: list[AnyArray] = []  # (capacity, slot) bytes of each agent
         self._next = 0
-        self.missed = 0
+        self.missed = 0  # steps that were overwritten before or while they were read
 
     def ready(self) -> bool:
-        """Whether every agent has its checkpoint; they are opened then."""
+        """Whether every agent has its checkpoint; opens them when they are there."""
         if not self._rings:
             paths = [self._directory / f"{agent_name(agent)}.states" for agent in range(self._agents)]
             if not all(path.exists() and path.stat().st_size == self._total for path in paths):
@@ -61,20 +48,12 @@ class Tap:
         return ring.reshape(self._capacity, self._slot)
 
     def take(self, reached: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-        """Steps that all agents have made since the last time; not all of them, if they are many.
+        """The next steps that all agents have made, at most ``BLOCK``; ``reached``: newest state of all agents.
 
-        Parameters
-        ----------
-        reached
-            the newest state that every agent has published
-
-        Returns
-        -------
-        tuple[IntArray, IntArray, FloatArray, FloatArray]
-            steps : (b,) k modes : (b,) graph from 0 of the step k -> k+1, as the first agent says; in real time others
-            may say otherwise states, after : (b, m, width) x(k), x(k+1)
+        Returns steps k (b,), modes from 0 of k -> k+1 (b,), x(k) (b, m, width), x(k+1) (b, m, width). Modes are those
+        of the first agent; in real time others may have used another graph.
         """
-        oldest = max(reached - self._capacity // 2, 0)  # what is older may be written over while it is read
+        oldest = max(reached - self._capacity // 2, 0)  # older ones may be overwritten while they are read
         if self._next < oldest:
             self.missed += oldest - self._next
             self._next = oldest
@@ -96,7 +75,7 @@ class Tap:
         return steps[:-1][good], modes[1:][good] - 1, states[:-1][good], states[1:][good]
 
     def _read(self, ring: AnyArray, steps: IntArray) -> tuple[FloatArray, IntArray, BoolArray]:
-        """(b, width) states, (b,) modes from 1, and whether they are those of these steps."""
+        """States (b, width), modes from 1 (b,), and whether the slots still held these steps (b,)."""
         slots = steps % self._capacity
         data = ring[slots]
         marks = np.ascontiguousarray(data[:, self._size :]).view("<u8")

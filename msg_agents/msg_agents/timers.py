@@ -1,4 +1,4 @@
-"""Timers on the clock of a node, and timers on the wall, whatever that clock does."""
+"""Timers on the clock of a node, and timers on wall time, whatever that clock does."""
 
 from __future__ import annotations
 
@@ -12,17 +12,10 @@ FAR_OFF = 3600.0  # s
 
 
 class DueTimer:
-    """Calls back once, when the node's clock has come to a given time: a wall clock, or under use_sim_time ``/clock``.
+    """Calls back once, when the node's clock (a wall clock, or ``/clock`` under use_sim_time) has reached a given time.
 
-    ROS 2's own timers are periodic and count from when they were made; so this one is set anew for every time. Nothing
-    drifts, and the phase is the one that was asked for.
-
-    Parameters
-    ----------
-    node
-        whose clock counts
-    callback
-        called when it is time, or a little later
+    ROS 2's own timers are periodic and count from when they were made. This one is set anew for every time, so it does
+    not drift and has the phase that was asked for. The callback may come a little late.
     """
 
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:
@@ -32,20 +25,12 @@ class DueTimer:
         self._timer.cancel()
 
     def now(self) -> int:
-        """What the clock says [ns]; 0 under use_sim_time until ``/clock`` has been heard."""
+        """Time of the clock [ns]; 0 under use_sim_time until ``/clock`` has been received."""
         return int(self._clock.now().nanoseconds)
 
     def set(self, when: int, now: int | None = None) -> None:
-        """Call back at a time of the clock [ns]; at once if that has passed.
-
-        Parameters
-        ----------
-        when
-            time of the clock [ns]
-        now
-            what the clock says, if it is known already [ns]
-        """
-        # The clock may have moved since the caller looked: one that is late already is only called a little later.
+        """Call back at time ``when`` of the clock [ns], at once if it has passed; ``now``: its time, if known."""
+        # The clock may have moved on from ``now``: the callback is then a little later.
         self._timer.timer_period_ns = max(1, when - (self.now() if now is None else now))
         self._timer.reset()
 
@@ -55,15 +40,5 @@ class DueTimer:
 
 
 def every(node: Node, period: float, callback: Callable[[], None]) -> None:
-    """Call back every ``period`` s of the wall, even while the node's clock stands or runs at another rate.
-
-    Parameters
-    ----------
-    node
-        whose executor calls
-    period
-        of the wall [s]
-    callback
-        what to call
-    """
+    """Call back every ``period`` s of wall time, from the node's executor, even while the node's clock stands still."""
     node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))

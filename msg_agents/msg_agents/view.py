@@ -1,4 +1,4 @@
-"""What people see of a run while it goes on: a panel on a terminal, lines elsewhere, a page for browsers on demand."""
+"""View of a run while it goes on: a panel on a terminal, lines elsewhere, a page for browsers on request."""
 
 from __future__ import annotations
 
@@ -18,20 +18,12 @@ if TYPE_CHECKING:
     from msg_analysis.model.experiment import Experiment
     from msg_analysis.model.record import RunRecord
 
-REFRESH = 0.25  # s between two pictures
+REFRESH = 0.25  # s between two updates
 LINES = 10.0  # s between two lines where there is no terminal
 
 
 class RunView:
-    """Shows a run; to be used with ``with``. Only the thread that runs the network calls it.
-
-    Parameters
-    ----------
-    experiment
-        that is run
-    web
-        the page; None: none
-    """
+    """Shows a run; a context. All methods are called from the thread that runs the network."""
 
     def __init__(self, experiment: Experiment, web: Web | None = None) -> None:
         from rich.console import Console
@@ -40,7 +32,7 @@ class RunView:
         self._experiment, self._web = experiment, web
         self._console = Console(stderr=True)
         self._terminal = self._console.is_terminal
-        # No thread: refreshed as the run is looked at.
+        # No thread: ``look`` refreshes it.
         self._live = Live(console=self._console, auto_refresh=False, transient=True, vertical_overflow="crop")
         self._jobs = JobControl(before=self._live.stop, after=lambda: self._live.start(refresh=True))
         self._clockwork = Clockwork(experiment)
@@ -65,46 +57,24 @@ class RunView:
             self._live.stop()
 
     def note(self, line: str) -> None:
-        """Say what happens, above the panel.
-
-        Parameters
-        ----------
-        line
-            for people
-        """
+        """Print a note, above the panel."""
         from rich.text import Text
 
         self._console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
 
     def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
-        """The processes have been started.
-
-        Parameters
-        ----------
-        record
-            of the run
-        checkpoints
-            directory in which the agents keep their states; None: nowhere, and nobody follows the errors
-        """
+        """Follow the run: its processes have been started. Without ``checkpoints`` its errors are not followed."""
         if self._web is not None:
             self._web.begin(setting(record.experiment))
         if not self._terminal and self._web is None:
-            return  # lines say nothing of errors
+            return  # lines do not show errors
         if checkpoints is None:
             self._note = "errors are not followed here: the states are not kept (--restarts 0), or not on this host"
         else:
             self._observer = Observer(record, checkpoints)
 
     def look(self, steps: Sequence[int], *, force: bool = False) -> None:
-        """Show how it stands.
-
-        Parameters
-        ----------
-        steps
-            newest step of every agent, -1: none; empty before the start
-        force
-            even if it has been shown a moment ago
-        """
+        """Show the newest step of every agent (-1: none; empty before the start), every ``REFRESH`` s or if forced."""
         if self._terminal:
             self._jobs.check()
         self._steps = steps
@@ -128,7 +98,7 @@ class RunView:
             self._web.show(moment_document(moment))
 
     def end(self) -> None:
-        """The run is over, or nobody should look at it any more."""
+        """Show the last numbers, and stop following the run."""
         if self._observer is not None:
             self._observer.look(min(self._steps, default=-1))
             self._observer.end()
@@ -136,12 +106,6 @@ class RunView:
             self._observer = None
 
     def say(self, words: dict[str, Any]) -> None:
-        """Tell the page how the run ended.
-
-        Parameters
-        ----------
-        words
-            what the page shows of it
-        """
+        """Tell the page how the run ended."""
         if self._web is not None:
             self._web.end(words)

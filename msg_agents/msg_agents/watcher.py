@@ -1,4 +1,4 @@
-"""What watches a network, running or played: it finds the run, follows it, and leaves when it is over."""
+"""Base of the nodes that watch a network, running or played: find the run, follow it, leave when it is over."""
 
 from __future__ import annotations
 
@@ -28,30 +28,13 @@ from msg_analysis.bags.cdr_stream import CdrError
 from msg_analysis.errors import InputError
 from msg_analysis.model.record import RunRecord
 
-PATIENCE = 1.0  # s after which it is said that nobody is there
+PATIENCE = 1.0  # s after which a note says that there is no network
 LISTEN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""How states are read by default: a writer never waits for such a reader, which misses what it is too slow for."""
+"""How states are read by default: a writer never waits for such a reader, which misses messages if it is too slow."""
 
 
 class Watcher(QuietNode):
-    """Follows the first run that it hears of.
-
-    Parameters
-    ----------
-    name
-        of the node
-    on_note
-        told what somebody should know
-
-    Attributes
-    ----------
-    record
-        of the run, once it is known; None before
-    known
-        set when the run is known
-    done
-        set when the run is over
-    """
+    """Follows the first run that it hears of; ``known`` is set then, and ``done`` (by subclasses) at its end."""
 
     def __init__(self, name: str, *, on_note: Callable[[str], None]) -> None:
         super().__init__(name)
@@ -61,26 +44,20 @@ class Watcher(QuietNode):
         self._refused: Counter[str] = Counter()
         self._others: set[str] = set()
         self._ended = False
-        self._topics: list[str] = []  # whose publishers are the run
+        self._topics: list[str] = []  # topics of states: the run is there while they have publishers
         self.create_subscription(String, EXPERIMENT_TOPIC, self._receive_experiment, LATCHED, raw=True)
         self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LATCHED, raw=True)
 
     def follow(self) -> None:
-        """Read the states of the run that has been found.
-
-        Raises
-        ------
-        InputError
-            that cannot be done with this run
-        """
+        """Read the states of the run that has been found; InputError: not possible with this run."""
         raise NotImplementedError
 
     def farewell(self) -> None:
-        """Stay until whoever reads what this node says has the last of it."""
+        """Wait until the readers of this node's own topics have the last messages."""
         raise NotImplementedError
 
     def conclude(self) -> None:
-        """Work out what is to be said in the end, as far as it has come: leaving is given little time."""
+        """Prepare the final result from what has been received; must be quick, since leaving has a time limit."""
 
     def _receive_experiment(self, data: bytes) -> None:
         try:
@@ -112,35 +89,16 @@ Kind = TypeVar("Kind", bound=Watcher)
 
 
 def run_watcher(
-    make_node: Callable[[], Kind],
+    make_node: Callable[[], Kind],  # called after rclpy.init
     *,
     timeout: float | None = None,
     on_note: Callable[[str], None] = lambda _: None,
-    on_look: Callable[[], None] = lambda: None,
+    on_look: Callable[[], None] = lambda: None,  # called about every ``SPIN_SLICE`` s, between two callbacks
 ) -> Kind | None:
-    """Watch a network in this process until it is over, or until Ctrl-C or another signal.
+    """Watch a network in this process until it is over or a signal comes; None: interrupted before there was a node.
 
-    Parameters
-    ----------
-    make_node
-        called once ROS is up
-    timeout
-        s to wait for a network; None: for ever
-    on_note
-        told what somebody should know
-    on_look
-        called a few times a second, between two callbacks
-
-    Returns
-    -------
-    Kind | None
-        The node; None: it was interrupted before there was one. Where the run was seen to be over, it is still on the
-        network: end the process at once
-
-    Raises
-    ------
-    InputError
-        no network came in time, or it cannot be followed
+    If the run was seen to be over, the node is still on the network: end the process at once. InputError: no network
+    within ``timeout`` s (None: no limit), or it cannot be followed.
     """
     nobody = _nobody()
     os.environ.update(without_shared_memory())
@@ -169,19 +127,16 @@ def run_watcher(
     finally:
         for node in nodes:
             node.conclude()
-        # When the run is over nobody waits for this node, and leaving while others leave can deadlock: see ``leave``.
+        # After the run no node waits for this one, and leaving while others leave can deadlock: see ``leave``.
         if not all(node.done.done() for node in nodes):
             leave(nodes, complete=False)
     return nodes[0] if nodes else None
 
 
 def _spin(executor: Executor, done: Future, on_look: Callable[[], None]) -> None:
-    """Spin until something is done.
+    """Spin until ``done``; a signal raises KeyboardInterrupt or SystemExit between two callbacks.
 
-    Raises
-    ------
-    KeyboardInterrupt, SystemExit
-        by Ctrl-C or another signal, between two callbacks: in one, the executor would complain of it
+    Raised within a callback, the executor would report it as an error.
     """
     with Interruption() as interruption:
         while not done.done():

@@ -1,7 +1,7 @@
 """A small page on which browsers follow a run: one HTML file, and server-sent events.
 
-Each browser has a thread of its own, which sends it what is newest when it is ready for it. So a slow one, or one that
-has gone, holds up nobody; what it was too slow for it does not get.
+Each browser has a thread of its own, which sends what is newest whenever the browser is ready. A slow or lost browser
+delays nothing; it misses what it is too slow for.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from msg_analysis.errors import InputError
 
 MOST_BROWSERS = 32
 HISTORY = 600
-"""Points of the running error that who comes late is given."""
+"""Points of the running error that a browser gets when it connects."""
 SEND_TIMEOUT = 10.0  # s for a browser to take what it is sent
-ALIVE = 5.0  # s after which something is sent, if there is nothing new, to find out who has gone
-FAREWELL = 1.5  # s for the browsers to be told of the end
+ALIVE = 5.0  # s after which a comment is sent if there is nothing new, to detect lost browsers
+FAREWELL = 1.5  # s for telling the browsers of the end
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -37,29 +37,14 @@ HEADERS = {
 
 
 class Web:
-    """Serves the page, from when it is made until ``close``.
+    """Serves the page at ``address`` from when it is made until ``close``; port 0: any free one.
 
-    Parameters
-    ----------
-    host
-        name or address to listen at
-    port
-        0: any that is free
-
-    Attributes
-    ----------
-    address
-        of the page
-
-    Raises
-    ------
-    InputError
-        the port is taken, or there is no such address here
+    Its methods may be called from any thread. InputError: the port is taken, or the address is not one of this machine.
     """
 
     def __init__(self, host: str, port: int) -> None:
         self._changed = threading.Condition()
-        self._number = 0  # of what is newest
+        self._number = 0  # of the newest change
         self._setting: dict[str, Any] | None = None
         self._moment: dict[str, Any] | None = None
         self._ending: dict[str, Any] | None = None
@@ -88,25 +73,13 @@ class Web:
         self.close()
 
     def begin(self, setting: dict[str, Any]) -> None:
-        """There is a run.
-
-        Parameters
-        ----------
-        setting
-            of ``msg_agents.moment.setting``
-        """
+        """Show a run, given by ``moment.setting``."""
         with self._changed:
             self._setting = finite(setting)
             self._tell()
 
     def show(self, moment: dict[str, Any]) -> None:
-        """How the run stands now.
-
-        Parameters
-        ----------
-        moment
-            of ``msg_agents.moment.moment_document``
-        """
+        """Show the current state of the run, given by ``moment.moment_document``."""
         system = moment["system"] or {}
         with self._changed:
             self._moment = finite(moment)
@@ -118,19 +91,13 @@ class Web:
             self._tell()
 
     def end(self, words: dict[str, Any]) -> None:
-        """The run is over.
-
-        Parameters
-        ----------
-        words
-            ``text``, and ``verdict`` or None
-        """
+        """Show that the run is over (first call only): ``words`` are "text", and "verdict" or None."""
         with self._changed:
             self._ending = self._ending or finite(words)
             self._tell()
 
     def close(self) -> None:
-        """Tell the browsers that it is over, and let them go."""
+        """Tell the browsers that the run is over, for ``FAREWELL`` s at most, and stop serving."""
         self.end({"text": "The run has ended.", "verdict": None})
         deadline = time.monotonic() + FAREWELL
         with self._changed:
@@ -145,13 +112,7 @@ class Web:
         self._changed.notify_all()
 
     def follow(self, handler: _Handler) -> None:
-        """Send one browser what is newest, again and again, until the end or until it has gone.
-
-        Parameters
-        ----------
-        handler
-            of its request
-        """
+        """Send one browser what is newest until the end or until it has gone; runs in that browser's thread."""
         with self._changed:
             if self._browsers >= MOST_BROWSERS:
                 handler.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_BROWSERS} browsers are watching already")
@@ -196,21 +157,21 @@ class _Server(ThreadingHTTPServer):
         self.web = web
         page = resources.files("msg_agents") / "pages" / "live.html"
         self.page = page.read_bytes()
-        self.names: set[str] | None = None  # by which the page may be asked for; None: by any
+        self.names: set[str] | None = None  # allowed in the Host header; None: any
         super().__init__((host, port), _Handler)
         address = ipaddress.ip_address(str(self.server_address[0]))
         if address.is_loopback:
             self.names = {"localhost", "127.0.0.1", "[::1]", host.lower()}
 
     def server_bind(self) -> None:
-        """Without asking who we are: that may take long, or a network."""
+        """Bind without a look-up of our own name, which may take long or need a network."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away in the middle is none of our business."""
+        """Ignore browsers that disconnect."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -219,9 +180,9 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "msg_agents", ""
 
     def do_GET(self) -> None:
-        """The page, or the events."""
+        """Serve the page or the events."""
         path = self.path.partition("?")[0]
-        # A page from elsewhere whose name has been made to point here must not read this one.
+        # DNS rebinding: a foreign page whose name has been made to point here must not read this one.
         name = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
         if self.server.names is not None and name.lower() not in self.server.names:
             self.refuse(HTTPStatus.FORBIDDEN, "this page is served under the name of this machine only")
@@ -235,22 +196,22 @@ class _Handler(BaseHTTPRequestHandler):
             self.refuse(HTTPStatus.NOT_FOUND, "there is / and /events")
 
     def refuse(self, status: HTTPStatus, words: str) -> None:
-        """Say why not."""
+        """Answer with an error and its reason."""
         self._send(status, f"{words}\n".encode(), "text/plain; charset=utf-8")
 
     def start_events(self) -> None:
-        """The head of a stream of events."""
+        """Send the head of a stream of events."""
         self.close_connection = True
         self._head(HTTPStatus.OK, "text/event-stream; charset=utf-8")
         self.end_headers()
 
     def send_events(self, events: list[tuple[str, Any]]) -> bool:
-        """Whether the browser took them."""
+        """Send events, or a comment if there are none; False if the browser did not take them."""
         text = "".join(f"event: {name}\ndata: {json.dumps(data)}\n\n" for name, data in events) or ": still here\n\n"
         try:
             self.wfile.write(text.encode())
             self.wfile.flush()
-        except OSError:  # it has gone, or is too slow
+        except OSError:  # the browser has gone, or is too slow
             return False
         return True
 
@@ -267,4 +228,4 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(header, value)
 
     def log_message(self, *_: Any) -> None:
-        """Nothing: stderr is for the run."""
+        """Log nothing: stderr is for the run."""

@@ -1,4 +1,4 @@
-"""The temporary folders of a run: its record and what its processes print, and what they leave if they are killed."""
+"""Temporary folders of a run: its record, the output of its processes, and the states for a takeover."""
 
 from __future__ import annotations
 
@@ -13,23 +13,19 @@ from pathlib import Path
 
 PREFIX = "msg_agents_run_"
 MEMORY = Path("/dev/shm")
-"""A file system in memory, where there is one: pages of files on a disk cost about twice as much when they are written
-for the first time, and again whenever the system has saved them."""
+"""A file system in memory, where there is one: a page of a file on a disk costs about twice as much to write for the
+first time, and again after each time the system has saved it."""
 
-SPARE = 4  # times the room that is needed there must be free, for others to live
+SPARE = 4  # times the room that is needed must be free there, so that other programs have enough
 YOUTH = 60.0  # s; younger folders may belong to a run that has not locked its own yet
 
 
 @contextmanager
 def workshop(room: int | None = None) -> Iterator[Path]:
-    """A folder of our own that is gone afterwards; those of runs that were killed are cleared away first.
+    """A folder that is removed at the end; those that killed runs left behind are removed first.
 
-    A lock tells a run's folder from one that was left behind: it goes with the process, however that ends.
-
-    Parameters
-    ----------
-    room
-        bytes that will be mapped into memory; the folder then is in memory, if there is plenty of it
+    A lock, which ends with its process, marks folders in use. ``room``: bytes that will be mapped into memory; the
+    folder is then in memory, if there is plenty.
     """
     _clear_abandoned()
     parent = MEMORY if room is not None and _free(MEMORY) > SPARE * room else None
