@@ -1,8 +1,8 @@
-"""Everything public says what it takes, gives and refuses: arguments, shapes, units, errors, and theory its source.
+"""Docstrings follow the rule of docs/contributing.md.
 
-Public is what has no underscore at the front of its name nor of its module's or class's, in msg_analysis and
-msg_agents; of a module with ``__all__``, what that lists. Commands are documented by their --help (tests/commands).
-What overrides a method of another package, or of a documented class of ours, may leave the words to that.
+The public API is documented in full: arguments, shapes, units, errors. So is whatever has sections in theory/ and
+inference/, and theory/ names its sources. All else has one to three lines without sections. Commands are documented by
+their --help (tests/commands). Folders are matched by prefix, so that modules may move into folders below them.
 """
 
 from __future__ import annotations
@@ -11,13 +11,25 @@ import ast
 import logging
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import griffe
 import pytest
 
 ROOT = Path(__file__).parents[2]
+API_MODULES = "msg_analysis", "msg_analysis.protocol", "msg_agents"  # with ``__all__``; docs/api.md names the rest
+API_NAME = re.compile(r"^::: ([\w.]+)", re.MULTILINE)
+THEORY = "msg_analysis.theory"
+FORMULAS = THEORY, "msg_analysis.inference"  # where functions that implement a formula have sections
+LONG = *FORMULAS, "msg_analysis.wire"  # where modules may have a long docstring without a formula in it
+MOST_LINES = 3  # of a docstring inside; blank lines do not count
+MOST_MODULE_LINES, MOST_LONG_MODULE_LINES = 6, 12
+FORMULA = re.compile(r"^ *\S.* = \S", re.MULTILINE)
+SECTION = re.compile(
+    r"^(Parameters|Other Parameters|Returns|Yields|Receives|Raises|Warns|Attributes|Methods)\n-{3,}$", re.MULTILINE
+)
 SHAPE = re.compile(r"\([\w+*/^ .'-]+,[\w+*/^ .,'-]*\)|\bshape\b|\bscalar\b|\bone (?:for|per|a)\b|[Ss]ee ")
 ARRAY = re.compile(r"\b(?:Float|Int|Bool|Any|Complex)Array\b|\bndarray\b|\bNDArray\b|\bArrayLike\b")
 PHYSICAL = re.compile(  # names of arguments that are times or rates, whatever they are of
@@ -30,7 +42,7 @@ UNIT = re.compile(
 SOURCE = re.compile(
     r"\bpaper\b|Proposition|Lemma|Theorem|Definition|docs/\w+\.md|\b[A-Z]\w+[^.]{0,70} \(?(?:19|20)\d\d\b"
 )
-NOT_TOLD = {
+NOT_DOCUMENTED = {
     "NotImplementedError",
     "AssertionError",
     "SystemExit",
@@ -43,18 +55,16 @@ ELSEWHERE = re.compile(
 )
 FOREIGN = re.compile(r"[Ss]ee [`:\w.]*(?:click|rclpy|numpy|ast|threading|logging|collections|contextlib|Protocol|http)")
 
-
-def packages() -> dict[str, griffe.Module]:
-    logging.getLogger("griffe").setLevel(logging.ERROR)
-    found = {}
-    for name, folder in (("msg_analysis", "analysis"), ("msg_agents", "msg_agents")):
-        module = griffe.load(name, search_paths=[ROOT / folder], docstring_parser="numpy", allow_inspection=False)
-        assert isinstance(module, griffe.Module)
-        found[name] = module
-    return found
+Member = griffe.Function | griffe.Class | griffe.Attribute  # of attributes, the properties
 
 
-PACKAGES = packages()
+def under(path: str, folders: Collection[str]) -> bool:
+    """Whether a path is one of these, or below one."""
+    return any(path == folder or path.startswith(f"{folder}.") for folder in folders)
+
+
+def lines(text: str) -> int:
+    return sum(1 for line in text.splitlines() if line.strip())
 
 
 def modules(module: griffe.Module) -> Iterator[griffe.Module]:
@@ -64,32 +74,22 @@ def modules(module: griffe.Module) -> Iterator[griffe.Module]:
             yield from modules(member)
 
 
-MODULES = {module.path: module for package in PACKAGES.values() for module in modules(package)}
+def is_command(member: Member) -> bool:
+    decorators = member.decorators if isinstance(member, griffe.Function) else []
+    return any(re.search(r"\bcommand\(|\bgroup\(", str(each.value)) for each in decorators)
 
 
-def is_command(function: griffe.Function) -> bool:
-    return any(re.search(r"\bcommand\(|\bgroup\(", str(each.value)) for each in function.decorators)
-
-
-def public(module: griffe.Module) -> Iterator[griffe.Function | griffe.Class]:
-    for member in module.members.values():
-        if member.is_alias or not isinstance(member, griffe.Function | griffe.Class):
+def members(parent: griffe.Module | griffe.Class, listed: bool = True) -> Iterator[tuple[Member, bool]]:
+    """Functions, classes, methods and properties, and whether each is public: by its own name and its class's."""
+    exports = parent.exports if isinstance(parent, griffe.Module) else None
+    for member in parent.members.values():
+        if not isinstance(member, Member) or is_command(member):  # a module, or an imported name
             continue
-        listed = member.name in module.exports if module.exports is not None else not member.name.startswith("_")
-        if listed and not (isinstance(member, griffe.Function) and is_command(member)):
-            yield from with_methods(member)
-
-
-def with_methods(member: griffe.Function | griffe.Class) -> Iterator[griffe.Function | griffe.Class]:
-    yield member
-    if isinstance(member, griffe.Class):
-        for inner in member.members.values():
-            if (
-                isinstance(inner, griffe.Function | griffe.Class)
-                and not inner.is_alias
-                and not inner.name.startswith("_")
-            ):
-                yield from with_methods(inner)
+        public = listed and (member.name in exports if exports is not None else not member.name.startswith("_"))
+        if not isinstance(member, griffe.Attribute) or "property" in member.labels:
+            yield member, public
+        if isinstance(member, griffe.Class):
+            yield from members(member, public)
 
 
 class Words:
@@ -101,7 +101,7 @@ class Words:
         self.sections = docstring.parse("numpy", warnings=False) if docstring else []
 
     def described(self, *kinds: str) -> dict[str, str]:
-        """Name of each argument (attribute, error) and what is said of it; several may share the words."""
+        """Name of each argument (attribute, error) and its description; several may share one."""
         found: dict[str, str] = {}
         for section in self.sections:
             if section.kind.value in kinds:
@@ -112,7 +112,7 @@ class Words:
 
     @property
     def result(self) -> str:
-        """What is said of what comes back: by the first paragraph, or the sections about it."""
+        """Description of the result: the first paragraph, and the sections about it."""
         parts = [self.text.split("\n\n")[0]]
         for section in self.sections:
             if section.kind.value in ("returns", "yields"):
@@ -120,11 +120,11 @@ class Words:
         return "\n".join(parts)
 
 
-def arguments(member: griffe.Function | griffe.Class) -> dict[str, str]:
+def arguments(member: Member) -> dict[str, str]:
     """Name and annotation of every argument; of a class, of its constructor."""
-    function = member
+    function: object = member
     if isinstance(member, griffe.Class):
-        function = member.members.get("__init__") or member  # type: ignore[assignment]  # dataclasses have one, too
+        function = member.members.get("__init__")  # dataclasses have one, too
     if not isinstance(function, griffe.Function):
         return {}
     return {
@@ -147,15 +147,15 @@ def raised(member: griffe.Function) -> set[str]:
             continue
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             name = ast.unparse(node.exc.func)
-            if name[0].isupper() and name not in NOT_TOLD and name.split(".")[-1] != "Exit":
+            if name[0].isupper() and name not in NOT_DOCUMENTED and name.split(".")[-1] != "Exit":
                 found.add(name)
         waiting += ast.iter_child_nodes(node)
     return found
 
 
-def overridden(member: griffe.Function) -> griffe.Function | None:
-    """The method of a class of ours that this one takes the place of, if that says what it takes."""
-    if not isinstance(member.parent, griffe.Class):
+def overridden(member: Member) -> griffe.Function | None:
+    """The documented method of a class of ours that this one overrides."""
+    if not isinstance(member, griffe.Function) or not isinstance(member.parent, griffe.Class):
         return None
     for base in member.parent.mro():
         other = base.members.get(member.name)
@@ -164,13 +164,10 @@ def overridden(member: griffe.Function) -> griffe.Function | None:
     return None
 
 
-def findings(member: griffe.Function | griffe.Class) -> Iterator[str]:
+def missing(member: Member) -> Iterator[str]:
+    """What a full docstring lacks: arguments, shapes, units, errors."""
     words = Words(member)
-    name = member.path.removeprefix(member.module.path + ".")
-    if not words.text:
-        yield f"{name}: no docstring"
-        return
-    if isinstance(member, griffe.Function) and (FOREIGN.search(words.text) or overridden(member)):
+    if FOREIGN.search(words.text) or overridden(member):
         return
     told = words.described("parameters", "other parameters", "attributes")
     given = arguments(member)
@@ -181,87 +178,333 @@ def findings(member: griffe.Function | griffe.Class) -> Iterator[str]:
         given = {}
     for argument, annotation in given.items():
         if not told.get(argument):
-            yield f"{name}: {argument}: not documented"
+            yield f"{argument}: not documented"
             continue
         if ARRAY.search(annotation) and not SHAPE.search(told[argument]):
-            yield f"{name}: {argument}: no shape in {told[argument]!r}"
+            yield f"{argument}: no shape in {told[argument]!r}"
         if (
             PHYSICAL.fullmatch(argument)
             and re.search(r"float|int|Array", annotation)
             and not UNIT.search(told[argument])
         ):
-            yield f"{name}: {argument}: no unit in {told[argument]!r}"
+            yield f"{argument}: no unit in {told[argument]!r}"
     for argument in words.described("parameters", "other parameters"):
         if given and argument not in given:
-            yield f"{name}: {argument}: documented, but no argument"
+            yield f"{argument}: documented, but no argument"
     if isinstance(member, griffe.Class):
         body = member.members.get("__init__")
         errors = raised(body) if isinstance(body, griffe.Function) else set()
     else:
-        errors = raised(member)
-        returns = str(member.returns or getattr(member, "annotation", "") or "")
+        errors = raised(member) if isinstance(member, griffe.Function) else set()
+        returns = str(member.returns if isinstance(member, griffe.Function) else member.annotation)
         if ARRAY.search(returns) and "Callable" not in returns and not SHAPE.search(words.result):
-            yield f"{name}: no shape of what it returns"
-    for error in errors - words.described("raises").keys():
-        yield f"{name}: raises {error}: not documented"
-    if member.path.startswith("msg_analysis.theory.") and not any(SOURCE.search(text) for text in sources(member)):
-        yield f"{name}: no source"
+            yield "no shape of what it returns"
+    for error in sorted(errors - words.described("raises").keys()):
+        yield f"raises {error}: not documented"
+
+
+def too_much(text: str) -> Iterator[str]:
+    """What does not belong into a docstring inside."""
+    for match in SECTION.finditer(text):
+        yield f"section {match.group(1)}, expected one or two lines without sections"
+    if lines(text) > MOST_LINES and not SECTION.search(text):
+        yield f"{lines(text)} lines, expected at most {MOST_LINES}"
 
 
 def sources(member: griffe.Object) -> Iterator[str]:
     """Where its source may be named: itself, its class, its module."""
     parent: griffe.Object | None = member
-    while parent is not None and parent.path.count(".") >= 2:
+    while parent is not None:
         if parent.docstring:
             yield parent.docstring.value
-        parent = parent.parent  # type: ignore[assignment]
+        parent = None if isinstance(parent, griffe.Module) else parent.parent
+
+
+@dataclass(frozen=True)
+class Api:
+    """Paths of what users may use."""
+
+    modules: Collection[str] = ()
+    full: Collection[str] = ()  # functions and classes, which must be documented in full; with the bases of classes
+    mentioned: Collection[str] = ()  # classes in their signatures and attributes, which may be documented in full
+
+
+def findings(module: griffe.Module, api: Api) -> Iterator[str]:
+    """Everything in a module that breaks the rule."""
+    for finding in of_module(module, api):
+        yield f"module: {finding}"
+    for member, public in members(module):
+        for finding in of_member(member, public, api):
+            yield f"{member.path.removeprefix(module.path + '.')}: {finding}"
+
+
+def of_module(module: griffe.Module, api: Api) -> Iterator[str]:
+    text = Words(module).text
+    if not text:
+        yield "no docstring"
+    long = under(module.path, LONG) or module.path in api.modules or FORMULA.search(text)
+    most = MOST_LONG_MODULE_LINES if long else MOST_MODULE_LINES
+    if lines(text) > most:
+        yield f"{lines(text)} lines, expected at most {most}"
+
+
+def of_member(member: Member, public: bool, api: Api) -> Iterator[str]:
+    text, formulas = Words(member).text, under(member.module.path, FORMULAS)
+    if public and not text:
+        yield "no docstring"
+    elif public and under(member.path, api.full):
+        yield from missing(member)
+    elif formulas or (public and under(member.path, api.mentioned)):
+        if public and SECTION.search(text):
+            yield from missing(member)
+    else:
+        yield from too_much(text)
+    if public and under(member.path, [THEORY]) and not any(SOURCE.search(words) for words in sources(member)):
+        yield "no source"
+
+
+def packages() -> griffe.ModulesCollection:
+    logging.getLogger("griffe").setLevel(logging.ERROR)
+    collection = griffe.ModulesCollection()
+    for name, folder in (("msg_analysis", "analysis"), ("msg_agents", "msg_agents")):
+        griffe.load(
+            name,
+            search_paths=[ROOT / folder],
+            docstring_parser="numpy",
+            allow_inspection=False,
+            modules_collection=collection,
+        )
+    return collection
+
+
+def found_at(path: str, collection: griffe.ModulesCollection) -> griffe.Object:
+    """The object of a path, not where it is imported but where it is written."""
+    member = collection[path]
+    return member.final_target if isinstance(member, griffe.Alias) else member
+
+
+def with_bases(member: griffe.Object) -> Iterator[griffe.Object]:
+    """A class and those that it inherits from; of a module, everything public in it."""
+    yield member
+    if isinstance(member, griffe.Class):
+        yield from (base for base in member.mro() if not base.path.startswith("builtins"))
+    if isinstance(member, griffe.Module):
+        yield from (inner for inner, public in members(member) if public)
+
+
+def types_of(member: griffe.Object) -> Iterator[griffe.Expr]:
+    """Annotations of the arguments and the result of a function, or of the attributes and methods of a class."""
+    given: list[object] = []
+    if isinstance(member, griffe.Function):
+        given = [member.returns, *(each.annotation for each in member.parameters)]
+    elif isinstance(member, griffe.Attribute):
+        given = [member.annotation]
+    elif isinstance(member, griffe.Class):
+        for inner in member.members.values():
+            if isinstance(inner, griffe.Function | griffe.Attribute) and not inner.name.startswith("_"):
+                yield from types_of(inner)
+    yield from (each for each in given if isinstance(each, griffe.Expr))
+
+
+def mentioned(member: griffe.Object, collection: griffe.ModulesCollection) -> Iterator[str]:
+    """Classes of ours in the annotations of a member."""
+    for annotation in types_of(member):
+        for name in annotation.iterate(flat=True):
+            if isinstance(name, griffe.ExprName) and under(name.canonical_path, API_MODULES):
+                found = found_at(name.canonical_path, collection)
+                if isinstance(found, griffe.Class):
+                    yield found.path
+
+
+def public_api(collection: griffe.ModulesCollection, page: str) -> Api:
+    """What the packages export, and what docs/api.md names."""
+    names = [f"{module}.{name}" for module in API_MODULES for name in collection[module].exports or []]
+    found = [each for name in names + API_NAME.findall(page) for each in with_bases(found_at(name, collection))]
+    return Api(
+        modules={*API_MODULES, *(each.path for each in found if isinstance(each, griffe.Module))},
+        full={each.path for each in found if not isinstance(each, griffe.Module)},
+        mentioned={path for each in found for path in mentioned(each, collection)},
+    )
+
+
+COLLECTION = packages()
+MODULES = {module.path: module for name in ("msg_analysis", "msg_agents") for module in modules(COLLECTION[name])}
+API = public_api(COLLECTION, (ROOT / "docs/api.md").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("path", MODULES)
-def test_public_names_are_documented(path: str) -> None:
-    assert [found for member in public(MODULES[path]) for found in findings(member)] == []
+def test_docstrings_follow_the_rule(path: str) -> None:
+    found = list(findings(MODULES[path], API))
+    assert not found, "\n".join(["", *found])
 
 
 def test_there_is_something_to_look_at() -> None:
     assert len(MODULES) > 120
-    assert sum(1 for module in MODULES.values() for _ in public(module)) > 600
+    assert sum(1 for module in MODULES.values() for _, public in members(module) if public) > 600
+    assert len(API.full) > 30
 
 
-def made(signature: str, *sections: str, body: str = "") -> str:
+@pytest.mark.parametrize(
+    "path",
+    [
+        "msg_analysis.api.Experiment",  # exported
+        "msg_analysis.model.experiment.Experiment",  # its base
+        "msg_analysis.errors.BagError",  # exported, and in a module that docs/api.md names
+    ],
+)
+def test_the_api_is_found(path: str) -> None:
+    assert path in API.full
+
+
+def test_everything_in_the_api_has_a_docstring() -> None:
+    assert [path for path in sorted(API.full) if not found_at(path, COLLECTION).has_docstring] == []
+
+
+def test_classes_in_signatures_are_found() -> None:
+    assert {path.rpartition(".")[2] for path in API.mentioned} >= {"RunRecord", "Trajectory", "Comparison"}
+
+
+HEAD = '"""Written for a test."""\n\n'
+
+
+def loaded(tmp_path: Path, path: str, code: str) -> griffe.Module:
+    """A module of a package made for this test."""
+    file = tmp_path.joinpath(*path.split(".")).with_suffix(".py")
+    file.parent.mkdir(parents=True)
+    for parent in file.relative_to(tmp_path).parents[:-1]:
+        (tmp_path / parent / "__init__.py").write_text('"""After Somebody 1984."""')
+    file.write_text(code)
+    module = griffe.load(path, search_paths=[tmp_path], docstring_parser="numpy", allow_inspection=False)
+    assert isinstance(module, griffe.Module)
+    return module
+
+
+def made(signature: str, *sections: str, body: str = "", first: str = "Do.") -> str:
     """Source of a function, or class, with a docstring of the given sections: "Parameters x: what it is"."""
-    text = "Do."
+    text = first
     for section in sections:
         title, entry, words = re.fullmatch(r"(\w+) (\w+): (.*)", section).groups()  # type: ignore[union-attr]
         text += f"\n\n    {title}\n    {'-' * len(title)}\n    {entry}\n        {words}"
     return f'{signature}\n    """{text}\n    """\n    {body}\n'
 
 
+DATACLASS = "from dataclasses import dataclass\n\n@dataclass\nclass C:"
+FULL = [  # what is found where everything has to be documented
+    ("def f(x): ...", ["f: no docstring"]),
+    (made("def f(x):"), ["f: x: not documented"]),
+    (made("def f(x):", "Parameters y: it"), ["f: x: not documented", "f: y: documented, but no argument"]),
+    (made("def f(x):", "Parameters x: it"), []),
+    (made("def f(x: FloatArray):", "Parameters x: it"), ["f: x: no shape in 'it'"]),
+    (made("def f(x: FloatArray):", "Parameters x: (m, n) it"), []),
+    (made("def f(dt: float):", "Parameters dt: it"), ["f: dt: no unit in 'it'"]),
+    (made("def f(dt: float):", "Parameters dt: it [s]"), []),
+    (made("def f() -> FloatArray:"), ["f: no shape of what it returns"]),
+    (made("def f() -> FloatArray:", "Returns FloatArray: (m,) errors"), []),
+    (made("def f():", body="raise InputError('x')"), ["f: raises InputError: not documented"]),
+    (made("def f():", "Raises InputError: never", body="raise InputError('x')"), []),
+    (made(DATACLASS, body="x: int"), ["C: x: not documented"]),
+    (made(DATACLASS, "Attributes x: it", body="x: int"), []),
+    (made("class C:", body="def f(self, x):\n        'Do.'"), ["C.f: x: not documented"]),
+    (
+        made("class C:", body="@property\n    def p(self) -> FloatArray:\n        'It.'"),
+        ["C.p: no shape of what it returns"],
+    ),
+    (made("class C:", body="@property\n    def p(self) -> FloatArray:\n        '(m,) it.'"), []),
+    (made("class C:", body="def _f(self, x): ..."), []),
+    ("def _f(x): ...", []),
+]
+
+
+@pytest.mark.parametrize(("code", "found"), FULL)
+def test_it_finds_what_the_api_lacks(code: str, found: list[str], tmp_path: Path) -> None:
+    path = "msg_analysis.report.made"
+    assert list(findings(loaded(tmp_path, path, HEAD + code), Api(full=[f"{path}.f", f"{path}.C"]))) == found
+
+
+SECTIONS = "section Parameters, expected one or two lines without sections"
+
+
 @pytest.mark.parametrize(
     ("code", "found"),
     [
         ("def f(x): ...", ["f: no docstring"]),
-        (made("def f(x):"), ["f: x: not documented"]),
-        (made("def f(x):", "Parameters y: it"), ["f: x: not documented", "f: y: documented, but no argument"]),
-        (made("def f(x):", "Parameters x: it"), []),
-        (made("def f(x: FloatArray):", "Parameters x: it"), ["f: x: no shape in 'it'"]),
-        (made("def f(x: FloatArray):", "Parameters x: (m, n) it"), []),
-        (made("def f(dt: float):", "Parameters dt: it"), ["f: dt: no unit in 'it'"]),
-        (made("def f(dt: float):", "Parameters dt: it [s]"), []),
-        (made("def f() -> FloatArray:"), ["f: no shape of what it returns"]),
-        (made("def f() -> FloatArray:", "Returns FloatArray: (m,) errors"), []),
-        (made("def f():", body="raise InputError('x')"), ["f: raises InputError: not documented"]),
-        (made("def f():", "Raises InputError: never", body="raise InputError('x')"), []),
+        (made("def f(x: FloatArray):"), []),
+        (made("def f(x):", "Parameters x: it"), [f"f: {SECTIONS}"]),
+        (made("def f():", "Raises InputError: it"), [f"f: {SECTIONS.replace('Parameters', 'Raises')}"]),
+        (made("def _f(x):", "Parameters x: it"), [f"_f: {SECTIONS}"]),
+        (made(DATACLASS, "Attributes x: it", body="x: int"), [f"C: {SECTIONS.replace('Parameters', 'Attributes')}"]),
         (
-            made("@dataclass\nclass C:", body="x: int").replace("@d", "from dataclasses import dataclass\n\n@d"),
-            ["C: x: not documented"],
+            made("class C:", body=made("def f(self, x):", "Parameters x: it").replace("\n", "\n    ")),
+            [f"C.f: {SECTIONS}"],
         ),
-        (made("class C:", body="def f(self, x):\n        'Do.'"), ["C.f: x: not documented"]),
-        (made("class C:", body="def _f(self, x): ..."), []),
-        ("def _f(x): ...", []),
+        (
+            made("class _C:", body=made("def f(self, x):", "Parameters x: it").replace("\n", "\n    ")),
+            [f"_C.f: {SECTIONS}"],
+        ),
+        (made("class _C:", body="def f(self, x): ..."), []),
+        (made("class C:", body="@property\n    def p(self): ..."), ["C.p: no docstring"]),
+        (made("def f():", first="One.\n\n    Two.\n    Three."), []),
+        (made("def f():", first="One.\n\n    Two.\n    Three.\n    Four."), ["f: 4 lines, expected at most 3"]),
+        ("__all__ = ['f']\n\ndef f(): ...\n\ndef g(): ...", ["f: no docstring"]),
     ],
 )
-def test_the_test_finds_what_is_missing(code: str, found: list[str], tmp_path: Path) -> None:
-    (tmp_path / "made.py").write_text(code)
-    module = griffe.load("made", search_paths=[tmp_path], docstring_parser="numpy", allow_inspection=False)
-    assert isinstance(module, griffe.Module)
-    assert [each for member in public(module) for each in findings(member)] == found
+def test_it_finds_what_is_too_much_inside(code: str, found: list[str], tmp_path: Path) -> None:
+    assert list(findings(loaded(tmp_path, "msg_analysis.report.made", HEAD + code), Api())) == found
+
+
+@pytest.mark.parametrize(
+    ("code", "found"),
+    [
+        ("def f(x): ...", ["f: no docstring"]),
+        (made("def f(x: FloatArray) -> FloatArray:"), []),
+        (made("def f(x, y):", "Parameters x: it"), ["f: y: not documented"]),
+        (made("def f(x: FloatArray):", "Parameters x: it"), ["f: x: no shape in 'it'"]),
+        (made("def f(x):", "Parameters x: it", "Parameters y: it"), ["f: y: documented, but no argument"]),
+        (made("def f() -> FloatArray:", "Returns FloatArray: errors"), ["f: no shape of what it returns"]),
+        (made("def f():", "Parameters x: it", first="One.\n\n    Two.\n    Three.\n    Four."), []),
+    ],
+)
+@pytest.mark.parametrize("folder", ["inference", "inference.errors", "mentioned"])
+def test_it_finds_sections_that_are_not_complete(folder: str, code: str, found: list[str], tmp_path: Path) -> None:
+    path = f"msg_analysis.{folder}.made"
+    api = Api(mentioned=[f"{path}.f"] if folder == "mentioned" else [])
+    assert list(findings(loaded(tmp_path, path, HEAD + code), api)) == found
+
+
+@pytest.mark.parametrize("folder", ["theory", "theory.solvers"])
+@pytest.mark.parametrize(
+    ("head", "words", "found"),
+    [
+        ("Made.", "Do.", ["f: no source"]),
+        ("Made.", "Proposition 3.", []),
+        ("Solvers after Somebody and others (1984).", "Do.", []),
+    ],
+)
+def test_it_finds_theory_without_a_source(folder: str, head: str, words: str, found: list[str], tmp_path: Path) -> None:
+    code = f'"""{head}"""\n\ndef f():\n    """{words}"""'
+    assert list(findings(loaded(tmp_path, f"msg_analysis.{folder}.made", code), Api())) == found
+
+
+@pytest.mark.parametrize(
+    ("path", "count", "last", "most"),
+    [
+        ("msg_analysis.report.made", 0, "", None),
+        ("msg_analysis.report.made", 6, "End.", None),
+        ("msg_analysis.report.made", 7, "End.", 6),
+        ("msg_analysis.model.made", 12, "x(k+1) = W x(k)", None),
+        ("msg_analysis.model.made", 13, "x(k+1) = W x(k)", 12),
+        ("msg_analysis.theory.solvers.made", 12, "End.", None),
+        ("msg_analysis.wire.made", 13, "End.", 12),
+        ("msg_analysis.wired.made", 12, "End.", 6),
+        ("msg_analysis.public", 12, "End.", None),
+    ],
+)
+def test_it_finds_modules_with_long_docstrings(
+    path: str, count: int, last: str, most: int | None, tmp_path: Path
+) -> None:
+    text = "\n\n".join([*["Line."] * (count - 1), last])
+    expected = [] if most is None else [f"module: {count} lines, expected at most {most}"]
+    if not count:
+        text, expected = "", ["module: no docstring"]
+    module = loaded(tmp_path, path, f'"""{text}"""' if text else "X = 1")
+    assert list(findings(module, Api(modules=["msg_analysis.public"]))) == expected

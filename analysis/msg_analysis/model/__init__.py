@@ -1,1 +1,4 @@
-"""What an experiment is: file, graphs, chain, noise, the law of one step, the record and the outcome of a run."""
+"""The experiment and one step of it: file, graphs, chain, noise, update law, run record and trajectory.
+
+This folder imports no other folder of msg_analysis; all others may import it.
+"""

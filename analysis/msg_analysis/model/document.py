@@ -13,7 +13,7 @@ from msg_analysis.errors import InputError
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """The safe loader with the scalars of YAML 1.2 (1e-3 is a number, no a text), without duplicate keys."""
+    """The safe loader with the scalars of YAML 1.2 (1e-3 is a number, not a text), without duplicate keys."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 (of PyYAML)
 
@@ -44,7 +44,7 @@ for _tag, _pattern, _first in (
 
 
 def _construct_int(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
-    """Decimal, whatever its leading zeros."""
+    """Decimal, also with leading zeros (octal in YAML 1.1)."""
     return int(loader.construct_scalar(node))
 
 
@@ -52,17 +52,9 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML (or JSON) file.
+    """The content of a YAML (or JSON) file in UTF-8.
 
-    Parameters
-    ----------
-    path
-        of the file, in UTF-8
-
-    Raises
-    ------
-    InputError
-        the file cannot be read, is not YAML in UTF-8, or has a key twice; names file and line
+    InputError, with file and (if known) line: the file cannot be read, is not YAML in UTF-8, or has a key twice.
     """
     try:
         text = path.read_text(encoding="utf-8")

@@ -29,7 +29,7 @@ from msg_analysis.types import FloatArray
 __all__ = ["Experiment", "ExperimentError", "json_schema"]
 
 SHOWN_GRAPHS = 4
-"""Most graphs that are named in a line."""
+"""Largest number of graphs named in a ``repr``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -39,17 +39,17 @@ class Experiment:
     Attributes
     ----------
     spec
-        the document, normalised: defaults written out, number of agents known, GraphML files read
+        the normalised document: defaults written out, number of agents known, GraphML files read
     graph_list
         the n graphs, in the order of the modes
     chain
-        the Markov chain that switches between them
+        the Markov chain that switches between the graphs
     noise_gain
         (n, m, m) F_i; Q_i = F_i F_i^T
     source
-        where it came from, for messages
+        where the experiment came from, for messages
     protocol
-        what the agents do instead of the built-in law, if anything
+        the protocol that replaces the built-in law; None for the built-in law
     """
 
     spec: ExperimentSpec
@@ -89,7 +89,7 @@ class Experiment:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read an experiment file (YAML; JSON is YAML too).
+        """Read an experiment file (YAML, of which JSON is a part).
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class Experiment:
         directory: Path | None = None,
         recorded: ProtocolInfo | None = None,
     ) -> Self:
-        """Check a document and make it an experiment.
+        """Check a document and make an experiment of it.
 
         Parameters
         ----------
@@ -124,14 +124,14 @@ class Experiment:
         source
             where it came from, for messages
         directory
-            what the paths in it are relative to; by default the current directory
+            base of the relative paths in it; by default the current directory
         recorded
-            of a recorded run, the protocol that was used, which need not be installed
+            the protocol that a recorded run used, which need not be installed
 
         Raises
         ------
         ExperimentError
-            names every mistake in the document
+            the document is not valid; names every mistake
         """
         if not isinstance(mapping, Mapping):
             raise ExperimentError(
@@ -160,10 +160,10 @@ class Experiment:
         return experiment
 
     def to_document(self) -> dict[str, Any]:
-        """The normalised document: self-contained, fit for JSON; parsed again it gives an equal one."""
+        """The normalised, self-contained document, ready for JSON; parsed again it gives an equal experiment."""
         document: dict[str, Any] = self.spec.model_dump(mode="json", exclude_none=True)
         if self.spec.protocol:
-            # A parameter that is None need not be so by default.
+            # None may differ from the default of a parameter, so it must not be left out.
             document["protocol"] = self.spec.protocol.model_dump(mode="json")
         return document
 
@@ -178,19 +178,19 @@ class Experiment:
         Raises
         ------
         ExperimentError
-            names the key
+            the new document is not valid; names every mistake
         """
         document = self.to_document()
         document["run"].update(changes)
         return self.parse(document, source=self.source)
 
     def unavailable(self, purpose: Purpose = "run") -> list[str]:
-        """What the experiment asks for that this version does not do yet, one line each.
+        """What the experiment asks for that this version cannot do, one line each.
 
         Parameters
         ----------
         purpose
-            "run" (simulate or run it) or "predict" (exact for any noise)
+            "run" (simulate it or run a network) or "predict"
         """
         lines = []
         if self.run.pace == "realtime":
@@ -214,17 +214,17 @@ class Experiment:
         return lines
 
     def require_available(self, purpose: Purpose = "run") -> None:
-        """Refuse what this version does not do yet.
+        """Raise an error if the experiment asks for something that this version cannot do.
 
         Parameters
         ----------
         purpose
-            "run" (simulate or run it) or "predict"
+            "run" (simulate it or run a network) or "predict"
 
         Raises
         ------
         NotAvailableError
-            lists it
+            lists what is not available
         """
         lines = self.unavailable(purpose)
         if lines and self.protocol and lines == self.protocol.unavailable(purpose):
@@ -274,18 +274,18 @@ class Experiment:
 
     @property
     def steps_only(self) -> bool:
-        """Whether only its steps are defined, and no law in continuous time."""
+        """Whether the law exists only in steps, not in continuous time: noise on the air, loss, delay or a protocol."""
         return self.noise.steps_only or self.protocol is not None
 
     @property
     def width(self) -> int:
-        """Numbers of an agent's whole state: one per replica, or as many for each as its protocol has."""
+        """Numbers in an agent's state: the number of replicas, times the numbers in the state of a protocol."""
         protocol = self.protocol
         return self.run.replicas * (protocol.info.states if protocol else 1)
 
     @property
     def truth(self) -> bool:
-        """Whether others hear something else than the whole state, which then goes on a topic of its own."""
+        """Whether agents publish something else than their whole state, which then has a topic of its own."""
         protocol = self.protocol
         return self.noise.broadcast > 0 or (protocol is not None and protocol.info.hidden)
 
@@ -296,17 +296,17 @@ class Experiment:
 
     @property
     def reference(self) -> float:
-        """What tracking agents should hold; 0 for consensus."""
+        """The value that tracking agents should reach; 0 for consensus."""
         return self.leaders.reference if self.leaders else 0.0
 
     @property
     def steps(self) -> int:
-        """Steps N of a run; it logs the states 0..N."""
+        """Number of steps N of a run, which has the states x(0), ..., x(N)."""
         return round(self.run.duration / self.run.dt)
 
     @property
     def step_length(self) -> float:
-        """Simulated time of a step: run.dt, which is 1 in discrete time."""
+        """Simulated time of a step, ``run.dt`` [units of simulated time]; 1 in discrete time."""
         return self.run.dt
 
 

@@ -11,22 +11,9 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
 def hops(leads: BoolArray, sources: Collection[int]) -> IntArray:
-    """Fewest arcs on a way from any of the sources; -1 for what no way leads to. Breadth first, each vertex once.
+    """(v,) least number of arcs from any source to each vertex; -1 if unreachable. ``leads[i, j]``: arc from i to j.
 
-    Every process of a run asks this of its experiment. It would wait longer for networkx to be imported than for all
-    else that it imports.
-
-    Parameters
-    ----------
-    leads
-        (v, v) whether an arc leads from i to j
-    sources
-        indices of vertices
-
-    Returns
-    -------
-    IntArray
-        (v,)
+    Not by networkx: every process of a run needs this, and importing networkx takes longer than all its other imports.
     """
     level = np.full(len(leads), -1)
     front, distance = np.array(sorted(sources), dtype=int), 0
@@ -45,8 +32,8 @@ class Graph:
     name
         name of the graph in the experiment file
     adjacency
-        (m, m), zero diagonal; ``adjacency[i, j]`` [1 / unit of time] is the weight with which agent i+1 listens to
-        agent j+1. Symmetric for an undirected graph.
+        (m, m), zero diagonal; ``adjacency[i, j]`` [1 / unit of time] is the weight with which agent i listens to
+        agent j (from 0). Symmetric for an undirected graph.
     """
 
     name: str
@@ -78,5 +65,5 @@ class Graph:
 
     @property
     def edges(self) -> list[tuple[int, int, float]]:
-        """(i, j, weight) with i < j of every pair that listens to each other with equal weight, agents from 1."""
+        """(i, j, weight), i < j, of every pair that listen to each other with equal weight, agents from 1."""
         return [(s, t, w) for s, t, w in self.arcs if s < t and self.adjacency[s - 1, t - 1] == w]

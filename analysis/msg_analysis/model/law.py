@@ -1,8 +1,8 @@
-"""The update law, once: agents, twin and checks all call these functions.
+"""The update law, implemented once: agents, twin and checks all call these functions.
 
-Bit-for-bit equality between a network of processes and the vectorised twin rests on two rules kept here: sums run over
-the agents in ascending order, one term at a time (never through BLAS or a reduction, whose order depends on shapes and
-threads), and each term is one multiplication and one addition of doubles.
+Two rules make a network of processes and the vectorised twin equal bit for bit. Sums run over the agents in ascending
+order, one term at a time (never through BLAS or a reduction, whose order depends on shapes and threads). Each term is
+one multiplication and one addition of doubles.
 """
 
 from __future__ import annotations
@@ -13,19 +13,9 @@ from msg_analysis.types import FloatArray
 
 
 def weighted_sum(weights: Sequence[float | FloatArray], values: Sequence[FloatArray]) -> FloatArray:
-    """sum_j weights[j] * values[j], term after term, in the order given.
+    """sum_j weights[j] * values[j], term after term in the order given; at least one term, values of one shape.
 
-    Parameters
-    ----------
-    weights
-        numbers, or arrays of a shape that broadcasts against the values
-    values
-        arrays of one shape, at least one
-
-    Returns
-    -------
-    FloatArray
-        of the shape of a value
+    A weight is a number, or an array that broadcasts against the values.
     """
     terms = zip(values, weights, strict=True)
     value, weight = next(terms)
@@ -36,21 +26,10 @@ def weighted_sum(weights: Sequence[float | FloatArray], values: Sequence[FloatAr
 
 
 def step(weights: Sequence[float | FloatArray], values: Sequence[FloatArray], drive: FloatArray) -> FloatArray:
-    """x_i(k+1) = sum_j W_ij x_j(k) + drive_i(k).
+    """x_i(k+1) = sum_j W_ij x_j(k) + drive_i(k), for the non-zero W_ij of row i, j ascending, and values of shape (R,).
 
-    Parameters
-    ----------
-    weights
-        the non-zero W_ij of row i, j ascending; or, of many rows at once, columns of shape (m, 1), padded with zeros
-    values
-        the matching x_j(k), each (R,), one entry for each replica; of many rows, (m, R)
-    drive
-        noise_i(k) + offset_i, of the shape of a value, the offset being what a reference adds to the row
-
-    Returns
-    -------
-    FloatArray
-        x_i(k+1), of the shape of a value
+    For many rows at once: weights (m, 1), padded with zeros, and values (m, R). The drive, of the shape of a value, is
+    the noise plus the offset that a reference adds to the row.
     """
     total = weighted_sum(weights, values)
     total += drive

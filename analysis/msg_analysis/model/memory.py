@@ -1,4 +1,4 @@
-"""How much memory an experiment needs, and how much there is."""
+"""How much memory an experiment needs, and how much is available."""
 
 from __future__ import annotations
 
@@ -13,58 +13,27 @@ _MATRICES_PER_GRAPH = 8  # adjacency, W, its coupling, F, B, N, the variance of 
 def memory_needed(
     agents: int, modes: int, steps: int, replicas: int, delay: int = 0, truth: bool = False
 ) -> tuple[int, int]:
-    """Bytes for the states of a run, and for the matrices of all graphs, which a delay makes larger.
+    """Bytes for the states of a run, and for the matrices of all graphs; ``replicas``: numbers in an agent's state.
 
-    Where others hear something else than the states, these are there twice: as they are, and as they were published.
-
-    Parameters
-    ----------
-    agents
-        m
-    modes
-        n
-    steps
-        N
-    replicas
-        numbers of an agent's state
-    delay
-        of values [steps]
-    truth
-        whether states and what is published of them are kept
+    A delay [steps] makes the matrices larger. With ``truth``, states are kept twice: as they are and as published.
     """
     states = (steps + 1) * agents * replicas * 8 * (2 if truth else 1)
     return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
 
 
 def available_memory() -> int:
-    """Bytes that this machine can give, as far as it tells."""
+    """Available bytes: what Linux estimates as available, elsewhere all physical memory."""
     try:
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
     except OSError:
-        pass  # not Linux: all the memory there is, is the next best number
+        pass  # not Linux: all physical memory is the next best number
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int, truth: bool = False) -> list[str]:
-    """States and matrices that cannot fit in memory.
-
-    Parameters
-    ----------
-    agents
-        m
-    modes
-        n
-    steps
-        N
-    replicas
-        numbers of an agent's state
-    delay
-        of values [steps]
-    truth
-        whether states and what is published of them are kept
-    """
+    """Problems if states and matrices do not fit in memory; arguments as in ``memory_needed``."""
     available = available_memory()
     states, matrices = memory_needed(agents, modes, steps, replicas, delay, truth)
     if states + matrices <= available:
@@ -81,13 +50,7 @@ def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: i
 
 
 def amount(size: float) -> str:
-    """A number of bytes for people.
-
-    Parameters
-    ----------
-    size
-        in bytes
-    """
+    """A number of bytes as text with a unit: ``1.5 GB``."""
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if size < 1000 or unit == "TB":
             return f"{size:.3g} {unit}"

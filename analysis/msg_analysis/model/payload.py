@@ -1,6 +1,6 @@
-"""States as they travel: bytes of little-endian doubles, one per replica, and the update law on them.
+"""States as messages carry them: bytes of little-endian doubles, and the update law on such bytes.
 
-The compiled kernel, where it was built, and numpy give the same bits; the first costs an agent a tenth of the second.
+The compiled kernel and numpy give the same bits. The kernel is used where it was built, because it is faster.
 """
 
 from __future__ import annotations
@@ -16,50 +16,25 @@ _DOUBLE = np.dtype("<f8")
 
 
 def to_payload(state: FloatArray) -> bytes:
-    """Bytes of (replicas,) numbers.
-
-    Parameters
-    ----------
-    state
-        (replicas,) float64
-    """
+    """Bytes of a state (replicas,) of float64."""
     return state.astype(_DOUBLE, copy=False).tobytes()
 
 
 def from_payload(payload: bytes) -> FloatArray:
-    """(replicas,) numbers, read-only.
-
-    Parameters
-    ----------
-    payload
-        8 bytes for each number, little-endian
-    """
+    """State (replicas,) of a payload of 8 bytes for each number; read-only."""
     return np.frombuffer(payload, _DOUBLE)
 
 
 def combine_with_numpy(weights: Sequence[float], payloads: Sequence[bytes], drive: bytes) -> bytes:
-    """The update law (``law.step``) on payloads: sum_j weights[j] payloads[j], term after term, plus the drive.
+    """``law.step`` on payloads of equal size: sum_j weights[j] payloads[j], term after term, plus the drive.
 
-    Parameters
-    ----------
-    weights
-        a tuple of numbers, at least one
-    payloads
-        a list, one for each weight, all of the size of the drive
-    drive
-        payload of noise and offset
+    The kernel accepts only a tuple of weights (at least one) and a list of payloads.
     """
     return to_payload(step(weights, [from_payload(payload) for payload in payloads], from_payload(drive)))
 
 
 def all_finite_with_numpy(payload: bytes) -> bool:
-    """Whether no entry is infinite or undefined.
-
-    Parameters
-    ----------
-    payload
-        8 bytes for each number, little-endian
-    """
+    """Whether all numbers of a payload are finite."""
     return bool(np.isfinite(from_payload(payload)).all())
 
 
@@ -67,7 +42,7 @@ combine: Callable[[Sequence[float], Sequence[bytes], bytes], bytes]
 """The update law on payloads: the kernel's, or ``combine_with_numpy``."""
 
 all_finite: Callable[[bytes], bool]
-"""Whether no entry is infinite or undefined: the kernel's, or ``all_finite_with_numpy``."""
+"""Whether all numbers of a payload are finite: the kernel's, or ``all_finite_with_numpy``."""
 
 try:
     from msg_analysis.model import _kernel

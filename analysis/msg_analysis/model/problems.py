@@ -15,7 +15,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.spec import ExperimentSpec
 
 _LONGEST_VALUE = 60
-_MOST_LINES = 100  # of problems shown; a file with more has one that was made a thousand times
+_MOST_LINES = 100  # problems shown; a file with more mostly repeats one of them
 
 
 class ExperimentError(InputError):
@@ -24,9 +24,9 @@ class ExperimentError(InputError):
     Attributes
     ----------
     source
-        file or topic that it came from
+        file or topic that the experiment came from
     problems
-        one line each
+        one line for each mistake: ``key: value: what was expected: what to do``
     """
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
@@ -44,30 +44,12 @@ class ExperimentError(InputError):
 
 
 def problem(key: str, value: object, wanted: str, remedy: str) -> str:
-    """One line about one mistake.
-
-    Parameters
-    ----------
-    key
-        dotted key
-    value
-        what stands there; a text is taken as it is
-    wanted
-        what was expected
-    remedy
-        what to do
-    """
+    """One line about one mistake at a dotted key; a ``value`` that is a text is taken as it is."""
     return f"{key}: {value if isinstance(value, str) else show(value)}: {wanted}: {remedy}"
 
 
 def show(value: object) -> str:
-    """A value as the file would have it, on one line, shortened.
-
-    Parameters
-    ----------
-    value
-        of a key of the file, or what a key was given
-    """
+    """A value as the file would have it, on one line, shortened."""
     try:
         text = json.dumps(value, ensure_ascii=False)
     except (TypeError, ValueError):
@@ -77,13 +59,7 @@ def show(value: object) -> str:
 
 
 def dotted(location: Sequence[int | str]) -> str:
-    """The key of a place in the document: names joined by dots, list entries in brackets, counted from 1.
-
-    Parameters
-    ----------
-    location
-        keys and list indices from 0, as pydantic has them
-    """
+    """The key of pydantic's location: names joined by dots, list entries in brackets, counted from 1."""
     key = ""
     for part in location:
         if isinstance(part, int):
@@ -117,14 +93,7 @@ _EXPECTED = {
 def translate(error: ErrorDetails, root: type[BaseModel] = ExperimentSpec, section: str = "") -> str:
     """One of pydantic's errors in the style of this module.
 
-    Parameters
-    ----------
-    error
-        of the validation of ``root``
-    root
-        model of the whole document, or of a section
-    section
-        key of that section
+    ``root`` is the model that was validated: of the whole document, or of a section with the key ``section``.
     """
     kind, location, value = error["type"], error["loc"], error["input"]
     if not location:
@@ -159,14 +128,14 @@ def _did_you_mean(value: object, options: Sequence[str]) -> str | None:
 
 
 def _plain(limit: object) -> object:
-    """A limit without decimals that say nothing, a pattern without anchors, a boolean as YAML writes it."""
+    """A limit without unnecessary decimals, a pattern without anchors, a boolean as YAML writes it."""
     if isinstance(limit, float):
         return f"{limit:g}"
     return str(limit).strip("^$").replace("True", "true")
 
 
 def _context(location: Sequence[int | str], root: type[BaseModel]) -> tuple[type[BaseModel], str]:
-    """The model that a place belongs to, and an example of the last key of it that is known."""
+    """The model that a place belongs to, and an example for the last known key of the place."""
     model = root
     example = "see `msg-analysis schema`" if root is ExperimentSpec else "see the documentation of the package"
     for part in location:
@@ -180,7 +149,7 @@ def _context(location: Sequence[int | str], root: type[BaseModel]) -> tuple[type
 
 
 def _model_in(annotation: object) -> type[BaseModel] | None:
-    """The section inside ``Section``, ``Section | None`` or ``dict[str, Section]``."""
+    """The model in ``Section``, ``Section | None`` or ``dict[str, Section]``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((found for inner in get_args(annotation) if (found := _model_in(inner))), None)

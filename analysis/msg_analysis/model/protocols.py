@@ -1,4 +1,7 @@
-"""Protocols of other packages: found, checked, and called so that their mistakes become errors that name them."""
+"""Protocols of other packages: find them, check them, and call them.
+
+Whatever a protocol raises or returns wrongly becomes an error that names the protocol and its package.
+"""
 
 from __future__ import annotations
 
@@ -29,50 +32,25 @@ class ProtocolError(InputError):
 
 @dataclass(frozen=True, slots=True)
 class ProtocolInfo:
-    """What a run record says of a protocol: enough to read a bag without it.
+    """What a run record says about a protocol: enough to read a bag without the protocol."""
 
-    Attributes
-    ----------
-    name
-        in the experiment, and of the entry point
-    package, version
-        that offers it
-    linear
-        whether it declares the matrix of a step
-    states
-        numbers S of an agent's state, for each replica
-    hidden
-        whether others hear something else than the whole state
-    """
-
-    name: str
+    name: str  # in the experiment, and of the entry point
     package: str
-    version: str
-    linear: bool
-    states: int = 1
-    hidden: bool = False
+    version: str  # of the package
+    linear: bool  # declares the matrix of a step
+    states: int = 1  # S: numbers in an agent's state, for each replica
+    hidden: bool = False  # agents publish something else than their whole state
 
     def __str__(self) -> str:
         return f"protocol {self.name} ({self.package} {self.version})"
 
     def to_json(self) -> dict[str, Any]:
-        """The document."""
+        """The document in the run record."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, document: Any) -> ProtocolInfo:
-        """Read it back.
-
-        Parameters
-        ----------
-        document
-            what ``to_json`` gave
-
-        Raises
-        ------
-        ValueError
-            it is something else (KeyError and TypeError, too)
-        """
+        """Read what ``to_json`` gave; ValueError, KeyError or TypeError if it is something else."""
         if int(document["states"]) < 1:
             raise ValueError(f"protocol: states {document['states']}, expected a number >= 1")
         return cls(
@@ -87,29 +65,17 @@ class ProtocolInfo:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChosenProtocol:
-    """The protocol of an experiment.
+    """The protocol of an experiment."""
 
-    Attributes
-    ----------
-    info
-        what it is; of a recorded run, what it was
-    kind, parameters
-        its class and its own parameters; None where it is not here
-    absent
-        that it is not here and why, for people; None where it is
-    network
-        that it is for, once that is known
-    """
-
-    info: ProtocolInfo
-    kind: type[LinearProtocol | Protocol] | None = None
-    parameters: BaseModel | None = None
-    absent: str | None = None
-    network: Network | None = field(default=None, repr=False)
+    info: ProtocolInfo  # for a recorded run, what was used then
+    kind: type[LinearProtocol | Protocol] | None = None  # None if ``absent``
+    parameters: BaseModel | None = None  # None if ``absent``
+    absent: str | None = None  # why it cannot be used here, for messages; None if it can
+    network: Network | None = field(default=None, repr=False)  # set by ``bind``
 
     @property
     def linear(self) -> bool:
-        """Whether it is linear, and here to say with which matrices."""
+        """Whether it is linear and installed, so that its matrices are available."""
         return self.info.linear and self.kind is not None
 
     def unpredictable(self) -> str | None:
@@ -119,13 +85,7 @@ class ChosenProtocol:
         return None if self.info.linear else f"{self.info} is not linear, and runs without a prediction"
 
     def unavailable(self, purpose: Purpose) -> list[str]:
-        """What stands in the way of a purpose, one line each: see ``Experiment.unavailable``.
-
-        Parameters
-        ----------
-        purpose
-            "run" or "predict"
-        """
+        """Why it cannot be used for a purpose, one line each: see ``Experiment.unavailable``."""
         name, reason = show(self.info.name), self.unpredictable()
         if self.absent:
             remedy = f"install {self.info.package} {self.info.version}"
@@ -138,10 +98,7 @@ class ChosenProtocol:
     def matrices(self) -> tuple[FloatArray, FloatArray]:
         """W_g and B_g of a linear protocol, (n, m, m) each.
 
-        Raises
-        ------
-        InputError
-            it is not here, or not linear; it fails, or what it says is wrong
+        InputError if the protocol is not installed, not linear, fails, or returns something wrong.
         """
         reason = self.unpredictable()
         if reason:
@@ -180,20 +137,7 @@ class ChosenProtocol:
             )
 
     def guard(self, where: str, call: Callable[[], Result]) -> Result:
-        """What a call of the protocol's own code gives; whatever it raises becomes an error that says where.
-
-        Parameters
-        ----------
-        where
-            the method, for the message
-        call
-            of the protocol's code
-
-        Raises
-        ------
-        ProtocolError
-            with ``where`` ("" for nowhere in particular) and what was raised
-        """
+        """The result of a call of the protocol's code; what it raises becomes a ProtocolError that says ``where``."""
         try:
             return call()
         except Exception as error:  # of code that we know nothing about
@@ -203,19 +147,9 @@ class ChosenProtocol:
 
 
 class AgentProtocol:
-    """One agent's protocol, with every result checked.
+    """The nonlinear protocol of one agent (index from 0), with every result checked.
 
-    Parameters
-    ----------
-    chosen
-        a protocol that is not linear
-    agent
-        index from 0
-
-    Raises
-    ------
-    InputError
-        it is not here, or fails
+    InputError if the protocol is not installed, or fails.
     """
 
     def __init__(self, chosen: ChosenProtocol, agent: int) -> None:
@@ -229,17 +163,17 @@ class AgentProtocol:
         self.states = chosen.guard(self._agent, lambda: _states(made))
 
     def start(self, value: FloatArray) -> FloatArray:
-        """(S, R): see Protocol."""
+        """State (S, R) at step 0: see ``Protocol.start``."""
         shape = (self.states, len(value))
         return self._guard(f"{self._agent}, start", lambda: _array(self._protocol.start(value), shape))
 
     def publish(self, k: int, state: FloatArray) -> FloatArray:
-        """(R,) of a state (S, R) of step k: see Protocol."""
+        """What others hear, (R,), of a state (S, R) of step k: see ``Protocol.publish``."""
         shape = state.shape[1:]
         return self._guard(f"{self._agent}, publish, step {k}", lambda: _array(self._protocol.publish(state), shape))
 
     def step(self, k: int, mode: int, state: FloatArray, heard: Heard, noise: FloatArray) -> FloatArray:
-        """(S, R): see Protocol."""
+        """State (S, R) after step k: see ``Protocol.step``."""
         return self._guard(
             f"{self._agent}, step {k}",
             lambda: _array(self._protocol.step(k, mode, state, heard, noise), state.shape),
@@ -263,13 +197,7 @@ def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 
 def network_of(experiment: Experiment) -> Network:
-    """What a protocol is told of an experiment's network.
-
-    Parameters
-    ----------
-    experiment
-        checked
-    """
+    """What a protocol gets to know of an experiment's network."""
     return Network(
         graphs=experiment.graph_list,
         dt=experiment.step_length,
@@ -281,7 +209,7 @@ def network_of(experiment: Experiment) -> Network:
 
 
 def installed() -> dict[str, list[EntryPoint]]:
-    """Protocols that packages offer, by name; more than one where packages contradict each other."""
+    """Entry points of the installed protocols, by name; several where packages offer the same name."""
     found: dict[str, list[EntryPoint]] = {}
     for point in entry_points(group=ENTRY_POINTS):
         found.setdefault(point.name, []).append(point)
@@ -289,16 +217,9 @@ def installed() -> dict[str, list[EntryPoint]]:
 
 
 def find(spec: ProtocolSpec, recorded: ProtocolInfo | None = None) -> tuple[ChosenProtocol | None, list[str]]:
-    """The protocol that an experiment asks for, with its parameters, and what is wrong with these.
+    """The protocol of an experiment and its parameters (None if unusable), and what is wrong; ``bind`` checks the rest.
 
-    What depends on the network is found by ``bind``.
-
-    Parameters
-    ----------
-    spec
-        of the experiment
-    recorded
-        of a run that was recorded, what was used then: need not be here
+    With ``recorded``, the protocol that a recorded run used, nothing is wrong: the protocol need not be installed.
     """
     chosen, found = _find(spec)
     if recorded is None:
@@ -335,7 +256,7 @@ def _find(spec: ProtocolSpec) -> tuple[ChosenProtocol | None, list[str]]:
         return None, [problem("protocol.name", f"{spec.name}: {text}", wanted, "tell its authors")]
     try:
         parameters = kind.Parameters.model_validate(spec.model_extra or {})
-        if "name" in parameters.model_dump(mode="json"):  # it must be possible to write them down, too
+        if "name" in parameters.model_dump(mode="json"):  # this also checks that they can be written as JSON
             raise ValueError("they have a field 'name', which is the protocol's own")
     except ValidationError as error:
         details = error.errors(include_url=False)
@@ -355,16 +276,9 @@ def _package(point: EntryPoint) -> str:
 def bind(
     chosen: ChosenProtocol, experiment: Experiment, recorded: ProtocolInfo | None = None
 ) -> tuple[ChosenProtocol, list[str]]:
-    """The same protocol with its network, and what does not go together.
+    """The same protocol with its network, and what does not fit together.
 
-    Parameters
-    ----------
-    chosen
-        found by ``find``
-    experiment
-        which may not know it yet
-    recorded
-        see ``find``
+    The protocol of ``experiment`` itself is not used. ``recorded`` as in ``find``.
     """
     if chosen.absent:
         return chosen, []
@@ -417,11 +331,5 @@ def _problems(check: Callable[[], object]) -> list[str]:
 
 
 def info_of(document: Mapping[str, Any]) -> ProtocolInfo | None:
-    """Of a run record; None where the built-in law was run.
-
-    Parameters
-    ----------
-    document
-        of the run record
-    """
+    """The protocol in the document of a run record; None for the built-in law."""
     return ProtocolInfo.from_json(document["protocol"]) if document.get("protocol") is not None else None

@@ -1,8 +1,8 @@
-"""Real time: when which agent makes which step.
+"""Real time: at which time each agent makes each step.
 
-Simulated time runs with the clock of the nodes, ``run.speed`` units a second, from the epoch of the run on. Agent i
-makes its step from x(k) to x(k+1) at (k + phi_i) dt, with the newest values that it has by then. The phases phi_i are
-those of timers of equal period which nobody has synchronised: spread over the period, in an order that the seed draws.
+Simulated time follows the clock of the nodes, ``run.speed`` units per second, from the epoch of the run. Agent i makes
+its step from x(k) to x(k+1) at (k + phi_i) dt, with the newest values that it has by then. The phases phi_i are
+those of unsynchronised timers of equal period: spread evenly over the period, in an order drawn from the seed.
 """
 
 from __future__ import annotations
@@ -19,14 +19,6 @@ if TYPE_CHECKING:
 
 
 def phases(experiment: Experiment) -> FloatArray:
-    """(m,) phi_i in (0, 1): the part of a step after which agent i makes it.
-
-    They are (rank + 1/2) / m, the ranks a random permutation drawn from the seed of the experiment.
-
-    Parameters
-    ----------
-    experiment
-        in real time; its seed draws them
-    """
+    """(m,) phi_i = (rank_i + 1/2) / m, a part of a step; the ranks are a permutation drawn from the seed."""
     ranks = generator(experiment.run.seed, Stream.PHASE).permutation(experiment.agents)
     return np.asarray((ranks + 0.5) / experiment.agents)

@@ -1,4 +1,4 @@
-"""What all agents hear at once, where something becomes of values on the air: the twin's half of ``model.air``."""
+"""What all agents hear in a step with noise or loss on the air: the vectorised part of ``model.air``, for the twin."""
 
 from __future__ import annotations
 
@@ -12,15 +12,7 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
 def padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
-    """(d, m): the d-th input of every agent, ascending, and which of these entries there are; others are 0.
-
-    Parameters
-    ----------
-    model
-        of the experiment
-    mode
-        graph, from 0
-    """
+    """(d, m) the d-th input of every agent (agents from 0, ascending), padded with 0; and which entries are inputs."""
     inputs = [model.inputs(mode, i) for i in range(model.agents)]
     columns = np.zeros((max(len(row) for row in inputs), model.agents), dtype=np.int64)
     there = np.zeros(columns.shape, dtype=np.bool_)
@@ -31,15 +23,7 @@ def padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
 
 
 class Reception:
-    """The values that take part in ``law.step``, step after step, and what is logged of them.
-
-    Parameters
-    ----------
-    experiment
-        with its noise on the air
-    model
-        its step model
-    """
+    """The values that go into ``law.step``, step after step, and what is logged of them."""
 
     def __init__(self, experiment: Experiment, model: StepModel) -> None:
         self._air = Air(experiment)
@@ -51,16 +35,9 @@ class Reception:
         self._block: int | None = None
 
     def values(self, k: int, mode: int, state: FloatArray) -> list[FloatArray]:
-        """The d-th entry: what every agent uses for its d-th input in the step from x(k); see ``padded_inputs``.
+        """For each d, (m, replicas): what every agent uses for its d-th input in step k; see ``padded_inputs``.
 
-        Parameters
-        ----------
-        k
-            of the step; must not go back to an earlier block of steps
-        mode
-            of g(k)
-        state
-            (m, replicas) x(k)
+        ``state`` is x(k), (m, replicas). ``k`` must not go back to an earlier block of steps.
         """
         within = self._draw(k)
         air, (columns, _), used = self._air, self._padded[mode], self._used[mode]
@@ -70,14 +47,9 @@ class Reception:
         return list(np.where(self._own[used, within, None], state, heard))
 
     def log(self, states: FloatArray, modes: IntArray) -> tuple[FloatArray | None, BoolArray | None]:
-        """What the agents publish and log of a run: see ``Trajectory.published`` and ``Trajectory.lost``.
+        """``Trajectory.published`` and ``Trajectory.lost`` of a run: states (N + 1, m, replicas), modes (N,).
 
-        Parameters
-        ----------
-        states
-            (N + 1, m, replicas)
-        modes
-            (N,)
+        None where there is no broadcast noise, or no loss.
         """
         air, agents = self._air, self._model.agents
         published = None
@@ -99,21 +71,21 @@ class Reception:
         lost = np.empty((len(modes), *numbers.shape[1:]), dtype=np.bool_)
         for first in range(0, len(modes), STEPS_PER_BLOCK):
             drawn = self._lost(first // STEPS_PER_BLOCK)
-            drawn[-1] = False  # no link
+            drawn[-1] = False  # padding, no link
             last = min(len(modes), first + STEPS_PER_BLOCK)
             within = np.arange(last - first)[:, None, None]
             lost[first:last] = drawn[numbers[modes[first:last]], within]
         return lost
 
     def _link_numbers(self, columns: IntArray, there: BoolArray) -> IntArray:
-        """(d, m): which link brings each of the padded inputs; one more than there are for an agent's own value."""
+        """(d, m) number of the link of each padded input; the number of links for own values and padding."""
         agents = self._model.agents
         numbers = np.full((agents, agents), len(self._links))
         numbers[self._links[:, 0], self._links[:, 1]] = np.arange(len(self._links))
         return np.where(there, numbers[np.arange(agents), columns], len(self._links))
 
     def _draw(self, k: int) -> int:
-        """See that the random numbers of step k are there; its place in their block."""
+        """Draw the random numbers of the block of step k, unless done; the index of the step in its block."""
         block, within = divmod(k, STEPS_PER_BLOCK)
         if block != self._block:
             self._block = block
@@ -130,7 +102,7 @@ class Reception:
         return within
 
     def _lost(self, block: int) -> BoolArray:
-        """(links + 1, STEPS_PER_BLOCK): which messages are lost; True at last, for an agent's own value."""
+        """(links + 1, STEPS_PER_BLOCK): which messages are lost; the last row, for an agent's own value, is True."""
         lost = np.ones((len(self._links) + 1, STEPS_PER_BLOCK), dtype=np.bool_)
         for number, (i, j) in enumerate(self._links.tolist()):
             lost[number] = self._air.losses(i, j, block) if self._air.loss else False

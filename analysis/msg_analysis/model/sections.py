@@ -1,4 +1,4 @@
-"""A document on its way to an experiment: what each section says, what they say together, and every mistake in it."""
+"""Checks of a document, section by section and then together, so that every mistake is reported at once."""
 
 from __future__ import annotations
 
@@ -20,29 +20,15 @@ from msg_analysis.types import FloatArray
 
 @functools.cache
 def _adapter(key: str) -> TypeAdapter[Any]:
-    """What checks one section; to make it takes longer than to use it."""
+    """The validator of one section; cached, since making it takes longer than using it."""
     annotation: Any = ExperimentSpec.model_fields[key].annotation
     return TypeAdapter(annotation)
 
 
 class Sections:
-    """A document on its way: each section is None as long as it is not known to be good.
+    """A document that is being checked: a section is None as long as it is not known to be valid.
 
-    So a mistake in one section does not hide those in the others.
-
-    Parameters
-    ----------
-    mapping
-        the document
-    recorded
-        of a recorded run, the protocol that was used, which need not be installed
-
-    Attributes
-    ----------
-    problems
-        the mistakes found so far
-    values, agents, graphs, chain, noise_gain, protocol
-        what is known so far
+    ``recorded``: protocol of a recorded run, which need not be installed.
     """
 
     def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
@@ -75,13 +61,7 @@ class Sections:
         self.protocol: ChosenProtocol | None = None
 
     def resolve(self, directory: Path) -> None:
-        """Find everything that several keys say together, and every mistake in it.
-
-        Parameters
-        ----------
-        directory
-            what the paths in the file are relative to
-        """
+        """Check what several keys say together; paths in the document are relative to ``directory``."""
         time, run, leaders = self.values["time"], self.values["run"], self.values["leaders"]
         self._find_protocol()
         self._count_agents(directory)
@@ -114,7 +94,7 @@ class Sections:
             self.problems += validation.stability_problems(self.graphs, gains, run.dt)
 
     def spec(self) -> ExperimentSpec:
-        """The whole document, once there are no problems, with what else is known by now."""
+        """The whole document with everything resolved. Only valid once there are no problems."""
         return ExperimentSpec.model_construct(**(self.values | {"agents": self.agents}))
 
     def _find_protocol(self) -> None:
@@ -129,7 +109,7 @@ class Sections:
             self.values["protocol"] = type(spec).model_validate({"name": spec.name, **parameters})
 
     def _count_agents(self, directory: Path) -> None:
-        """The number of agents, once every graph says which it needs; GraphML files are read here."""
+        """The number of agents, if every graph is valid; GraphML files are read here."""
         graphs: dict[str, GraphSpec] | None = self.values["graphs"]
         if graphs is None or "agents" not in self.known:
             return

@@ -1,4 +1,12 @@
-"""Agents one after the other: what a period of a run in real time does when nobody is late."""
+"""Agents that step one after the other: what a period of a run in real time does when no agent is late.
+
+With g the graph of the period, an agent uses the new states of the agents that are due before it and the old states of
+the others. Row by row, in the order of the phases,
+
+    A_i = W_ii e_i + sum_earlier W_ij A_j + sum_later W_ij e_j,    B_i = F_i + sum_earlier W_ij B_j,
+
+and offsets like B. Rows of A sum to 1 where those of W do, so consensus stays consensus; but A is not symmetric.
+"""
 
 from __future__ import annotations
 
@@ -18,45 +26,23 @@ StepLaw = Literal["synchronous", "sequential"]
 
 
 def step_law(experiment: Experiment) -> StepLaw:
-    """Whether the agents of a run step all at once (lockstep) or one after the other (real time).
-
-    Parameters
-    ----------
-    experiment
-        by its ``run.pace``
-    """
+    """Whether the agents of a run step all at once (lockstep) or one after the other (real time)."""
     return "sequential" if experiment.run.pace == "realtime" else "synchronous"
 
 
 def build_run_model(experiment: Experiment) -> StepModel:
-    """What a step of all agents does to x(k), as one jump linear system: ``build_step_model``, or in real time its
-    sequential law, in which the noise that everybody makes reaches those who are due later in the same period.
+    """What a step of all agents of a run with a linear law does to x(k), as one jump linear system.
 
-    Parameters
-    ----------
-    experiment
-        whose law is linear
+    In real time the law is sequential: noise of an agent reaches those that are due later in the same period.
     """
     step = build_step_model(experiment)
     return sequential(step, phases(experiment)) if step_law(experiment) == "sequential" else step
 
 
 def sequential(step: StepModel, phase: FloatArray) -> StepModel:
-    """The agents' micro-steps of one period, in the order of their phases, put together.
+    """The agents' micro-steps of one period, in the order of their phases (m,), all different, as one step.
 
-    With g the graph of the period, an agent uses the new states of those who are due before it and the old ones of the
-    others. Row by row, in that order,
-
-        A_i = W_ii e_i + sum_earlier W_ij A_j + sum_later W_ij e_j,    B_i = F_i + sum_earlier W_ij B_j,
-
-    and offsets like B. A has the row sums of W = 1 where W has, so consensus stays consensus; but it is not symmetric.
-
-    Parameters
-    ----------
-    step
-        the synchronous step, without loss, delay or noise on the air
-    phase
-        (m,) all different
+    ``step`` is the synchronous step, without loss, delay or noise on the air.
     """
     weights, offsets, gain = np.empty_like(step.weights), np.empty_like(step.offsets), np.empty_like(step.noise_gain)
     done = np.zeros(step.agents, dtype=bool)
@@ -78,16 +64,9 @@ def sequential(step: StepModel, phase: FloatArray) -> StepModel:
 
 
 def ideal_uses(model: StepModel, phase: FloatArray) -> IntArray:
-    """(n, m, D): how many steps after x_i(k) the value of the d-th neighbour of agent i is, with ideal timers.
+    """(n, m, D) how many steps after x_i(k) the value of the d-th neighbour of agent i is, with ideal timers.
 
-    1 for those that are due earlier in the period, 0 for others; -1 where there is no such neighbour.
-
-    Parameters
-    ----------
-    model
-        of the experiment
-    phase
-        (m,) of ``phases``
+    1 for neighbours that are due earlier in the period, 0 for others; -1 where there is no d-th neighbour.
     """
     ahead = np.full((model.modes, model.agents, model.most_neighbours), -1, dtype=np.int64)
     for mode in range(model.modes):

@@ -26,24 +26,12 @@ Purpose = Literal["predict", "run"]
 
 
 def expected(text: str) -> PydanticCustomError:
-    """The error of a value that is not what ``text`` says.
-
-    Parameters
-    ----------
-    text
-        what the value should be, such as "a number > 0"
-    """
+    """The error of a value that is not what ``text`` says, such as "a number > 0"."""
     return PydanticCustomError("expected", "{text}", {"text": text})
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a real number (no boolean) of a reasonable size.
-
-    Parameters
-    ----------
-    value
-        anything that YAML knows
-    """
+    """Whether a value is a number, not a boolean, of at most ``LARGEST_NUMBER``."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
 
 
@@ -228,12 +216,12 @@ class NoiseSpec(_Section):
 
     @property
     def on_air(self) -> bool:
-        """Whether something becomes of values between the agents: broadcast noise, link noise or loss."""
+        """Whether there is broadcast noise, link noise or loss between the agents."""
         return bool(self.broadcast or self.link or self.loss)
 
     @property
     def steps_only(self) -> bool:
-        """Whether there is something that only steps can have: noise on the air, loss or delay."""
+        """Whether there is noise on the air, loss or delay, which only steps can have."""
         return self.on_air or self.delay > 0
 
 

@@ -1,6 +1,6 @@
-"""When steps are due in simulated time, in whole nanoseconds: the one place where that is computed.
+"""When steps are due in simulated time, in whole nanoseconds: computed here only.
 
-Stamps, timers, the twin and the analysis all go by it, so they agree to the nanosecond however late in the run.
+Stamps, timers, the twin and the analysis use this, so they agree to the nanosecond however long the run is.
 """
 
 from __future__ import annotations
@@ -16,50 +16,26 @@ _LARGEST = 2**63 - 1
 
 
 class StepClock:
-    """Simulated time of the steps in whole nanoseconds, free of rounding drift.
+    """Simulated time of the steps in whole nanoseconds, without rounding drift.
 
-    Step k is due at (k + phase) dt: k dt rounded to the nearest nanosecond (a half goes up), and as many more, for all
-    steps alike, as phase dt rounds to.
-
-    Parameters
-    ----------
-    dt
-        length of a step [units of simulated time, written as seconds]; its decimal text counts: 0.1 is one tenth
-    phase
-        part of a step, in [0, 1)
-
-    Attributes
-    ----------
-    step_ns
-        dt [ns], as near as a float comes
+    Step k is due at (k + phase) dt, phase in [0, 1): k dt to the nearest nanosecond (half up), plus phase dt rounded
+    once. ``dt``, in units of simulated time written as seconds, counts as its decimal text: 0.1 is one tenth.
     """
 
     def __init__(self, dt: float, phase: float = 0.0) -> None:
         step = Fraction(repr(float(dt))) * SECOND
         self._numerator, self._denominator = step.numerator, step.denominator
-        self.step_ns = float(step)
+        self.step_ns = float(step)  # dt [ns]
         self._shift = round(float(phase) * self.step_ns)
 
     def nanoseconds(self, step: int) -> int:
-        """Time of step k [ns].
-
-        Parameters
-        ----------
-        step
-            k
-        """
+        """Time of a step [ns]."""
         if self._denominator == 1:
             return step * self._numerator + self._shift
         return (2 * step * self._numerator + self._denominator) // (2 * self._denominator) + self._shift
 
     def times(self, steps: IntArray) -> IntArray:
-        """Times of many steps [ns], in the same shape; the same as one by one.
-
-        Parameters
-        ----------
-        steps
-            of any shape: k
-        """
+        """Times of steps of any shape [ns], in the same shape; equal to ``nanoseconds`` of each."""
         whole, rest = divmod(self._numerator, self._denominator)
         if 2 * int(np.max(steps, initial=0)) * rest + self._denominator > _LARGEST:  # a dt of very many digits
             flat = [self.nanoseconds(step) for step in np.ravel(steps).tolist()]

@@ -14,13 +14,7 @@ from msg_analysis.model.spec import GraphSpec, Link, is_number
 
 
 def largest_label(spec: GraphSpec) -> int:
-    """Largest number of an agent that the graph mentions; 0 where it mentions none.
-
-    Parameters
-    ----------
-    spec
-        graph as the file has it
-    """
+    """Largest agent number that the graph mentions; 0 where it mentions none."""
     if spec.path or spec.cycle:
         return max(spec.path or spec.cycle or [0])
     if spec.star:
@@ -31,15 +25,7 @@ def largest_label(spec: GraphSpec) -> int:
 
 
 def links(spec: GraphSpec, agents: int) -> list[Link]:
-    """(i, j, weight) of every edge (or arc i -> j, for ``arcs``) among the given number of agents.
-
-    Parameters
-    ----------
-    spec
-        the graph, not a GraphML file (see ``read_graphml``)
-    agents
-        number of agents m
-    """
+    """(i, j, weight), agents from 1, of every edge (``arcs``: arc i -> j). Not for GraphML: see ``read_graphml``."""
     if spec.edges is not None or spec.arcs is not None:
         return list(spec.edges or spec.arcs or [])
     pairs: list[tuple[int, int]]
@@ -60,17 +46,7 @@ def links(spec: GraphSpec, agents: int) -> list[Link]:
 
 
 def link_problems(name: str, spec: GraphSpec, agents: int) -> list[str]:
-    """Self-loops, links that stand twice and agents that do not exist.
-
-    Parameters
-    ----------
-    name
-        of the graph
-    spec
-        as the file has it
-    agents
-        m
-    """
+    """Self-loops, duplicate links and agents that do not exist."""
     kind = spec.kinds[0]
     key = f"graphs.{name}.{kind}"
     largest = largest_label(spec)
@@ -92,17 +68,7 @@ def link_problems(name: str, spec: GraphSpec, agents: int) -> list[str]:
 
 
 def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
-    """The graph with its (m, m) adjacency.
-
-    Parameters
-    ----------
-    name
-        of the graph
-    spec
-        without mistakes
-    agents
-        m
-    """
+    """The graph with its (m, m) adjacency, from a spec without mistakes."""
     adjacency = np.zeros((agents, agents))
     for i, j, weight in links(spec, agents):
         adjacency[j - 1, i - 1] = weight
@@ -112,19 +78,9 @@ def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
 
 
 def read_graphml(name: str, file: Path) -> tuple[GraphSpec, int, list[str]]:
-    """A GraphML file as edges (or arcs, where it is directed).
+    """A GraphML file as edges (arcs if directed), its number of agents, and problems (then the rest is meaningless).
 
-    Parameters
-    ----------
-    name
-        of the graph, for messages
-    file
-        to read
-
-    Returns
-    -------
-    tuple[GraphSpec, int, list[str]]
-        the graph, the number of agents it has, and problems (then the rest means nothing)
+    ``name`` of the graph is for messages.
     """
     import networkx as nx  # here, since every process of a run would wait for it
 

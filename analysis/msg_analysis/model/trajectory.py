@@ -1,4 +1,4 @@
-"""What a run did: the states of every agent and the graph of every step, from a bag or from the twin."""
+"""The outcome of a run: the states of all agents and the graph of every step, from a bag or from the twin."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Completeness:
-    """What came and what did not, counted in states x_i(k): m (N + 1) are expected of a run of N steps.
+    """How much of a run is there, counted in states x_i(k): m (N + 1) are expected of a run of N steps.
 
-    Where others hear something else than the state, every state is expected twice: as it is, and as it was published.
+    Where agents publish something else than their state, every state is expected twice: as it is, and as published.
 
     Attributes
     ----------
     expected, received, missing
-        states; received counts each (agent, step) once
+        states; received counts each (agent, step) once, and none whose copies contradict each other
     duplicates
-        states that came again
+        further copies of states
     out_of_order
         states that came after a later one of the same agent
-    refused
-        messages that are no part of this run, by reason
     missing_modes
         steps whose graph is not known
+    refused
+        number of messages that were not used, by reason
     """
 
     expected: int
@@ -40,7 +40,7 @@ class Completeness:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is missing."""
+        """Whether no state and no graph is missing."""
         return self.missing == 0 and self.missing_modes == 0
 
 
@@ -53,29 +53,29 @@ class Trajectory:
     record
         what the run was started from
     states
-        (N + 1, m, width); NaN where a state is missing. The width is the number of replicas, or as many times that as a
-        protocol's state has numbers: those of the first come first, and are the agents' values
+        (N + 1, m, width); NaN where a state is missing. The width is the number of replicas R, or S R for a protocol
+        whose state has S numbers; the first R are the agents' values
     modes
         (N,) index from 0 of the graph used in the step k -> k+1; -1 where not known
+    completeness
+        how many states are there and how many are missing
     agent_modes
-        (N + 1, m) graph that each agent says it used in the step that led to this state (from 0; -1 at step 0 and where
-        missing), or None where nobody logged it
+        (N + 1, m) index from 0 of the graph that each agent says it used in the step to this state; -1 at step 0 and
+        where missing. None where it was not logged
     published
         (N + 1, m, replicas) what the agents published of their states, NaN where missing; None where that is the states
         themselves
     lost
-        (N, m, D) whether in the step k -> k+1 agent i did not get the message of its d-th neighbour, ascending, under
-        the graph of that step (see ``StepModel.neighbours``); D is the largest number of neighbours. None where
-        messages cannot be lost
+        (N, m, D) whether agent i did not get the message of its d-th neighbour, ascending, under the graph of the step
+        k -> k+1 (see ``StepModel.neighbours``); False where the state is missing. D is the largest number of
+        neighbours. None where messages cannot be lost
     used
-        (N, m, D) in real time: step of the value of the d-th neighbour, ascending under the graph ``agent_modes[k + 1,
-        i]``, that went into x_i(k+1); -1 where nothing had been heard and the agent's own value took its place, where
-        the state is missing, and beyond the last neighbour. None in lockstep
+        (N, m, D) in real time: step of the value of the d-th neighbour, ascending, that was used for x_i(k+1), under
+        the graph ``agent_modes[k + 1, i]``; -1 where nothing had been heard and the agent's own value took its place,
+        where the state is missing, and beyond the last neighbour. None in lockstep
     made
-        (N + 1, m) in real time: simulated time [ns] at which the state was made; 0 for x(0), -1 where missing. Later
-        than that of all values that went into it. None in lockstep
-    completeness
-        the account of what is there
+        (N + 1, m) in real time: simulated time [ns] at which the state was made, later than that of every value used
+        for it; 0 for x(0), -1 where missing. None in lockstep
     """
 
     record: RunRecord
@@ -98,12 +98,12 @@ class Trajectory:
 
     @property
     def values(self) -> FloatArray:
-        """(N + 1, m, replicas): the agents' values, which are all of the state unless a protocol has more to it."""
+        """(N + 1, m, replicas): the agents' values; they are the whole state unless a protocol has more numbers."""
         return self.states[:, :, : self.record.experiment.run.replicas]
 
     @property
     def present(self) -> BoolArray:
-        """(N + 1, m): which states are there, with what was published of them."""
+        """(N + 1, m): which states are there; what was published of them, too, where that is something else."""
         there = ~np.isnan(self.states).any(axis=2)
         if self.published is not None:
             there &= ~np.isnan(self.published).any(axis=2)
@@ -111,7 +111,7 @@ class Trajectory:
 
     @property
     def prefix(self) -> int:
-        """Steps in the longest complete beginning: x(0..prefix), g(0..prefix-1) are there (-1: not even x(0))."""
+        """Steps in the longest complete beginning: x(0..prefix) and g(0..prefix-1) are there; -1 if x(0) is not."""
         whole = np.asarray(self.present.all(axis=1))
         states = int(np.argmin(whole)) if not whole.all() else len(whole)
         known = self.modes >= 0
@@ -120,7 +120,7 @@ class Trajectory:
 
     @property
     def stretch(self) -> tuple[int, int] | None:
-        """First and last step of the longest stretch in which every state is there; None where no step is whole."""
+        """First and last step of the longest stretch in which no state is missing; None where no step is complete."""
         whole = np.concatenate(([0], self.present.all(axis=1), [0])).astype(np.int64)
         first, behind = np.flatnonzero(np.diff(whole) == 1), np.flatnonzero(np.diff(whole) == -1)
         if not len(first):

@@ -16,7 +16,7 @@ from msg_analysis.types import BoolArray, FloatArray
 SUM_TOLERANCE = 1e-9
 STEP_TOLERANCE = 1e-9
 MOST_STEPS = 1e15
-"""Beyond, a double cannot tell one step from the next."""
+"""Beyond this, a double cannot tell one step from the next."""
 LONGEST_DURATION = 2**31 - 1
 """A message's stamp has 32 bits for the seconds of simulated time."""
 
@@ -24,16 +24,8 @@ LONGEST_DURATION = 2**31 - 1
 def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tuple[MarkovChain | None, list[str]]:
     """The chain that the file describes, and what is wrong with it (then the chain is None).
 
-    Rows are scaled to sum to 0 (or 1) to the last bit, within the tolerance that the check allows.
-
-    Parameters
-    ----------
-    switching
-        section of the file
-    names
-        of the graphs, in their order
-    time
-        "continuous" or "discrete"
+    Within the tolerance of the check, the diagonal of a generator is replaced by minus the sum of the other rates, and
+    rows of a transition matrix are divided by their sum.
     """
     found = _initial_problems(switching, names)
     given = [key for key in ("generator", "rates", "transition") if getattr(switching, key) is not None]
@@ -136,17 +128,7 @@ def _from_matrix(
 
 
 def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> list[str]:
-    """Graphs that cannot be reached from others, or the period of the chain (assumption 1 of the paper).
-
-    Parameters
-    ----------
-    chain
-        to look at
-    names
-        of the graphs
-    key
-        of the file that the chain came from, for messages
-    """
+    """Graphs that cannot be reached, or a period of the chain (assumption 1 of the paper); ``key`` is for messages."""
     if chain.ergodic:
         return []
     for source in range(chain.modes):
@@ -159,17 +141,10 @@ def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> l
 
 
 def connection_problems(graphs: Sequence[Graph], leaders: LeadersSpec | None) -> list[str]:
-    """Agents that nothing connects in the union of all graphs.
+    """Agents that are not connected in the union of all graphs; ``leaders`` is None in consensus.
 
-    Disagreement (deviation from the reference) is mean-square stable only if the union has an agent (leaders)
-    from which every other one is reached.
-
-    Parameters
-    ----------
-    graphs
-        all of the experiment
-    leaders
-        section of the file; None in consensus
+    Mean-square stability of the disagreement (tracking: of the deviation from the reference) needs a union in which
+    some agent (tracking: the leaders together) reaches every other one.
     """
     union = np.any([graph.adjacency.T > 0 for graph in graphs], axis=0)
     sources = _widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
@@ -182,17 +157,14 @@ def connection_problems(graphs: Sequence[Graph], leaders: LeadersSpec | None) ->
 
 
 def _widest_reaching(leads: BoolArray) -> list[int]:
-    """The vertices from which the most others are reached, those only of one strongly connected component.
+    """The vertices from which the most others are reached, of one strongly connected component only.
 
-    Parameters
-    ----------
-    leads
-        (v, v) whether an arc leads from i to j
+    ``leads[i, j]`` (v, v): an arc leads from i to j.
     """
     known = np.zeros(len(leads), dtype=bool)
     widest, reached = 0, known.copy()
     for vertex in range(len(leads)):
-        if not known[vertex]:  # else whoever was found to reach it reaches as many at least
+        if not known[vertex]:  # else a vertex that reaches it was tried, which reaches at least as many
             found = hops(leads, [vertex]) >= 0
             known |= found
             if found.sum() > reached.sum():
@@ -201,7 +173,7 @@ def _widest_reaching(leads: BoolArray) -> list[int]:
 
 
 def _list(agents: Sequence[int], longest: int = 8) -> str:
-    """`` 3`` or ``s 1, 2, 3``: agents, from 0, as texts count them."""
+    """`` 3`` or ``s 1, 2, 3``: agents (from 0) as texts count them, after the word "agent"."""
     shown = ", ".join(str(agent + 1) for agent in agents[:longest])
     more = f" and {len(agents) - longest} more" if len(agents) > longest else ""
     return ("s " if len(agents) > 1 else " ") + shown + more
@@ -210,16 +182,7 @@ def _list(agents: Sequence[int], longest: int = 8) -> str:
 def noise_gain_of(noise: NoiseSpec, names: Sequence[str], agents: int) -> tuple[FloatArray, list[str]]:
     """(n, m, m) F of every graph as ``noise.process`` has it, and what is wrong with it.
 
-    One and the same F for all graphs is stored once.
-
-    Parameters
-    ----------
-    noise
-        section of the file
-    names
-        of the graphs
-    agents
-        m
+    If all graphs have the same F it is stored once, in a read-only view.
     """
     if not isinstance(noise.process, dict):
         gain, found = _gain_of("noise.process", noise.process, agents)
@@ -267,17 +230,7 @@ def _ragged(value: object) -> bool:
 
 
 def leader_problems(problem_kind: str, leaders: LeadersSpec | None, agents: int | None) -> list[str]:
-    """Leaders where there must be none, missing, twice, unknown, or with nobody to lead.
-
-    Parameters
-    ----------
-    problem_kind
-        "consensus" or "tracking"
-    leaders
-        section of the file, if there
-    agents
-        m; None where the graphs do not tell
-    """
+    """Leaders that are forbidden, missing, duplicate, unknown or without followers; ``agents``: None if unknown."""
     if problem_kind == "consensus":
         if leaders is None:
             return []
@@ -300,19 +253,9 @@ def leader_problems(problem_kind: str, leaders: LeadersSpec | None, agents: int 
 
 
 def stability_limit(graph: Graph, gains: FloatArray) -> float:
-    """Largest dt (not included) for which I - dt Z contracts all that Z does; inf for a graph without links.
+    """Limit of dt: I - dt Z, Z = L + diag(gains), is stable below min 2 Re(lambda) / |lambda|^2 over lambda != 0 of Z.
 
-    Parameters
-    ----------
-    graph
-        one mode
-    gains
-        (m,) kappa; rows and columns of agents with infinite gain are deleted
-
-    Returns
-    -------
-    float
-        min over non-zero eigenvalues of 2 Re(lambda) / |lambda|^2, which is 2 / lambda_max for symmetric Z
+    Rows and columns of agents with infinite gain are deleted; ``gains`` (m,) kappa. inf for a graph without links.
     """
     follows = np.isfinite(gains)
     z = (graph.laplacian + np.diag(np.where(follows, gains, 0.0)))[np.ix_(follows, follows)]
@@ -324,17 +267,7 @@ def stability_limit(graph: Graph, gains: FloatArray) -> float:
 
 
 def stability_problems(graphs: Iterable[Graph], gains: FloatArray, dt: float) -> list[str]:
-    """Graphs for which an Euler step of dt is unstable.
-
-    Parameters
-    ----------
-    graphs
-        all of the experiment
-    gains
-        (m,) kappa, inf for grounded leaders
-    dt
-        length of a step [units of simulated time]
-    """
+    """Graphs for which an Euler step of dt is unstable; ``gains`` (m,) kappa, inf for grounded leaders."""
     found = []
     for graph in graphs:
         limit = stability_limit(graph, gains)
@@ -345,17 +278,7 @@ def stability_problems(graphs: Iterable[Graph], gains: FloatArray, dt: float) ->
 
 
 def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
-    """Steps, durations and starting values that do not fit.
-
-    Parameters
-    ----------
-    run
-        section of the file
-    time
-        "continuous" or "discrete"
-    agents
-        m; None where the graphs do not tell
-    """
+    """Steps, durations and starting values that do not fit; ``agents`` is None where unknown."""
     found = []
     if time == "discrete" and run.dt != 1.0:
         found.append(problem("run.dt", run.dt, "expected 1 in discrete time", "remove run.dt"))
@@ -378,15 +301,7 @@ def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
 
 
 def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
-    """(m,) kappa; 0 for followers, inf for grounded leaders.
-
-    Parameters
-    ----------
-    leaders
-        section of the file; None in consensus
-    agents
-        m
-    """
+    """(m,) kappa; 0 for followers, inf for grounded leaders."""
     gains = np.zeros(agents)
     if leaders:
         gains[np.array(leaders.agents) - 1] = leaders.gain

@@ -4,13 +4,7 @@ from __future__ import annotations
 
 
 def percent(share: float) -> str:
-    """With three digits, and never 0 or 100 for what is not.
-
-    Parameters
-    ----------
-    share
-        from 0 to 1
-    """
+    """A share from 0 to 1 in percent, with three digits; never "0 %" or "100 %" for a share in between."""
     value = 100.0 * share
     if 0.0 < value < 0.01:
         return "less than 0.01 %"
@@ -18,11 +12,5 @@ def percent(share: float) -> str:
 
 
 def counted(number: int, thing: str) -> str:
-    """So many things.
-
-    Parameters
-    ----------
-    number, thing
-        how many, and one of them; several get an s
-    """
+    """A number and a noun whose plural ends with s: ``1 step``, ``2 steps``."""
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
