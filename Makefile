@@ -39,11 +39,18 @@ demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, 
 # Networks wait a good part of their time, for discovery for example: three at once, each in a domain of its own.
 SEVERAL_AT_ONCE := --numprocesses 3 --dist worksteal
 
+# More options of pytest.
+TEST_OPTIONS ?=
+SKIPPED := build/skipped
+TEST := $(BIN)/python -m pytest --skipped-to $(SKIPPED) $(TEST_OPTIONS)
+
 test: test-fast ## Run all tests
-	$(BIN)/python -m pytest $(SEVERAL_AT_ONCE) -m integration
+	$(TEST) $(SEVERAL_AT_ONCE) -m integration
+	@test ! -s $(SKIPPED) || { echo "Not tested:"; cat $(SKIPPED); } >&2
 
 test-fast: setup ## Run the tests that start no network
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto -m "not integration"
+	@rm -f $(SKIPPED)
+	OPENBLAS_NUM_THREADS=1 $(TEST) --numprocesses auto -m "not integration"
 
 STRESS ?= 20
 

@@ -176,7 +176,7 @@ def test_special_numbers_survive() -> None:
 def test_schema_and_hash_are_those_of_the_installed_package(kind: MessageType) -> None:
     share = Path(sys.prefix) / "share"
     if not (share / kind.package / "msg" / f"{kind.name}.json").exists():
-        pytest.skip("not installed here")
+        pytest.skip(f"{kind.package} is not installed: run make setup")
     parts = kind.schema.split("\n" + "=" * 80 + "\nMSG: ")
     definitions = {kind.full_name.replace("/msg/", "/"): parts[0]}
     definitions |= dict(part.split("\n", 1) for part in parts[1:])

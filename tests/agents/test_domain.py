@@ -93,7 +93,7 @@ def test_a_domain_whose_ports_are_in_use_is_left_alone(
         try:
             somebody.bind(("::1" if family == socket.AF_INET6 else "127.0.0.1", _port(domains[0], 11)))
         except OSError as error:
-            pytest.skip(f"cannot bind here: {error}")
+            pytest.skip(f"this machine: cannot bind: {error}")
         for _ in range(4):  # the order is random
             with free_domain() as chosen:
                 assert chosen == domains[1]
@@ -106,7 +106,7 @@ def test_the_lock_is_released_when_the_run_fails(monkeypatch: pytest.MonkeyPatch
             raise RuntimeError("the run failed")
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
+@pytest.mark.skipif(os.geteuid() != 0, reason="run as root: only root can be another user")
 def test_lock_files_of_another_user_do_not_use_up_the_domains(
     monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:

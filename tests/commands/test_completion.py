@@ -97,7 +97,7 @@ def test_in_bash(folder: Path) -> None:
     """By the line that docs/commands.md has for ~/.bashrc, and the function that it defines."""
     bash = shutil.which("bash")
     if not bash:
-        pytest.skip("no bash here")
+        pytest.skip("no bash: install it")
     script = """
         eval "$(_MSG_AGENTS_COMPLETE=bash_source msg-agents)"
         eval "$(_MSG_ANALYSIS_COMPLETE=bash_source msg-analysis)"

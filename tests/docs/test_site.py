@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -12,11 +11,9 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from browser import Log, chromium
 from pages import ROOT
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-QUIET = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-         "--disable-component-update", "--disable-sync"]  # fmt: skip
 LOADS = {"img": "src", "script": "src", "iframe": "src", "source": "src", "link": "href"}
 
 
@@ -94,18 +91,12 @@ def test_equations_are_drawn(site: Path) -> None:
         assert "$$" not in text
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 def test_in_a_browser(site: Path, pages: dict[Path, Links]) -> None:
     """Opened from the disk: no request to anywhere, no error, nothing wider than a phone, and the search finds."""
-    from playwright.sync_api import sync_playwright
-
-    asked, complaints, wide = [], [], []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+    wide = []
+    with chromium() as browser:
         page = browser.new_page(viewport={"width": 390, "height": 844})
-        page.on("request", lambda request: asked.append(request.url))
-        page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
-        page.on("pageerror", lambda error: complaints.append(str(error)))
+        log = Log(page)
         for file in pages:
             page.goto(file.as_uri())
             if page.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth"):
@@ -116,7 +107,6 @@ def test_in_a_browser(site: Path, pages: dict[Path, Links]) -> None:
         first = page.locator(".md-search-result__link").first
         first.wait_for(timeout=30_000)
         assert "leaders.html" in str(first.get_attribute("href"))
-        browser.close()
-    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
-    assert complaints == []
+    assert [url for url in log.requests if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
+    assert log.complaints == []
     assert wide == []

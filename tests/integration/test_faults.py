@@ -40,7 +40,7 @@ def small_disk(tmp_path: Path, rng: random.Random) -> Iterator[Path]:
     size = f"size={rng.randrange(700, 1300)}k"
     mount = subprocess.run(["mount", "-t", "tmpfs", "-o", size, "none", disk], capture_output=True, check=False)
     if mount.returncode:
-        pytest.skip("cannot mount a small file system here: not root")
+        pytest.skip("run as root: only root can mount a small file system")
     try:
         yield disk
     finally:

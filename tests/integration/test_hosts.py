@@ -86,9 +86,9 @@ class Lan:
 @pytest.fixture
 def lan(network: Any) -> Iterator[Lan]:
     if os.geteuid() != 0:
-        pytest.skip("network namespaces can be made by root only")
+        pytest.skip("run as root: only root can make network namespaces")
     if shutil.which("ip") is None:
-        pytest.skip("there is no command ip (Debian package iproute2)")
+        pytest.skip("no command ip: install it (Debian: apt-get install iproute2)")
     clear_abandoned()
     prefix = f"{PREFIX}{os.getpid()}_"
     try:
@@ -96,7 +96,7 @@ def lan(network: Any) -> Iterator[Lan]:
             ip("netns", "add", prefix + "switch")
             ip("-n", prefix + "switch", "link", "add", "bridge", "type", "bridge")
         except subprocess.CalledProcessError as error:
-            pytest.skip(f"this system has no network namespaces or bridges for us: {error.stderr.strip()}")
+            pytest.skip(f"this machine: no network namespaces or bridges: {error.stderr.strip()}")
         ip("-n", prefix + "switch", "link", "set", "bridge", "up")
         for number, name in enumerate(NAMES, start=1):
             ip("netns", "add", prefix + name)

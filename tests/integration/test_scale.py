@@ -59,7 +59,7 @@ def test_processes_keep_to_one_core_each(network: Any, pin: bool) -> None:
     """Where there are more of them than cores; whoever comes back keeps to the same one."""
     cores = os.sched_getaffinity(0)
     if not 2 <= len(cores) <= 5:
-        pytest.skip(f"{len(cores)} cores: of no use for 6 processes")
+        pytest.skip(f"this machine: {len(cores)} cores: nothing to pin 6 processes to")
     file = network.file(run={"duration": 500})
     run = network.start("run", file, "--out", network.directory / "runs", "--json", *([] if pin else ["--no-pin"]))
     network.wait_until_moving()

@@ -14,6 +14,7 @@ ARGUMENTS = (
     *("--disable-component-update", "--disable-sync"),
 )
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+NO_CHROMIUM = "no Chromium: install it (Debian: apt-get install chromium)"
 WAIT = 60_000  # ms
 
 
@@ -37,8 +38,8 @@ class Log:
 def chromium() -> Iterator[Any]:
     """A headless Chromium; the test is skipped where there is none."""
     if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+        pytest.skip(NO_CHROMIUM)
+    playwright = pytest.importorskip("playwright.sync_api", reason="no playwright: run make setup")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=list(ARGUMENTS))
         try:

@@ -25,8 +25,8 @@ def _printed(code: str, environment: dict[str, str]) -> str:
 def another_processor() -> dict[str, str]:
     """Environment variables under which linear algebra gives other last bits; skips the test where none does."""
     if platform.machine() != "x86_64":
-        pytest.skip("another processor can be played on x86-64 only")
+        pytest.skip("this machine: another processor can be played on x86-64 only")
     other = _printed(PROBE, {**os.environ, **SETTINGS})
     if not other or other == _printed(PROBE, dict(os.environ)):
-        pytest.skip("this processor's linear algebra is the older one already")
+        pytest.skip("this machine: its linear algebra is that of an older processor already")
     return SETTINGS

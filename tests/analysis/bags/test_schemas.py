@@ -21,7 +21,7 @@ TYPES = [AGENT_STATE, ACTIVE_GRAPH, ESTIMATE, PROGRESS, STRING]
 def test_definitions_are_those_of_the_packages(package: str) -> None:
     share = INTERFACES if package == "msg_agents_interfaces" else Path(sys.prefix) / "share" / package
     if not share.exists():
-        pytest.skip(f"{package} is not installed")
+        pytest.skip(f"{package} is not installed: run make setup")
     ours = sorted((DEFINITIONS / package / "msg").glob("*.msg"))
     assert ours
     if package == "msg_agents_interfaces":
