@@ -19,8 +19,8 @@ from typing import Any
 import pytest
 import yaml
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
 
 PREFIX = "msga"
 NAMES = ("base", "left", "right")

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.twin import simulate
+from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import simulate
 
 LEADERS = {"agents": [1, 4], "reference": 2.0}
 CASES: dict[str, dict[str, Any]] = {

@@ -1,1 +1,4 @@
-"""Bags of the network: CDR bytes, MCAP files, and the trajectories in them. No ROS."""
+"""Bags of the network: reading, writing, salvage, and the trajectories in them. No ROS.
+
+Message bytes belong to ``wire``, the format of the files to ``bags.format``. May import both, and model.
+"""

@@ -13,10 +13,10 @@ from typing import BinaryIO, Self
 
 from mcap.writer import CompressionType, Writer
 
-from msg_analysis.bags.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
-from msg_analysis.bags.schemas import Topic
-from msg_analysis.bags.storage import DEFAULT, Compression, Storage
+from msg_analysis.bags.format.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
+from msg_analysis.bags.format.storage_options import DEFAULT, Compression, Storage
 from msg_analysis.errors import BagError
+from msg_analysis.wire.schemas import Topic
 
 # As rosbag2 has it: small enough that a killed recorder loses little, large enough that what readers do once for a
 # chunk does not count. With a third of it, reading takes a fifth longer.
@@ -146,7 +146,7 @@ class BagWriter:
         data
             the message as CDR, with its encapsulation header
         time_ns
-            simulated time [ns]; :func:`msg_analysis.bags.cdr.stamp_ns` takes it from the message's header
+            simulated time [ns]; :func:`msg_analysis.wire.messages.stamp_ns` takes it from the message's header
 
         Raises
         ------

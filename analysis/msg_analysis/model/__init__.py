@@ -1,1 +1,4 @@
-"""What an experiment is: file, graphs, chain, noise, the law of one step, the record and the outcome of a run."""
+"""What an experiment is, and what one step and one run of it are.
+
+No predictions, files of runs or statistics. The folders, lowest first: network, arithmetic, experiment, step, run.
+"""

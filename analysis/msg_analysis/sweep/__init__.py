@@ -1,1 +1,4 @@
-"""Sweeps: one experiment at many values of its keys, on the processors of this machine or of a cluster."""
+"""Sweeps: one experiment at many values of its keys; the sweep file, the plan, the results.
+
+What a worker does belongs to ``sweep.jobs``. May import sweep.jobs, inference and what is below it.
+"""

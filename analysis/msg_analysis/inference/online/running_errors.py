@@ -1,0 +1,377 @@
+"""The errors of a network beside their prediction while it runs: the numbers of a comparison, one step at a time.
+
+Measured are time means, as in :mod:`msg_analysis.inference.errors.time_means`, with the same standard errors: of a run
+that has come whole, both give the same. Nothing of the past is kept but sums.
+Per step, the system error takes O(m^2), and so do the node errors: with more than ``EVERY_STEP`` agents, what a
+node's standard error needs is looked at in some
+steps only, which stand for all. While a start that is not stationary is still felt, the expectation is stepped along:
+O(n m^3).
+
+Steps that did not come whole are left out of the measured and of the predicted mean alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from msg_analysis.inference.errors.estimates import Estimate, beside
+from msg_analysis.inference.errors.time_means import Value, forms_of, packed_moments, values_of
+from msg_analysis.inference.observed.observation import BLOCK_NUMBERS, bounded
+from msg_analysis.inference.online.step_collector import StepCollector
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.types import FloatArray, IntArray
+
+EVERY_STEP = 20
+"""Agents up to which every step is looked at for the standard errors of the nodes; beyond, one in m / 20."""
+MOST_BYTES = 256 * 2**20
+"""Of what the standard errors of the nodes are computed with; if that does not do, they are left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class LiveReport:
+    """How far a network has come, and its errors so far.
+
+    Attributes
+    ----------
+    first, last
+        first and last step that went into the errors; -1: none did
+    steps
+        how many did
+    newest
+        largest step that anything has come of; -1: nothing has
+    system, nodes
+        measured beside predicted
+    note
+        why there is no prediction, or no standard error; None where there are both
+    refused
+        states or steps that do not count, by reason
+    latest
+        of the newest whole step: its number, its graph from 0 (in real time: 0), and the first replica (m,)
+    """
+
+    first: int
+    last: int
+    steps: int
+    newest: int
+    system: Estimate
+    nodes: list[Estimate]
+    note: str | None
+    refused: dict[str, int] = field(default_factory=dict)
+    latest: tuple[int, int, FloatArray] | None = None
+
+    @property
+    def missing(self) -> int:
+        """Steps between first and last that did not come whole."""
+        return self.last - self.first + 1 - self.steps if self.steps else 0
+
+
+class LiveEstimate:
+    """The errors of a run beside their prediction, from the states as they come.
+
+    In real time agents are not at the same step at the same moment, and what is expected of the errors depends on their
+    timing: then there is no standard error, and the prediction is that of agents that are never late.
+
+    Parameters
+    ----------
+    record
+        of the run
+    nodes
+        whether to give standard errors of the nodes, too, where that is not too much
+
+    Raises
+    ------
+    InputError
+        no prediction (too large, unbounded)
+    """
+
+    def __init__(self, record: RunRecord, *, nodes: bool = True) -> None:
+        experiment = record.experiment
+        lockstep = experiment.run.pace == "lockstep"
+        self.record = record
+        self.steps = StepCollector(experiment.agents, len(experiment.graph_list), experiment.steps, lockstep=lockstep)
+        reason = experiment.protocol.unpredictable() if experiment.protocol else None
+        prediction = None if reason else predict(experiment)
+        self._errors = RunningErrors(record, prediction, nodes=nodes)
+        self._latest: tuple[int, int, FloatArray] | None = None
+        self._newest = -1
+        self._note = reason
+        if prediction is not None and not lockstep:
+            self._note = "in real time, what is expected depends on how late agents are: compare the bag"
+        elif prediction is not None and not self._errors.nodes_judged:
+            self._note = "too many agents for standard errors of each"
+
+    def add(self, agent: int, step: int, mode: int, payload: bytes) -> None:
+        """See ``StepCollector.add``.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        step
+            k
+        mode
+            graph that led to it, from 0; -1 at step 0
+        payload
+            x(k), 8 bytes for each number
+        """
+        self.steps.add(agent, step, mode, payload)
+
+    def add_whole(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
+        """Take steps that have come whole by another way, each once ever.
+
+        Parameters
+        ----------
+        steps
+            (b,) k
+        modes
+            (b,) graph of the step k -> k+1, from 0
+        states
+            (b, m, width) x(k)
+        after
+            (b, m, width) x(k+1)
+        """
+        if not len(steps):
+            return
+        self._errors.add(steps, modes, states, after)
+        newest = int(np.argmax(steps))
+        self._newest = max(self._newest, int(steps[newest]))
+        if self._latest is None or steps[newest] > self._latest[0]:
+            self._latest = int(steps[newest]), int(modes[newest]), states[newest, :, 0].copy()
+
+    def report(self) -> LiveReport:
+        """The numbers up to now."""
+        self.add_whole(*self.steps.take())
+        errors = self._errors
+        system, nodes = errors.estimates()
+        return LiveReport(
+            first=errors.first,
+            last=errors.last,
+            steps=errors.count,
+            newest=max(self.steps.newest, self._newest),
+            system=system,
+            nodes=nodes,
+            note=self._note,
+            refused={reason: count for reason, count in sorted(self.steps.refused.items()) if count},
+            latest=self._latest,
+        )
+
+
+class RunningErrors:
+    """Sums over steps from which the errors of the agents and their standard errors can be had at any time.
+
+    Parameters
+    ----------
+    record
+        of the run
+    prediction
+        of its experiment; None: the errors are only measured
+    nodes
+        whether there should be standard errors of the nodes too
+
+    Attributes
+    ----------
+    first, last, count
+        first and last step that was added, and how many were; -1, -1, 0 at first
+    nodes_judged
+        whether there are standard errors of the nodes too
+    """
+
+    def __init__(self, record: RunRecord, prediction: Prediction | None, *, nodes: bool = True) -> None:
+        experiment = record.experiment
+        self._record, self._prediction = record, prediction
+        self._agents, self._replicas = experiment.agents, experiment.run.replicas
+        self.first = self.last = -1
+        self.count = 0
+        self.nodes_judged = False
+        self._squares = np.zeros(self._agents)  # sums of the agents' errors
+        self._judge: _Judge | None = None
+        self._expected: _Expected | None = None
+        if prediction is not None:
+            self._expected = _Expected(prediction)
+            if experiment.run.pace == "lockstep":
+                self._judge = _Judge(prediction, self._replicas, nodes=nodes)
+                self.nodes_judged = self._judge.nodes
+
+    def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
+        """Let steps count.
+
+        Parameters
+        ----------
+        steps
+            (b,) k, each once ever
+        modes
+            (b,) graph of the step k -> k+1, from 0
+        states, after
+            (b, m, width) x(k), x(k+1)
+        """
+        if not len(steps):
+            return
+        self.first = int(steps.min()) if self.first < 0 else min(self.first, int(steps.min()))
+        self.last = max(self.last, int(steps.max()))
+        self.count += len(steps)
+        if self._expected is not None:
+            known = np.flatnonzero(steps == 0)
+            self._expected.add(steps, self._record, int(modes[known[0]]) if len(known) else None)
+        deviations, later = self._deviations(states), self._deviations(after)
+        self._squares += (deviations**2).mean(axis=2).sum(axis=0)
+        if self._judge is not None:
+            self._judge.add(steps, modes, deviations, later)
+
+    def estimates(self) -> tuple[Estimate, list[Estimate]]:
+        """System error and node errors up to now."""
+        if not self.count:
+            return Estimate(), [Estimate()] * self._agents
+        measured = np.concatenate([[self._squares.sum()], self._squares]) / self.count
+        if self._expected is None:
+            return Estimate(float(measured[0])), [Estimate(float(error)) for error in measured[1:]]
+        nodes = self._expected.total / self.count
+        predicted = np.concatenate([[nodes.sum()], nodes])
+        if self._judge is None:
+            found = [Estimate(float(m), float(p)) for m, p in zip(measured, predicted, strict=True)]
+            return found[0], found[1:]
+        errors = np.sqrt(self._judge.variances().clip(0.0)) / self.count
+        judged = len(errors)
+        system, judged_nodes = beside(measured[:judged], predicted[:judged], errors)
+        pairs = zip(measured[judged:], predicted[judged:], strict=True)
+        return system, judged_nodes + [Estimate(float(m), float(p)) for m, p in pairs]
+
+    def _deviations(self, states: FloatArray) -> FloatArray:
+        """(b, m, R): what the agents are off."""
+        values = bounded(states[:, :, : self._replicas])
+        if self._record.experiment.problem == "consensus":
+            return np.asarray(values - values.mean(axis=1, keepdims=True))
+        return np.asarray(values - self._record.experiment.reference)
+
+
+class _Judge:
+    """Sums from which the variances of the time means follow, as in ``martingale.time_means``.
+
+    Attributes
+    ----------
+    nodes
+        whether of the node errors too, and not only of the system error; not where it would take too much
+    """
+
+    def __init__(self, prediction: Prediction, replicas: int, *, nodes: bool = True) -> None:
+        system = prediction.system
+        p = packed_symmetric.size(system.dimension)
+        agents = len(system.output)
+        self.nodes = nodes and 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
+        forms, _, trace = forms_of(system, "nodes" if self.nodes else "system")
+        self._system, self._replicas = system, replicas
+        self._values = values_of(prediction, forms)
+        self._each = np.eye(len(forms)) if self.nodes else np.empty((0, len(forms)))
+        self._trace = trace
+        self._stride = -(-agents // EVERY_STEP)
+        self._totals = np.zeros((system.modes, p + 1))
+        self._known = [
+            np.array([value.spread_variance(row) for row in (trace, *self._each)]) if isinstance(value, Value) else None
+            for value in self._values
+        ]
+        self._squares = np.zeros(1 + len(self._each))
+        self._looked = self._count = 0  # steps looked at for the nodes, and all
+        self._length = max(1, BLOCK_NUMBERS // max(p, agents * replicas))
+
+    def add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
+        """Arrays as in ``RunningErrors.add``."""
+        for first in range(0, len(steps), self._length):
+            at = slice(first, first + self._length)
+            self._add(steps[at], modes[at], deviations[at], later[at])
+
+    def _add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
+        a = self._packed(deviations)
+        shared = self._system.loss_variance is not None
+        b = self._packed(later) if shared else a
+        looked = steps % self._stride == 0
+        self._looked += int(looked.sum())
+        self._count += len(steps)
+        for mode in np.unique(modes).tolist():
+            here = modes == mode
+            self._totals[mode] += a[here].sum(axis=0)
+            self._squares[0] += self._sum_squares(mode, self._trace[None], a[here], b[here])[0]
+            if self.nodes:
+                some = here & looked
+                self._squares[1:] += self._sum_squares(mode, self._each, a[some], b[some])
+
+    def _packed(self, deviations: FloatArray) -> FloatArray:
+        """(b, p + 1): (s, 1) of every step."""
+        packed = packed_moments(deviations, self._system)
+        return np.concatenate([packed, np.ones((len(packed), 1))], axis=1)
+
+    def _sum_squares(self, mode: int, rows: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+        """(len(rows),): the part that is not linear in a, for some combinations of the forms."""
+        value = self._values[mode]
+        total = np.zeros(len(rows))
+        if isinstance(value, Value):
+            seen = a
+        else:
+            seen = b
+            total += ((value.increments(a, b) @ rows.T) ** 2).sum(axis=0)
+        for probability, surprise in zip(value.probability, value.surprises, strict=True):
+            total += probability * ((seen @ (rows @ surprise).T) ** 2).sum(axis=0)
+        return total
+
+    def variances(self) -> FloatArray:
+        """(1,) or (1 + m,): of the sums over all steps, of the system error and of the node errors."""
+        found = self._squares.copy()
+        if self._looked:
+            found[1:] *= self._count / self._looked
+        for known, total in zip(self._known, self._totals, strict=True):
+            if known is not None:
+                found += known @ total / self._replicas
+        return found
+
+
+class _Expected:
+    """Exact expectation of the node errors, summed over steps.
+
+    Attributes
+    ----------
+    total
+        (m,)
+    """
+
+    def __init__(self, prediction: Prediction) -> None:
+        self._prediction = prediction
+        steady = prediction.steady
+        self._steady = np.diag(prediction.system.lifted(steady.sum(axis=0)))
+        self._away: FloatArray | None = None  # from the steady state, of the step to be looked at next
+        self._law = np.empty(0)
+        self._scale = 0.0
+        self._series: list[FloatArray] = []  # distance from the steady errors, of every step up to there
+        self.total = np.zeros(len(self._steady))
+
+    def add(self, steps: IntArray, record: RunRecord, first_mode: int | None) -> None:
+        """Let steps count; ``first_mode`` is g(0) if it is known."""
+        if self._away is None:
+            self._begin(record, first_mode)
+        assert self._away is not None
+        system, last = self._prediction.system, int(steps.max())
+        while len(self._series) <= last and not self._arrived():
+            self._series.append(np.diag(system.lifted(self._away.sum(axis=0))))
+            self._away, self._law = system.advance(self._away, self._law)
+        self.total += len(steps) * self._steady
+        early = steps[steps < len(self._series)]
+        if len(early):
+            self.total += np.sum([self._series[step] for step in early.tolist()], axis=0)
+
+    def _begin(self, record: RunRecord, first_mode: int | None) -> None:
+        step, system, steady = self._prediction.step, self._prediction.system, self._prediction.steady
+        law = step.initial
+        if record.experiment.run.start == "stationary":
+            initial = (law / step.stationary)[:, None, None] * steady
+        else:
+            if first_mode is not None:
+                law = np.eye(step.modes)[first_mode]
+            y = system.reduced((record.start - step.reference).T)
+            initial = law[:, None, None] * (y.T @ y / len(y))
+        self._away, self._law = initial - steady, law - system.stationary
+        self._scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
+
+    def _arrived(self) -> bool:
+        assert self._away is not None
+        return bool(np.abs(self._away).max(initial=0.0) <= 1e-17 * self._scale and np.abs(self._law).max() <= 1e-17)

@@ -1,0 +1,137 @@
+"""What all agents hear at once, where something becomes of values on the air: the twin's half of ``model.step.air``."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.step.air import Air
+from msg_analysis.model.step.step_model import StepModel
+from msg_analysis.types import BoolArray, FloatArray, IntArray
+
+
+def padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
+    """(d, m): the d-th input of every agent, ascending, and which of these entries there are; others are 0.
+
+    Parameters
+    ----------
+    model
+        of the experiment
+    mode
+        graph, from 0
+    """
+    inputs = [model.inputs(mode, i) for i in range(model.agents)]
+    columns = np.zeros((max(len(row) for row in inputs), model.agents), dtype=np.int64)
+    there = np.zeros(columns.shape, dtype=np.bool_)
+    for i, row in enumerate(inputs):
+        columns[: len(row), i] = row
+        there[: len(row), i] = True
+    return columns, there
+
+
+class Reception:
+    """The values that take part in ``law.step``, step after step, and what is logged of them.
+
+    Parameters
+    ----------
+    experiment
+        with its noise on the air
+    model
+        its step model
+    """
+
+    def __init__(self, experiment: Experiment, model: StepModel) -> None:
+        self._air = Air(experiment)
+        self._model = model
+        self._replicas = experiment.run.replicas
+        self._links = np.argwhere(model.listens())  # (links, 2): receiver, sender
+        self._padded = [padded_inputs(model, mode) for mode in range(model.modes)]
+        self._used = [self._link_numbers(*padded) for padded in self._padded]
+        self._block = -1
+
+    def values(self, k: int, mode: int, state: FloatArray) -> list[FloatArray]:
+        """The d-th entry: what every agent uses for its d-th input in the step from x(k); see ``padded_inputs``.
+
+        Parameters
+        ----------
+        k
+            of the step; must not go back to an earlier block of steps
+        mode
+            of g(k)
+        state
+            (m, replicas) x(k)
+        """
+        within = self._draw(k)
+        air, (columns, _), used = self._air, self._padded[mode], self._used[mode]
+        heard = (state + self._broadcast[:, within] if air.broadcast else state)[columns]
+        if air.link:
+            heard += self._noise[used, within]
+        return list(np.where(self._own[used, within, None], state, heard))
+
+    def log(self, states: FloatArray, modes: IntArray) -> tuple[FloatArray | None, BoolArray | None]:
+        """What the agents publish and log of a run: see ``Trajectory.published`` and ``Trajectory.lost``.
+
+        Parameters
+        ----------
+        states
+            (N + 1, m, replicas)
+        modes
+            (N,)
+        """
+        air, agents = self._air, self._model.agents
+        published = None
+        if air.broadcast:
+            published = states.copy()
+            for first in range(0, len(states), STEPS_PER_BLOCK):
+                part = published[first : first + STEPS_PER_BLOCK]
+                for i in range(agents):
+                    part[:, i] += air.broadcast_noise(i, first // STEPS_PER_BLOCK)[: len(part)]
+        return published, self._losses(modes) if air.loss else None
+
+    def _losses(self, modes: IntArray) -> BoolArray:
+        links = {link: number for number, link in enumerate(map(tuple, self._links.tolist()))}
+        numbers = np.full((self._model.modes, self._model.agents, self._model.most_neighbours), len(links))
+        for mode in range(self._model.modes):
+            for i in range(self._model.agents):
+                neighbours = self._model.neighbours(mode, i).tolist()
+                numbers[mode, i, : len(neighbours)] = [links[i, j] for j in neighbours]
+        lost = np.empty((len(modes), *numbers.shape[1:]), dtype=np.bool_)
+        for first in range(0, len(modes), STEPS_PER_BLOCK):
+            drawn = self._lost(first // STEPS_PER_BLOCK)
+            drawn[-1] = False  # no link
+            last = min(len(modes), first + STEPS_PER_BLOCK)
+            within = np.arange(last - first)[:, None, None]
+            lost[first:last] = drawn[numbers[modes[first:last]], within]
+        return lost
+
+    def _link_numbers(self, columns: IntArray, there: BoolArray) -> IntArray:
+        """(d, m): which link brings each of the padded inputs; one more than there are for an agent's own value."""
+        agents = self._model.agents
+        numbers = np.full((agents, agents), len(self._links))
+        numbers[self._links[:, 0], self._links[:, 1]] = np.arange(len(self._links))
+        return np.where(there, numbers[np.arange(agents), columns], len(self._links))
+
+    def _draw(self, k: int) -> int:
+        """See that the random numbers of step k are there; its place in their block."""
+        block, within = divmod(k, STEPS_PER_BLOCK)
+        if block != self._block:
+            self._block = block
+            air, links = self._air, self._links.tolist()
+            self._own = self._lost(block)
+            if air.broadcast:
+                agents = range(self._model.agents)
+                self._broadcast = np.stack([air.broadcast_noise(i, block) for i in agents])
+            if air.link:
+                # The last row is never used: it stands for own values.
+                self._noise = np.zeros((len(links) + 1, STEPS_PER_BLOCK, self._replicas))
+                for number, (i, j) in enumerate(links):
+                    self._noise[number] = air.link_noise(i, j, block)
+        return within
+
+    def _lost(self, block: int) -> BoolArray:
+        """(links + 1, STEPS_PER_BLOCK): which messages are lost; True at last, for an agent's own value."""
+        lost = np.ones((len(self._links) + 1, STEPS_PER_BLOCK), dtype=np.bool_)
+        for number, (i, j) in enumerate(self._links.tolist()):
+            lost[number] = self._air.losses(i, j, block) if self._air.loss else False
+        return lost

@@ -1,0 +1,244 @@
+"""Experiments and bags explained back, as documents for ``msg-analysis info``."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from msg_analysis.errors import InputError
+from msg_analysis.model.experiment import memory, validation
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.network.graphs import Graph
+from msg_analysis.theory.prediction import predict
+
+if TYPE_CHECKING:
+    from msg_analysis.bags.format.inventory import FileInventory, Inventory
+    from msg_analysis.bags.salvage import SalvageReport
+
+
+def describe_experiment(experiment: Experiment) -> dict[str, Any]:
+    """What an experiment says, with what follows from it.
+
+    Parameters
+    ----------
+    experiment
+        checked; it need not be one that can be run
+
+    Returns
+    -------
+    dict[str, Any]
+        ``name``, ``problem``, ``time``, ``agents``, ``leaders``, ``protocol`` (``name``, ``package``, ``version``,
+        ``linear``, ``states``, ``hidden``, ``parameters``, ``absent``), ``noise``, ``run`` (with ``steps``),
+        ``switching`` (``matrix``, ``initial``), ``graphs`` (each ``name``, ``edges`` or ``arcs``,
+        ``algebraic_connectivity``, ``stationary``, ``mean_holding_time``, ``stability_limit``), ``stability_limit``,
+        ``predicted_system_error``, ``memory`` [bytes], ``unavailable``. None stands for what is infinite or cannot be
+        computed, or, for the stability limits, is not known (with a delay or a protocol).
+    """
+    document = experiment.to_document()
+    chain = experiment.chain
+    states, matrices = memory.memory_needed(
+        experiment.agents,
+        chain.modes,
+        experiment.steps,
+        experiment.width,
+        experiment.noise.delay,
+        experiment.truth,
+    )
+    limits = [_stability_limit(experiment, graph) for graph in experiment.graph_list]
+    return {
+        "name": experiment.name,
+        "problem": experiment.problem,
+        "time": experiment.time,
+        "agents": experiment.agents,
+        "leaders": document.get("leaders"),
+        "protocol": _protocol(experiment),
+        "noise": document["noise"],
+        "run": document["run"] | {"steps": experiment.steps},
+        "switching": {"matrix": chain.matrix.tolist(), "initial": experiment.switching.initial},
+        "graphs": [
+            {
+                "name": graph.name,
+                "edges": graph.edges if graph.symmetric else None,
+                "arcs": None if graph.symmetric else graph.arcs,
+                "algebraic_connectivity": algebraic_connectivity(graph),
+                "stationary": float(share),
+                "mean_holding_time": holding_time,
+                "stability_limit": limit,
+            }
+            for graph, share, holding_time, limit in zip(
+                experiment.graph_list, chain.stationary, holding_times(experiment), limits, strict=True
+            )
+        ],
+        "stability_limit": min((limit for limit in limits if limit is not None), default=None),
+        "predicted_system_error": _predicted_system_error(experiment),
+        "memory": {"states": states, "matrices": matrices},
+        "unavailable": experiment.unavailable(),
+    }
+
+
+def describe_bag(path: Path) -> dict[str, Any]:
+    """What a bag holds: whole or torn, of a run of ours or not.
+
+    Parameters
+    ----------
+    path
+        bag directory or MCAP file
+
+    Returns
+    -------
+    dict[str, Any]
+        ``bag``, ``recording`` (process that is writing it, or None), ``problem`` (why no run can be made of it; then
+        what is said of the run is None), ``run``, ``experiment``, ``seed``, ``agents``, ``replicas``, ``steps``,
+        ``simulated_time``, ``completeness``, ``prefix``, ``topics`` (each ``name``, ``type``, ``messages``), ``files``
+        (each ``name``, ``size`` [bytes]; those of the bag also ``messages``, ``start``, ``end`` [ns], ``compression``,
+        ``torn``, ``damaged_chunks``, ``lost_messages``, ``problem``), ``protocol`` (as of an experiment), ``versions``
+
+    Raises
+    ------
+    InputError
+        nothing of it can be read
+    """
+    from msg_analysis.bags.format.inventory import Inventory  # here: an experiment does not need it
+    from msg_analysis.bags.format.metadata import total_channels
+    from msg_analysis.bags.writer import recording_pid
+
+    inventory = Inventory()
+    run = _describe_run(path, inventory)
+    entries = {entry.file.path: entry for entry in inventory.files}
+    others = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else []
+    files = [*entries, *(file for file in others if file not in entries)]
+    return {
+        "bag": str(path),
+        "recording": recording_pid(path),
+        **run,
+        "topics": [
+            {"name": topic.topic, "type": topic.type_name, "messages": topic.messages}
+            for topic in total_channels([entry.count for entry in inventory.files]).values()
+        ],
+        "files": [
+            {"name": file.name, "size": file.stat().st_size}
+            | (_describe_file(entries[file]) if file in entries else {})
+            for file in files
+        ],
+    }
+
+
+def _describe_run(path: Path, inventory: Inventory) -> dict[str, Any]:
+    from msg_analysis.bags.reader import read_bag
+
+    try:
+        trajectory = read_bag(path, inventory)
+    except InputError as error:
+        if all(entry.problem for entry in inventory.files):
+            raise
+        keys = ("run", "experiment", "seed", "agents", "replicas", "steps", "simulated_time", "completeness", "prefix")
+        return {"problem": str(error), **dict.fromkeys(keys), "protocol": None, "versions": {}}
+    record = trajectory.record
+    run = record.experiment.run
+    completeness = trajectory.completeness
+    return {
+        "problem": None,
+        "run": str(record.run),
+        "experiment": record.experiment.name,
+        "seed": run.seed,
+        "agents": record.experiment.agents,
+        "replicas": run.replicas,
+        "steps": record.experiment.steps,
+        "simulated_time": run.duration,
+        "completeness": dataclasses.asdict(completeness)
+        | {"complete": completeness.complete, "stretch": trajectory.stretch},
+        "prefix": trajectory.prefix,
+        "protocol": _protocol(record.experiment),
+        "versions": record.versions,
+    }
+
+
+def _describe_file(entry: FileInventory) -> dict[str, Any]:
+    count, some = entry.count, entry.count.messages > 0
+    return {
+        "messages": count.messages,
+        "start": count.start if some else None,
+        "end": count.end if some else None,
+        "compression": entry.compression,
+        "torn": entry.file.torn,
+        "damaged_chunks": entry.file.damaged_chunks,
+        "lost_messages": entry.lost_messages,
+        "problem": entry.problem,
+    }
+
+
+def describe_salvage(out: Path, report: SalvageReport) -> dict[str, Any]:
+    """What was salvaged, and what run is in it: the new bag is read for that.
+
+    Parameters
+    ----------
+    out
+        the new bag
+    report
+        of :func:`msg_analysis.bags.salvage.salvage`
+
+    Returns
+    -------
+    dict[str, Any]
+        ``bag``, the report's fields, and of the run what :func:`describe_bag` says
+    """
+    from msg_analysis.bags.format.inventory import Inventory
+
+    return {"bag": str(out), **dataclasses.asdict(report), **_describe_run(out, Inventory())}
+
+
+def _protocol(experiment: Experiment) -> dict[str, Any] | None:
+    """What the agents do instead of the built-in law; None for that."""
+    protocol = experiment.protocol
+    if protocol is None:
+        return None
+    parameters = experiment.to_document()["protocol"]
+    return protocol.info.to_json() | {
+        "parameters": {key: value for key, value in parameters.items() if key != "name"},
+        "absent": protocol.absent,
+    }
+
+
+def algebraic_connectivity(graph: Graph) -> float:
+    """Second smallest real part of the Laplacian's eigenvalues: how fast agreement comes with this graph.
+
+    Parameters
+    ----------
+    graph
+        directed or not
+    """
+    laplacian = graph.laplacian
+    values = np.linalg.eigvalsh(laplacian) if graph.symmetric else np.linalg.eigvals(laplacian)
+    return max(float(np.sort(values.real)[1]), 0.0)
+
+
+def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
+    if experiment.time == "discrete" or experiment.noise.delay or experiment.protocol:
+        return None
+    limit = validation.stability_limit(graph, experiment.leader_gains)
+    return limit if math.isfinite(limit) else None
+
+
+def holding_times(experiment: Experiment) -> list[float | None]:
+    """Mean time [units of simulated time] in each graph at a stretch; None where it is never left.
+
+    Parameters
+    ----------
+    experiment
+        whose chain it is
+    """
+    matrix = experiment.chain.matrix
+    leaving = (matrix - np.diag(np.diag(matrix))).sum(axis=1)
+    return [1.0 / rate if rate > 0 else None for rate in leaving.tolist()]
+
+
+def _predicted_system_error(experiment: Experiment) -> float | None:
+    try:
+        experiment.require_available("predict")
+        return predict(experiment).emulated.system_error
+    except InputError:  # what cannot be predicted can be explained all the same
+        return None

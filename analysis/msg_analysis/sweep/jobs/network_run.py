@@ -1,0 +1,196 @@
+"""Runs of networks for a sweep: ``msg-agents run`` as a process of its own, one at a time on a machine.
+
+Nothing of ROS is imported: a worker that makes predictions does without, and so does one whose networks run.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from msg_analysis.errors import InputError
+from msg_analysis.sweep.jobs.job import Job, NetworkOptions, NetworkStoppedError
+
+PROGRAM = "msg-agents"
+POLL = 0.1  # s
+ESCALATION = ((signal.SIGINT, 30.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 5.0))
+"""Signals and the seconds that a run has to obey each: it ends its own processes in order."""
+_LEASH = Path(__file__).with_name("end_with_parent.py")
+
+
+def find_program() -> str:
+    """Path of ``msg-agents``: beside this Python, else on the path.
+
+    Raises
+    ------
+    InputError
+        it is not installed, or does not start
+    """
+    beside = Path(sys.executable).with_name(PROGRAM)
+    found = str(beside) if beside.is_file() else shutil.which(PROGRAM)
+    remedy = "install the package msg_agents and ROS 2 (or simulate with the offline twin instead)"
+    if found is None:
+        raise InputError(f"{PROGRAM}: not found beside {sys.executable} nor on PATH: it runs the networks: {remedy}")
+    # Its command line starts without ROS, a run does not.
+    check = "import importlib.util, sys; sys.exit(importlib.util.find_spec('rclpy') is None)"
+    python = _interpreter(Path(found))
+    if python and subprocess.run([python, "-c", check], capture_output=True, check=False).returncode:
+        raise InputError(f"{found}: there is no rclpy for {python}: {remedy}")
+    return found
+
+
+def options(directory: Path, keep: bool, at_once: int) -> NetworkOptions:
+    """How the networks of a sweep are run.
+
+    Parameters
+    ----------
+    directory
+        of the sweep; bags go to ``runs`` in it
+    keep
+        whether all bags are kept, or only those of runs that do not agree with their prediction
+    at_once
+        networks at a time on a machine
+
+    Raises
+    ------
+    InputError
+        see ``find_program``
+    """
+    return NetworkOptions(find_program(), str(directory.absolute() / "runs"), keep, at_once)
+
+
+def _interpreter(program: Path) -> str | None:
+    """The Python in the first line of a script."""
+    with program.open("rb") as file:
+        line = file.readline(1000).decode(errors="replace").strip()
+    return line[2:] if line.startswith("#!/") and "python" in line and " " not in line else None
+
+
+def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
+    """Run a network and read its result.
+
+    Parameters
+    ----------
+    job
+        with the options for networks
+    stopping
+        Callable[[], bool] whether to end it
+
+    Returns
+    -------
+    Mapping[str, Any]
+        The document of ``msg-agents run --json``.
+
+    Raises
+    ------
+    InputError
+        it could not be run; the text is what it said
+    NetworkStoppedError
+        it was ended
+    """
+    options = job.network
+    assert options is not None
+    directory = Path(options.directory) / job.id
+    with _slot(options.at_once, stopping) as slot:
+        shutil.rmtree(directory, ignore_errors=True)  # of a run whose worker was killed
+        directory.mkdir(parents=True)
+        file = directory / "experiment.json"
+        file.write_text(job.document, encoding="utf-8")
+        try:
+            document, said, code = _run(options, file, directory, slot, stopping)
+        except NetworkStoppedError:
+            shutil.rmtree(directory, ignore_errors=True)
+            raise
+    if document is None:
+        shutil.rmtree(directory, ignore_errors=True)
+        last = said.strip().splitlines()[-1:] or ["it said nothing"]
+        raise InputError(f"{PROGRAM} run: exit code {code}: {last[0].removeprefix('error: ')}")
+    if document.get("verdict") == "agrees" and not options.keep:
+        shutil.rmtree(directory, ignore_errors=True)
+        document["bag"] = None
+    return document
+
+
+def _run(
+    options: NetworkOptions, file: Path, directory: Path, slot: int, stopping: Callable[[], bool]
+) -> tuple[dict[str, Any] | None, str, int]:
+    """Its result, what it said on stderr, and its exit code."""
+    command = [options.program, "run", str(file), "--out", str(directory), "--json"]
+    with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
+        # In a session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The
+        # slot is its own, too: should this worker be killed, the next network waits until this one has ended.
+        process = subprocess.Popen(
+            [sys.executable, str(_LEASH), str(os.getpid()), *command],
+            stdin=subprocess.DEVNULL,
+            stdout=stdout,
+            stderr=stderr,
+            start_new_session=True,
+            pass_fds=[slot],
+        )
+        try:
+            while process.poll() is None:
+                time.sleep(POLL)
+                if stopping():
+                    raise NetworkStoppedError
+        finally:
+            _end(process)
+        stdout.seek(0)
+        stderr.seek(0)
+        said = stderr.read().decode(errors="replace")
+        try:
+            document: dict[str, Any] | None = json.loads(stdout.read())
+        except ValueError:
+            document = None
+    return document, said, process.returncode
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    for number, patience in ESCALATION:
+        if process.poll() is not None:
+            return
+        process.send_signal(number)
+        try:
+            process.wait(patience)
+        except subprocess.TimeoutExpired:
+            continue
+
+
+@contextmanager
+def _slot(at_once: int, stopping: Callable[[], bool]) -> Iterator[int]:
+    """Hold one of so many places for networks on this machine; waits until one is free.
+
+    The system frees the place when all who hold it have ended, however they end.
+
+    Raises
+    ------
+    NetworkStoppedError
+        the sweep was ended before
+    """
+    while True:
+        for number in range(at_once):
+            path = Path(tempfile.gettempdir()) / f"msg_agents_sweep_{os.getuid()}_{number}.lock"
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(descriptor)
+                continue
+            try:
+                yield descriptor
+            finally:
+                os.close(descriptor)
+            return
+        time.sleep(POLL)
+        if stopping():
+            raise NetworkStoppedError

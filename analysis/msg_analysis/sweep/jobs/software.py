@@ -1,0 +1,54 @@
+"""Which software a result was made with, so that results of different versions are not taken for one sweep."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from msg_analysis.common.version import __version__
+from msg_analysis.errors import InputError
+
+_ROOMS = ("model", "theory", "twin", "inference")
+
+
+_LIBRARIES = ("distributed", "pyarrow")
+
+
+def require_libraries() -> None:
+    """Refuse to begin without the libraries that only sweeps need: a system's packages may not have them.
+
+    Raises
+    ------
+    InputError
+        names those that are missing
+    """
+    missing = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"{' and '.join(missing)}: not installed: sweeps need them: pip install dask {' '.join(missing)}"
+        )
+
+
+@functools.cache
+def installed() -> str:
+    """Versions of all that a result depends on, in one line.
+
+    Two installations say the same only where the code of the law, the theory and the statistics is the same.
+    """
+    source = Path(__file__).parents[2]
+    files = [file for room in _ROOMS for file in (source / room).rglob("*.*") if file.suffix in (".py", ".c")]
+    digest = hashlib.sha256()
+    for file in sorted([*files, source / "sweep/jobs/evaluate.py"]):
+        digest.update(file.read_bytes())
+    libraries = " ".join(f"{name} {_version(name)}" for name in ("numpy", "scipy"))
+    return f"msg_analysis {__version__} ({digest.hexdigest()[:10]}), {libraries}"
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
