@@ -78,7 +78,11 @@ def test_files_and_targets_exist(page: Path) -> None:
     targets = {target for line in lines for target in re.findall(r"(?:^|\s)make ([a-z][a-z-]+)(?:\s|$)", line)}
     known = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     assert targets <= known
-    files = {file for line in lines for file in re.findall(r"(?:benchmarks|docker|tests)/[\w/.-]+\.(?:py|yaml)", line)}
+    files = {
+        file
+        for line in lines
+        for file in re.findall(r"(?<![\w/])(?:benchmarks|docker|tests)/[\w/.-]+\.(?:py|yaml)", line)
+    }
     assert [file for file in files if not (ROOT / file).exists()] == []
     for line in lines:
         if script := re.search(r"(benchmarks/\w+\.py)(.*)", line):

@@ -139,7 +139,7 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
     figures = network.directory / "figures"
     code = [
         "from msg_analysis.cli.main import main",
-        "from msg_analysis.report import emulation",
+        "from msg_analysis.paper import emulation",
         "from msg_analysis.paper.emulation import Run",
         f"emulation.runs_of = lambda number: [run for run in {runs} if run.example == number]",
         "if __name__ == '__main__':",

@@ -1,7 +1,7 @@
 """What launch files do, without ``launch``: which processes, what each end of one means, what comes after the run.
 
-The plan is that of ``msg-agents run`` (``process_plan``). What ``launch`` does itself is left to it: starting processes,
-signals, output. Processes that were killed are not started again here.
+The plan is that of ``msg-agents run`` (``process_plan``). What ``launch`` does itself is left to it: starting
+processes, signals, output. Processes that were killed are not started again here.
 """
 
 from __future__ import annotations

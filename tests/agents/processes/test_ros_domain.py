@@ -19,7 +19,7 @@ from msg_agents.processes.ros_domain import DOMAINS, PORT_BASE, PORTS_PER_DOMAIN
 from msg_analysis.errors import InputError
 
 HOLD = """
-from msg_agents import domain
+from msg_agents.processes import ros_domain as domain
 domain.DOMAINS = range({first}, {end})
 with domain.free_domain() as held:
     print(held, flush=True)

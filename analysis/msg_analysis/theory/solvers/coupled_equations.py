@@ -140,7 +140,7 @@ class CoupledEquations:
         mild = self.modes.mild and all(level.solves.mild for level in self._levels)
         other = copy.copy(self)
         other.definite = self.definite and self.modes.definite
-        if not mild or self.system.dimension < SINGLE_FROM:
+        if not (mild and self.large):
             return other
         other.modes = self.modes.single()
         other.drift, other.rates, other.leaving = other.modes.drift, single(self.rates), single(self.leaving)
@@ -148,6 +148,11 @@ class CoupledEquations:
             Level(single(level.average), single(level.members), level.solves.single()) for level in self._levels
         ]
         return other
+
+    @property
+    def large(self) -> bool:
+        """Whether single precision is faster."""
+        return self.system.dimension >= SINGLE_FROM
 
     @property
     def one_level(self) -> bool:

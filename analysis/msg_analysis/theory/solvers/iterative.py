@@ -13,7 +13,7 @@ import numpy as np
 
 from msg_analysis.errors import InputError
 from msg_analysis.theory.solvers.averaged_equations import AveragedEquations, suitable
-from msg_analysis.theory.solvers.coupled_equations import SINGLE_FROM, CoupledEquations
+from msg_analysis.theory.solvers.coupled_equations import CoupledEquations
 from msg_analysis.theory.solvers.krylov import (
     Equations,
     conjugate_gradients,
@@ -111,8 +111,7 @@ class IterativeSolver:
 
 def _averaged(equations: CoupledEquations) -> AveragedEquations | None:
     """The cheaper preconditioner, where it promises to be better."""
-    system = equations.system
-    if not equations.one_level or system.loss_variance is not None or system.dimension < SINGLE_FROM:
+    if not (equations.one_level and equations.large) or equations.system.loss_variance is not None:
         return None
     return AveragedEquations(equations) if suitable(equations) else None
 

@@ -1,4 +1,4 @@
-"""The agent node: one row of the MJLS on topics. What differs by pace is in ``lockstep_agent`` and ``realtime_agent``."""
+"""The agent node: one row of the MJLS on topics. Pace: ``lockstep_agent``, ``realtime_agent``."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Group(Protocol):
     progress_period: float
 
     def report(self, agent: int, step: int) -> None:
-        """Tell the switcher how far an agent is."""
+        """See AgentGroup."""
 
     def ask_again(self, agent: int, step: int) -> None:
-        """Ask an agent of another process for its states from a step on."""
+        """See AgentGroup."""
 
     def fail(self, error: Exception) -> None:
-        """End the process because an agent cannot go on."""
+        """See AgentGroup."""
 
 
 class Agent(NetworkNode):
