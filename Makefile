@@ -29,7 +29,7 @@ $(VENV)/.interfaces: $(VENV)/.locked $(wildcard $(INTERFACES)/msg/*) $(INTERFACE
 	$(PIP) install $(LOCAL) --force-reinstall ./$(INTERFACES)
 	@touch $@
 
-$(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_analysis/model/*.c msg_agents/setup.* analysis/package.xml msg_agents/package.xml $(EXAMPLES)/setup.* $(EXAMPLES)/package.xml)
+$(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_analysis/model/arithmetic/*.c msg_agents/setup.* analysis/package.xml msg_agents/package.xml $(EXAMPLES)/setup.* $(EXAMPLES)/package.xml)
 	$(PIP) install $(LOCAL) --editable analysis --editable msg_agents --editable $(EXAMPLES)
 	@touch $@
 

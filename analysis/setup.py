@@ -6,8 +6,8 @@ PACKAGE = "msg_analysis"
 
 # Without a compiler the package works all the same, only slower. Fused multiply-adds would change the last bits.
 KERNEL = Extension(
-    f"{PACKAGE}.model._kernel",
-    [f"{PACKAGE}/model/_kernel.c"],
+    f"{PACKAGE}.model.arithmetic._kernel",
+    [f"{PACKAGE}/model/arithmetic/_kernel.c"],
     extra_compile_args=["-O2", "-ffp-contract=off"] if os.name == "posix" else [],
     optional=True,
 )
@@ -24,7 +24,12 @@ setup(
     ext_modules=[KERNEL],
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={
-        PACKAGE: ["py.typed", "model/_kernel.pyi", "report/templates/*", "bags/definitions/*/msg/*.msg"],
+        PACKAGE: [
+            "py.typed",
+            "model/arithmetic/_kernel.pyi",
+            "report/html/templates/*",
+            "wire/definitions/*/msg/*.msg",
+        ],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
@@ -52,5 +57,5 @@ setup(
         "zstandard",
     ],
     extras_require={"test": ["pytest"]},  # by which colcon knows how to test it
-    entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli:main"]},
+    entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli.main:main"]},
 )

@@ -21,10 +21,10 @@ import numpy as np
 import scipy.linalg
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.system import continuous
+from msg_analysis.theory.system.jump_system import continuous
 from msg_analysis.types import FloatArray
 
 Result = TypeVar("Result")

@@ -23,12 +23,12 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from msg_agents.cores import available_cores, keep_to, place
-from msg_agents.domain import free_domain
-from msg_agents.environment import node_environment
-from msg_agents.errors import RCLError
-from msg_agents.network import RECORDER, ProcessPlan
-from msg_agents.process import prefer_throughput
+from msg_agents.nodes.node_process import prefer_throughput
+from msg_agents.nodes.ros.rclpy_error import RCLError
+from msg_agents.processes.core_pinning import available_cores, keep_to, place
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.process_plan import RECORDER, ProcessPlan
+from msg_agents.processes.ros_domain import free_domain
 
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0)
 FRAME = struct.Struct("<4xQI")  # CDR header, step, agent

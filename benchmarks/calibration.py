@@ -24,17 +24,17 @@ import numpy as np
 from scipy import stats
 
 import msg_analysis
-from msg_analysis.inference.compare import compare
-from msg_analysis.inference.comparison import Comparison
-from msg_analysis.inference.estimates import Estimate
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.record import RunRecord
-from msg_analysis.sweep.workers import Lost, Workers
-from msg_analysis.twin import new_record, simulate
+from msg_analysis.inference.errors.estimates import Estimate
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.inference.verdict.comparison import Comparison
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.sweep.jobs.workers import Lost, Workers
+from msg_analysis.twin.simulate import new_record, simulate
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/calibration.md"
-ROOMS = ("model", "theory", "inference")
+ROOMS = ("model", "theory", "twin", "inference")
 LINE = [(1, 2), (2, 3), (3, 4), (4, 5)]
 RING = [*LINE, (5, 1)]
 
@@ -188,7 +188,7 @@ def version() -> str:
     digest = hashlib.sha256(Path(__file__).read_bytes())
     source = Path(msg_analysis.__file__).parent
     for room in ROOMS:
-        for path in sorted((source / room).glob("*.py")):
+        for path in sorted((source / room).rglob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 

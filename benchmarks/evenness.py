@@ -17,11 +17,11 @@ import numpy as np
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.inference.compare import compare
-from msg_analysis.inference.comparison import Comparison
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.record import RunRecord
-from msg_analysis.twin import simulate
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.inference.verdict.comparison import Comparison
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.twin.simulate import simulate
 
 
 def line_ring(

@@ -30,10 +30,10 @@ from mcap.reader import make_reader
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import InputError
-from msg_analysis.inference.compare import compare
-from msg_analysis.model import memory
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.report.info import describe_bag, describe_experiment
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment import memory
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.report.documents.info import describe_bag, describe_experiment
 
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = [ROOT / "ros_ws/src/msg_agents_bringup/experiments", ROOT / "tests/data/golden"]

@@ -20,12 +20,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from msg_analysis.bags import writer
-from msg_analysis.bags.cdr import decode_string, encode_string
-from msg_analysis.bags.mcapfile import MAGIC
-from msg_analysis.bags.storage import COMPRESSIONS, Storage
-from msg_analysis.bags.store import write_trajectory
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.twin import simulate
+from msg_analysis.bags.format.mcap_file import MAGIC
+from msg_analysis.bags.format.storage_options import COMPRESSIONS, Storage
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.simulate import simulate
+from msg_analysis.wire.messages import decode_string, encode_string
 
 CHUNK, MESSAGE, METADATA = 0x06, 0x05, 0x0C
 _RECORD = struct.Struct("<BQ")

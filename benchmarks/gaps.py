@@ -11,10 +11,10 @@ import argparse
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.inference.online import RunningErrors
-from msg_analysis.model.experiment import Experiment
+from msg_analysis.inference.online.running_errors import RunningErrors
+from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.theory.prediction import predict
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 
 EXPERIMENT = {
     "name": "line_ring",

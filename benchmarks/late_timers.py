@@ -11,14 +11,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.noise import ProcessNoise
-from msg_analysis.model.path import mode_path
-from msg_analysis.model.realtime import phases
-from msg_analysis.model.step import StepModel, build_step_model
-from msg_analysis.model.streams import STEPS_PER_BLOCK
-from msg_analysis.model.trajectory import Completeness, Trajectory
-from msg_analysis.twin import new_record
+from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.graph_path import mode_path
+from msg_analysis.model.run.trajectory import Completeness, Trajectory
+from msg_analysis.model.step.phases import phases
+from msg_analysis.model.step.process_noise import ProcessNoise
+from msg_analysis.model.step.step_model import StepModel, build_step_model
+from msg_analysis.twin.simulate import new_record
 
 Lateness = Callable[[np.random.Generator], float]
 

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import bare_loop
 
-from msg_agents.runner import run_network
-from msg_analysis.model.experiment import Experiment
+from msg_agents.running.runner import run_network
+from msg_analysis.model.experiment.experiment import Experiment
 
 EXPERIMENT = Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml"
 LARGE, PROCESSES = 100, 4  # agents, and the processes that they share

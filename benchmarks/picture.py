@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.online import RunningErrors
-from msg_analysis.model.graphs import Graph
-from msg_analysis.model.trajectory import Trajectory
+from msg_analysis.inference.online.running_errors import RunningErrors
+from msg_analysis.model.network.graphs import Graph
+from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.theory.prediction import predict
 
 SHOWN = 30.0  # units of time of which the states are drawn

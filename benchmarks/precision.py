@@ -14,10 +14,10 @@ import tempfile
 import time
 from pathlib import Path
 
-from msg_agents.runner import run_network
-from msg_analysis.inference.compare import compare
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.twin import simulate
+from msg_agents.running.runner import run_network
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.simulate import simulate
 
 EXPERIMENT = Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml"
 REPLICAS = (16, 64, 256)

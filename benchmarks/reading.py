@@ -55,9 +55,9 @@ class Stopwatch:
 
 def make_bag(directory: Path, states: int, replicas: int) -> None:
     """A bag with at least so many states."""
-    from msg_analysis.bags.store import write_trajectory
-    from msg_analysis.model.experiment import Experiment
-    from msg_analysis.twin import simulate
+    from msg_analysis.bags.trajectory_writer import write_trajectory
+    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.twin.simulate import simulate
 
     document = Experiment.load(EXPERIMENT).to_document()
     steps = -(-states // len(TOPICS)) - 1

@@ -10,12 +10,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from msg_analysis.bags.cdr import StateCodec, stamp_ns
-from msg_analysis.bags.schemas import network_topics
-from msg_analysis.bags.storage import COMPRESSIONS, Storage
+from msg_analysis.bags.format.storage_options import COMPRESSIONS, Storage
 from msg_analysis.bags.writer import BagWriter
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.twin import simulate
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.simulate import simulate
+from msg_analysis.wire.messages import StateCodec, stamp_ns
+from msg_analysis.wire.schemas import network_topics
 
 SPLITS = (None, 5_000_000)  # bytes
 

@@ -14,8 +14,8 @@ import sys
 import time
 from pathlib import Path
 
-from msg_agents.cli import main as agents
-from msg_analysis.cli import main as analysis
+from msg_agents.cli.main import main as agents
+from msg_analysis.cli.main import main as analysis
 
 ROUNDS = 7
 BIN = Path(sys.executable).parent

@@ -21,9 +21,10 @@ from typing import Any
 import networkx as nx
 import numpy as np
 
+from msg_analysis.sweep.jobs.evaluate import evaluate
+from msg_analysis.sweep.jobs.job import Outcome
+from msg_analysis.sweep.jobs.workers import Workers
 from msg_analysis.sweep.plan import load_sweep
-from msg_analysis.sweep.point import Outcome, evaluate
-from msg_analysis.sweep.workers import Workers
 
 AGENTS, GRAPHS = 50, 3
 

@@ -12,7 +12,7 @@ setup(
     maintainer_email="maintainers@msg-agents.example.org",
     python_requires=">=3.11",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "loopback.xml", "udp.xml", "pages/*.html"]},
+    package_data={PACKAGE: ["py.typed", "processes/*.xml", "watching/pages/*.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -24,9 +24,9 @@ setup(
     # What `ros2 run msg_agents` can run: the command line, and each node by itself.
     entry_points={
         "console_scripts": [
-            "msg-agents = msg_agents.executables:msg_agents",
+            "msg-agents = msg_agents.cli.entry_points:msg_agents",
             *(
-                f"{node} = msg_agents.executables:{node}"
+                f"{node} = msg_agents.cli.entry_points:{node}"
                 for node in ("agent", "switcher", "recorder", "player", "live", "markers")
             ),
         ]

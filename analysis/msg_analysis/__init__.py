@@ -7,8 +7,9 @@ The names are those of ``msg_analysis.api``. Each is imported on first access: a
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
+
+from msg_analysis.common.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from msg_analysis.api import BagError as BagError
@@ -25,11 +26,6 @@ if TYPE_CHECKING:
     from msg_analysis.api import compare as compare
     from msg_analysis.api import read_bag as read_bag
     from msg_analysis.api import write_report as write_report
-
-try:
-    __version__ = version("msg_analysis")
-except PackageNotFoundError:  # run from a source tree that is not installed
-    __version__ = "0.0.0"
 
 __all__ = [
     "BagError",

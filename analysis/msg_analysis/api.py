@@ -14,24 +14,24 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from msg_analysis.bags.format.storage_options import DEFAULT, Storage
 from msg_analysis.bags.reader import read_bag as read_trajectory
-from msg_analysis.bags.storage import DEFAULT, Storage
-from msg_analysis.bags.store import write_trajectory
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.common.files import require_place
 from msg_analysis.errors import BagError, InputError, NotAvailableError
-from msg_analysis.files import require_place
-from msg_analysis.inference.compare import compare as compare_trajectory
-from msg_analysis.inference.comparison import Comparison
-from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.model import experiment as model
-from msg_analysis.model.problems import ExperimentError
-from msg_analysis.model.record import RunRecord
-from msg_analysis.model.trajectory import Trajectory
-from msg_analysis.report.theory import TransientLaw, solve_transient
-from msg_analysis.theory.leader_search import Watch, ignore
-from msg_analysis.theory.leaders import Law, Method, Selection, select_leaders
+from msg_analysis.inference.verdict.compare import compare as compare_trajectory
+from msg_analysis.inference.verdict.comparison import Comparison
+from msg_analysis.inference.verdict.pool import compare_pooled
+from msg_analysis.model.experiment import experiment as model
+from msg_analysis.model.experiment.problems import ExperimentError
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.report.documents.transient_and_facts import TransientLaw, solve_transient
+from msg_analysis.theory.leaders.search import Watch, ignore
+from msg_analysis.theory.leaders.selection import Law, Method, Selection, select_leaders
 from msg_analysis.theory.prediction import Moments, Prediction, predict
 from msg_analysis.theory.transient import Transient
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 from msg_analysis.types import FloatArray
 
 __all__ = [
@@ -207,8 +207,8 @@ class Experiment(model.Experiment):
 class Run(Trajectory):
     """A run of an experiment, by a network or by the twin: states and graphs of every step.
 
-    The arrays are those of :class:`msg_analysis.model.trajectory.Trajectory`. A missing state is NaN, a missing graph
-    -1; ``completeness`` counts them.
+    The arrays are those of :class:`msg_analysis.model.run.trajectory.Trajectory`. A missing state is NaN, a missing
+    graph -1; ``completeness`` counts them.
     """
 
     @classmethod
@@ -354,7 +354,9 @@ def write_report(comparison: Comparison, file: str | Path, **options: Any) -> Pa
     InputError
         the file cannot be written
     """
-    from msg_analysis.report.html import write_report as write_html  # imported here: it loads the plotting libraries
+    from msg_analysis.report.html.report_page import (
+        write_report as write_html,  # imported here: it loads the plotting libraries
+    )
 
     require_place(Path(file))
     write_html(comparison, comparison.trajectory, Path(file), **options)

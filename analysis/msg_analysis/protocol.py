@@ -21,8 +21,8 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from msg_analysis.model.graphs import Graph
-from msg_analysis.model.law import weighted_sum
+from msg_analysis.model.arithmetic.update_law import weighted_sum
+from msg_analysis.model.network.graphs import Graph
 from msg_analysis.types import FloatArray, IntArray
 
 __all__ = ["ENTRY_POINTS", "Graph", "Heard", "LinearProtocol", "Network", "Parameters", "Protocol"]

@@ -2,7 +2,7 @@
 
     from msg_agents import run_network
 
-The public names are those of ``msg_agents.runner``, which is imported at their first use.
+The public names are those of ``msg_agents.running.runner``, which is imported at their first use.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from msg_agents.runner import RunResult as RunResult
-    from msg_agents.runner import conclude as conclude
-    from msg_agents.runner import run_network as run_network
+    from msg_agents.running.runner import RunResult as RunResult
+    from msg_agents.running.runner import conclude as conclude
+    from msg_agents.running.runner import run_network as run_network
 
 try:
     __version__ = version("msg_agents")
@@ -26,7 +26,7 @@ __all__ = ["RunResult", "conclude", "run_network"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from msg_agents import runner
+    from msg_agents.running import runner
 
     return getattr(runner, name)
 

@@ -1,6 +1,6 @@
 """``python -m msg_agents`` is ``msg-agents``."""
 
-from msg_agents.executables import msg_agents
+from msg_agents.cli.entry_points import msg_agents
 
 if __name__ == "__main__":
     msg_agents()

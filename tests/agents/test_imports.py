@@ -1,12 +1,10 @@
-"""The house rules: no ROS below, and rooms that import only earlier rooms."""
+"""What importing a module brings with it, in an interpreter of its own. Who may import whom: tests/test_layers.py."""
 
 from __future__ import annotations
 
-import ast
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,19 +14,28 @@ import msg_analysis
 
 ANALYSIS = Path(msg_analysis.__file__).parent
 AGENTS = Path(msg_agents.__file__).parent
-ROOMS = ["base", "model", "theory", "twin", "bags", "inference", "sweep", "report", "api", "cli"]
-FRONT_DOOR = "msg_analysis.__init__"
-ROS = ("rclpy", "msg_agents", "rosidl", "ament", "launch")
+WITH_ROS = "nodes"
+ROS = ("rclpy", "rosidl", "ament", "launch")
 
 
-def modules() -> dict[str, Path]:
-    return {
-        ".".join(("msg_analysis", *file.relative_to(ANALYSIS).with_suffix("").parts)): file
-        for file in sorted(ANALYSIS.rglob("*.py"))
-    }
+def modules(package: str, place: Path, folder: str = ".") -> list[str]:
+    files = [file for file in sorted((place / folder).rglob("*.py")) if file.stem != "__main__"]
+    return [
+        ".".join((package, *file.relative_to(place).with_suffix("").parts)).removesuffix(".__init__") for file in files
+    ]
 
 
-MODULES = modules()
+def loaded_by(names: list[str]) -> set[str]:
+    """Every module that importing these loads, whoever imports it."""
+    code = (
+        "import importlib, json, sys\n"
+        f"for name in {names!r}:\n"
+        "    importlib.import_module(name)\n"
+        "print(json.dumps(sorted(sys.modules)))"
+    )
+    process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
+    assert process.returncode == 0, process.stderr
+    return set(json.loads(process.stdout))
 
 
 def is_ros(name: str) -> bool:
@@ -36,91 +43,55 @@ def is_ros(name: str) -> bool:
     return top.startswith(ROS) or top.endswith(("_msgs", "_interfaces"))
 
 
-def imported(file: Path) -> Iterator[str]:
-    """Absolute names of everything that a module imports, at the top, in functions, or for type checkers only."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{file}: a relative import"
-            assert node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+def folders_without_ros() -> list[str]:
+    return sorted(file.parent.name for file in AGENTS.glob("*/__init__.py") if file.parent.name != WITH_ROS)
 
 
-def room(name: str) -> str:
-    parts = name.split(".")[1:] or ["__init__"]
-    if name == FRONT_DOOR or parts[0] in msg_analysis.__all__:  # what the API gives away under the package's name
-        return "api"
-    if parts == ["__main__"]:
-        return "cli"
-    if "twin" in parts[:2]:  # the twin needs the theory for its start
-        return "twin"
-    top = parts[0].partition("_")[0]  # cli_theory is part of the command line
-    if top == "protocol":  # the public half of model.protocols
-        return "model"
-    return top if top in ROOMS else "base"
-
-
-def test_there_is_something_to_look_at() -> None:
-    assert len(MODULES) > 30
-    assert {room(name) for name in MODULES} == set(ROOMS)
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_no_ros(name: str) -> None:
-    assert not [other for other in imported(MODULES[name]) if is_ros(other)]
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_rooms_import_only_earlier_rooms(name: str) -> None:
-    order = {kind: number for number, kind in enumerate(ROOMS)}
-    later = [
-        other
-        for other in imported(MODULES[name])
-        if other.split(".")[0] == "msg_analysis"
-        and other != "msg_analysis.__version__"
-        and order[room(other)] > order[room(name)]
-    ]
-    assert not later
-
-
-def test_importing_everything_brings_no_ros() -> None:
+def test_msg_analysis_brings_neither_ros_nor_msg_agents() -> None:
     """Also where a dependency would bring it."""
-    code = (
-        "import importlib, json, sys\n"
-        f"for name in {[name.removesuffix('.__init__') for name in MODULES]!r}:\n"
-        "    importlib.import_module(name)\n"
-        "print(json.dumps(sorted(sys.modules)))"
-    )
-    process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
-    assert process.returncode == 0, process.stderr
-    loaded = json.loads(process.stdout)
-    assert "msg_analysis.bags.reader" in loaded
+    names = modules("msg_analysis", ANALYSIS)
+    assert len(names) > 100
+    loaded = loaded_by(names)
+    assert set(names) <= loaded
+    assert not [name for name in loaded if is_ros(name) or name.startswith("msg_agents")]
+
+
+@pytest.mark.parametrize("folder", folders_without_ros())
+def test_what_needs_no_ros_does_without(folder: str) -> None:
+    """These can be tested, the plan printed and a command line parsed on a machine without ROS."""
+    names = modules("msg_agents", AGENTS, folder)
+    assert len(names) > 1
+    loaded = loaded_by(names)
+    assert set(names) <= loaded
     assert not [name for name in loaded if is_ros(name)]
 
 
+def test_the_folders_without_ros() -> None:
+    pure = {"stepping", "terminal", "processes", "recovery", "replay", "watching", "running"}
+    assert set(folders_without_ros()) == pure | {"cli"}
+
+
+def test_ros_would_be_found() -> None:
+    pytest.importorskip("rclpy")
+    loaded = loaded_by(["msg_agents.nodes.ros.qos"])
+    assert {"rclpy"} <= {name for name in loaded if is_ros(name)}
+
+
 def test_help_needs_no_ros() -> None:
-    code = "import sys\nfrom msg_agents.cli import main\nmain(['--help'], standalone_mode=False)\n"
+    code = "import sys\nfrom msg_agents.cli.main import main\nmain(['--help'], standalone_mode=False)\n"
     code += "print([name for name in ('rclpy', 'numpy', 'scipy', 'matplotlib', 'rich') if name in sys.modules])"
     process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
     assert process.stdout.splitlines()[-1] == "[]", process.stderr
-
-
-@pytest.mark.parametrize("file", ["synchronizer.py", "network.py", "domain.py", "supervisor.py", "check.py"])
-def test_what_needs_no_ros_does_without(file: str) -> None:
-    """These can be tested, and the plan be printed, on a machine without ROS."""
-    needed = {name.split(".")[0] for name in imported(AGENTS / file)}
-    assert "rclpy" not in needed
-    assert "msg_agents_interfaces" not in needed
 
 
 def test_processes_of_a_run_import_little() -> None:
     """With these a network would take twice as long to start: every agent is a process that imports all it needs."""
     code = (
         "import sys\n"
-        "import msg_agents.agent, msg_agents.group, msg_agents.process, msg_agents.recorder, msg_agents.switcher\n"
-        "from msg_analysis.model.experiment import Experiment\n"
-        "from msg_analysis.model.step import build_model\n"
+        "import msg_agents.nodes.agents.agent, msg_agents.nodes.agents.agent_group, msg_agents.nodes.node_process\n"
+        "import msg_agents.nodes.recorder, msg_agents.nodes.switcher\n"
+        "from msg_analysis.model.experiment.experiment import Experiment\n"
+        "from msg_analysis.model.step.step_model import build_model\n"
         "document = {'name': 'two', 'graphs': {'pair': {'path': [1, 2]}, 'grid': {'grid': [1, 2]}},\n"
         "            'switching': {'generator': [[-1, 1], [1, -1]]}}\n"
         "build_model(Experiment.parse(document))\n"

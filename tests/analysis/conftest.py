@@ -1,14 +1,28 @@
-"""Packages that offer protocols."""
+"""Packages that offer protocols, and rosbags as the independent judge of bytes and bags."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from msg_analysis.model import protocols
+from msg_analysis.model.experiment import protocol_binding
+
+ROOT = Path(__file__).parents[2]
+INTERFACES = ROOT / "ros_ws" / "src" / "msg_agents_interfaces" / "msg"
+
+
+@pytest.fixture(scope="session")
+def typestore() -> Any:
+    """Jazzy's types and ours, from the .msg files of the ROS package."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for file in sorted(INTERFACES.glob("*.msg")):
+        store.register(get_types_from_msg(file.read_text(), f"msg_agents_interfaces/msg/{file.stem}"))
+    return store
 
 
 @pytest.fixture
@@ -26,6 +40,6 @@ def offer(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
             )
             for name, kind in offers
         ]
-        monkeypatch.setattr(protocols, "entry_points", lambda group: points)
+        monkeypatch.setattr(protocol_binding, "entry_points", lambda group: points)
 
     return have

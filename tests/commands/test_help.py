@@ -18,7 +18,7 @@ from programs import COMMANDS, PROGRAMS, command_of, context_of
 DOCS = Path(__file__).parents[2] / "docs"
 HEAVY = (
     *("numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich", "jinja2", "yaml", "mcap", "zstandard", "lz4"),
-    *("rclpy", "dask", "distributed", "pyarrow", "bokeh", "pandas", "msg_analysis.api", "msg_agents.runner"),
+    *("rclpy", "dask", "distributed", "pyarrow", "bokeh", "pandas", "msg_analysis.api", "msg_agents.running.runner"),
 )
 METAVARS = {  # of options that are called the same, wherever they are
     "--seed": {"N"},
@@ -127,7 +127,7 @@ def test_every_option_is_documented(program: str, name: str) -> None:
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_help_imports_nothing_heavy(program: str) -> None:
     """So every --help is there at once: docs/commands.md has the times."""
-    module = "msg_agents.cli" if program == "msg-agents" else "msg_analysis.cli"
+    module = "msg_agents.cli.main" if program == "msg-agents" else "msg_analysis.cli.main"
     code = (
         f"import sys\nfrom {module} import main\n"
         "for name in ['', *main.commands]:\n"

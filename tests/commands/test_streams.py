@@ -140,7 +140,7 @@ def test_devices_are_not_replaced_by_files(option: str, tmp_path: Path) -> None:
     """A file is written beside its place and moved there: /dev/null would be one ever after."""
     from click.testing import CliRunner
 
-    from msg_analysis.cli import main
+    from msg_analysis.cli.main import main
 
     Experiment.load(LINE_RING).simulate(duration=5).save(tmp_path / "bag")
     pipe = tmp_path / "pipe"

@@ -15,9 +15,9 @@ import yaml
 from click.testing import CliRunner
 from pages import EXPERIMENTS, PAGES, ROOT, Shown, blocks, console, experiments, missing, typed
 
-from msg_agents.cli import main as agents
-from msg_analysis.cli import main as analysis
-from msg_analysis.model.experiment import Experiment
+from msg_agents.cli.main import main as agents
+from msg_analysis.cli.main import main as analysis
+from msg_analysis.model.experiment.experiment import Experiment
 
 PROGRAMS: dict[str, click.Group] = {"msg-agents": agents, "msg-analysis": analysis}
 NEEDS_NETWORK = ("msg-agents check", "msg-analysis compare runs/loud")  # shown by tests/integration/test_docs.py
@@ -31,7 +31,7 @@ def name(page: Path) -> str:
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_experiments_are_valid(page: Path) -> None:
     for text in experiments(page).values():
-        if "protocol: {name: median" not in text:  # made by its reader; tests/analysis/test_protocols.py does so
+        if "protocol: {name: median" not in text:  # made by its reader; tests/analysis/model/test_protocols.py does so
             Experiment.parse(yaml.safe_load(text))
 
 
@@ -78,7 +78,11 @@ def test_files_and_targets_exist(page: Path) -> None:
     targets = {target for line in lines for target in re.findall(r"(?:^|\s)make ([a-z][a-z-]+)(?:\s|$)", line)}
     known = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     assert targets <= known
-    files = {file for line in lines for file in re.findall(r"(?:benchmarks|docker|tests)/[\w/.-]+\.(?:py|yaml)", line)}
+    files = {
+        file
+        for line in lines
+        for file in re.findall(r"(?<![\w/])(?:benchmarks|docker|tests)/[\w/.-]+\.(?:py|yaml)", line)
+    }
     assert [file for file in files if not (ROOT / file).exists()] == []
     for line in lines:
         if script := re.search(r"(benchmarks/\w+\.py)(.*)", line):

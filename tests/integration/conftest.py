@@ -27,14 +27,14 @@ import yaml
 
 pytest.importorskip("rclpy")
 
-from msg_agents.check import check
-from msg_agents.domain import free_domain
-from msg_agents.runner import RunResult, run_network
-from msg_agents.workshop import PREFIX
+from msg_agents.processes.ros_domain import free_domain
+from msg_agents.running.run_folder import PREFIX
+from msg_agents.running.runner import RunResult, run_network
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.store import write_trajectory
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.twin import simulate
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import simulate
 
 MARK = "MSG_AGENTS_TEST"
 PROGRAM = Path(sys.executable).with_name("msg-agents")

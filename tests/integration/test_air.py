@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.compare import compare
-from msg_analysis.twin import simulate
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import simulate
 
 GRID = [
     {"broadcast": broadcast, "link": link, "loss": loss}

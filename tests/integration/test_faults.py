@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
 
 PAUSE = 10.0  # s
 

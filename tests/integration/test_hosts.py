@@ -20,8 +20,8 @@ import pytest
 import yaml
 from processors import another_processor
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
 
 PREFIX = "msga"
 NAMES = ("base", "left", "right")

@@ -11,8 +11,8 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
 
 LONG = {"duration": 10_000, "replicas": 1, "processes": 2}  # 200,000 steps: no test waits for them
 

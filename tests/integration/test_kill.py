@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
 
 LONG = {"duration": 10_000, "replicas": 1, "processes": 2}
 

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.store import write_trajectory
-from msg_analysis.inference.compare import compare
-from msg_analysis.twin import simulate
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.twin.simulate import simulate
 
 LISTENER = """
 import json

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from processors import another_processor
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.twin import simulate
+from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import simulate
 
 LEADERS = {"agents": [1, 4], "reference": 2.0}
 CASES: dict[str, dict[str, Any]] = {

@@ -12,9 +12,9 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from msg_agents.domain import free_domain
-from msg_analysis.bags.store import write_trajectory
-from msg_analysis.twin import simulate
+from msg_agents.processes.ros_domain import free_domain
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.twin.simulate import simulate
 
 LISTENER = """
 import json

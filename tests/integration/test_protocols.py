@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import yaml
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.compare import compare
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.twin import simulate
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import simulate
 
 EXPERIMENTS = Path(__file__).parents[2] / "ros_ws/src/msg_agents_example_protocols/experiments"
 BROKEN = """

@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_agents.check import check
-from msg_agents.domain import free_domain
-from msg_agents.environment import node_environment
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.ros_domain import free_domain
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.compare import compare
-from msg_analysis.model.realtime import phases
-from msg_analysis.model.trajectory import Trajectory
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.phases import phases
+from msg_analysis.twin.check import check
 
 # 100 steps a second for 4 s.
 REALTIME = {"pace": "realtime", "speed": 5, "dt": 0.05, "duration": 20}

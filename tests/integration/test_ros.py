@@ -16,10 +16,10 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
-from msg_agents.check import check
-from msg_agents.domain import free_domain
-from msg_agents.launching import NETWORK_ARGUMENTS, LaunchedNetwork, environment
+from msg_agents.processes.ros_domain import free_domain
+from msg_agents.running.launch_support import NETWORK_ARGUMENTS, LaunchedNetwork, environment
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
 
 BIN = Path(sys.executable).parent
 ROOT = Path(__file__).parents[2]

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from msg_agents.check import check
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
 
 
 def grid(rows: int, columns: int) -> dict[str, Any]:

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from msg_agents.check import check
-from msg_agents.domain import free_domain
+from msg_agents.processes.ros_domain import free_domain
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
 
 
 @pytest.fixture

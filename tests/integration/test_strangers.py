@@ -17,19 +17,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_agents.check import check
-from msg_agents.domain import free_domain
-from msg_agents.environment import node_environment
-from msg_agents.network import ProcessPlan, plan_network
-from msg_agents.supervisor import Supervisor
-from msg_analysis.bags.cdr import ActiveGraph, AgentState, Progress, encode_string
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.process_plan import ProcessPlan, plan_network
+from msg_agents.processes.ros_domain import free_domain
+from msg_agents.running.supervisor import Supervisor
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.compare import compare
-from msg_analysis.model.path import sojourns
-from msg_analysis.model.record import RunRecord
-from msg_analysis.model.step import build_step_model
-from msg_analysis.model.trajectory import Trajectory
-from msg_analysis.twin import new_record
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.run.graph_path import sojourns
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.step_model import build_step_model
+from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import new_record
+from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, encode_string
 
 STEPS = 300
 # Waits for every reader of the run, publishes everything, waits until they have it, and only then appears as the node
@@ -41,7 +41,7 @@ import rclpy
 from rclpy.duration import Duration
 from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress
 from std_msgs.msg import String
-from msg_agents.qos import LATCHED, STREAM
+from msg_agents.nodes.ros.qos import LATCHED, STREAM
 
 AGENTS, PROCESSES = 5, 2
 rclpy.init()
@@ -257,9 +257,9 @@ import numpy as np
 import rclpy
 from rclpy.qos import qos_profile_sensor_data
 from msg_agents_interfaces.msg import ActiveGraph as GraphMsg, AgentState as StateMsg, Progress as ProgressMsg
-from msg_agents.qos import LATCHED, STREAM
-from msg_analysis.bags.cdr import ActiveGraph, AgentState, Progress, StateFrame
-from msg_analysis.model.record import RunRecord
+from msg_agents.nodes.ros.qos import LATCHED, STREAM
+from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, StateFrame
+from msg_analysis.model.run.record import RunRecord
 
 record = RunRecord.from_json(Path(sys.argv[1]).read_text(), "run.json")
 rng = random.Random(sys.argv[2])

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 import yaml
 
-from msg_analysis.inference.compare import compare
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.report import emulation
-from msg_analysis.twin import simulate
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.paper import emulation
+from msg_analysis.twin.simulate import simulate
 
 BIN = Path(sys.executable).parent
 
@@ -103,7 +103,7 @@ def test_networks_interrupted_and_resumed(network: Any) -> None:
     path = sweep_file(network, kind="network", over=over, combine="zip")
     process = start(path, "--workers", "2", "--out", out, "--json")
     network.wait_for(lambda: lines(out / "points.jsonl") == 1, 100, "the shorter run")
-    process.terminate()  # as a queue of a cluster does; Ctrl-C: tests/analysis/sweep/test_cli_sweep.py
+    process.terminate()  # as a queue of a cluster does; Ctrl-C: tests/analysis/cli/test_sweep.py
     stdout, stderr = process.communicate(timeout=100)
     assert process.returncode == 128 + signal.SIGTERM, stderr
     assert stdout == ""
@@ -138,9 +138,9 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
     ]
     figures = network.directory / "figures"
     code = [
-        "from msg_analysis.cli import main",
-        "from msg_analysis.report import emulation",
-        "from msg_analysis.report.emulation import Run",
+        "from msg_analysis.cli.main import main",
+        "from msg_analysis.paper import emulation",
+        "from msg_analysis.paper.emulation import Run",
         f"emulation.runs_of = lambda number: [run for run in {runs} if run.example == number]",
         "if __name__ == '__main__':",
         f"    main(['figures', '--emulate', '--format', 'svg', '--out', {str(figures)!r}])",

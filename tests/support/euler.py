@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.protocol import Heard, LinearProtocol, Protocol
 from msg_analysis.types import FloatArray
 

@@ -20,14 +20,14 @@ from typing import Any
 import matplotlib
 import scipy.stats  # noqa: F401
 
-import msg_agents.check
-import msg_agents.cli
+import msg_agents.cli.main
 import msg_analysis.api
-import msg_analysis.cli
-import msg_analysis.report.paper_figures
-import msg_analysis.report.text
+import msg_analysis.cli.main
+import msg_analysis.paper.figures
+import msg_analysis.report.terminal.result_text
+import msg_analysis.twin.check
 
-PROGRAMS = {"msg-analysis": msg_analysis.cli.main, "msg-agents": msg_agents.cli.main}
+PROGRAMS = {"msg-analysis": msg_analysis.cli.main.main, "msg-agents": msg_agents.cli.main.main}
 
 
 def child(program: str, arguments: list[str], kind: str, stdout: int, stderr: int) -> int:

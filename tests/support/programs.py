@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
-from msg_agents.cli import main as agents
-from msg_analysis.cli import main as analysis
+from msg_agents.cli.main import main as agents
+from msg_analysis.cli.main import main as analysis
 
 PROGRAMS: dict[str, click.Group] = {"msg-analysis": analysis, "msg-agents": agents}
 COMMANDS = [(program, name) for program, group in PROGRAMS.items() for name in group.commands]

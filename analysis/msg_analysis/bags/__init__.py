@@ -1,4 +1,4 @@
-"""Bags of the network: CDR bytes, MCAP files, and the trajectories in them.
+"""Bags of the network: reading, writing, salvage, and the trajectories in them. No ROS.
 
-No ROS; of this package only ``model`` and the modules beside it (``errors``, ``types``) are imported.
+Message bytes belong to ``wire``, the format of the files to ``bags.format``. May import both, and model.
 """

@@ -20,7 +20,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 
-from msg_analysis.bags.mcapfile import MAGIC, McapFile
+from msg_analysis.bags.format.mcap_file import MAGIC, McapFile
 from msg_analysis.bags.reader import bag_files
 from msg_analysis.errors import BagError
 

@@ -13,18 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_analysis.bags.cdr import ActiveGraph, decode_string
-from msg_analysis.bags.cdr_stream import CdrError
-from msg_analysis.bags.collected import Collector
-from msg_analysis.bags.inventory import Inventory
-from msg_analysis.bags.mcapfile import Batch, McapFile
-from msg_analysis.bags.metadata import METADATA_FILE, read_metadata
-from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
+from msg_analysis.bags.format.inventory import Inventory
+from msg_analysis.bags.format.mcap_file import Batch, McapFile
+from msg_analysis.bags.format.metadata import METADATA_FILE, read_metadata
+from msg_analysis.bags.trajectory_builder import Collector
 from msg_analysis.bags.writer import RECORD_NAME, recording_pid
 from msg_analysis.errors import BagError, InputError
-from msg_analysis.model.record import RunRecord
-from msg_analysis.model.trajectory import Completeness, Trajectory
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.types import IntArray
+from msg_analysis.wire.cdr_fields import CdrError
+from msg_analysis.wire.messages import ActiveGraph, decode_string
+from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
 
 # Topics are recognised by type and by the end of their name: the network may run in any namespace.
 _STATE, _TRUTH, _GRAPH, _EXPERIMENT = "state", "truth", "graph", "experiment"

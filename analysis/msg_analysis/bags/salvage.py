@@ -16,9 +16,9 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from msg_analysis.bags.inventory import FileInventory, channel_count
-from msg_analysis.bags.mcapfile import Batch, McapFile
-from msg_analysis.bags.metadata import METADATA_FILE, FileCount, bag_information, dump, write_metadata
+from msg_analysis.bags.format.inventory import FileInventory, channel_count
+from msg_analysis.bags.format.mcap_file import Batch, McapFile
+from msg_analysis.bags.format.metadata import METADATA_FILE, FileCount, bag_information, dump, write_metadata
 from msg_analysis.bags.reader import bag_files
 from msg_analysis.bags.writer import CHUNK_SIZE, RECORD_NAME, RECORDING_MARKER, ROSBAG2_RECORD, recording_pid
 from msg_analysis.errors import BagError

@@ -16,10 +16,10 @@ from typing import BinaryIO, Self
 
 from mcap.writer import CompressionType, Writer
 
-from msg_analysis.bags.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
-from msg_analysis.bags.schemas import Topic
-from msg_analysis.bags.storage import DEFAULT, Compression, Storage
+from msg_analysis.bags.format.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
+from msg_analysis.bags.format.storage_options import DEFAULT, Compression, Storage
 from msg_analysis.errors import BagError
+from msg_analysis.wire.schemas import Topic
 
 # As in rosbag2: small enough that a killed recorder loses little, large enough that the readers' work per chunk does
 # not matter. With a third of it, reading takes a fifth longer.

@@ -1,4 +1,4 @@
-"""The experiment and one step of it: file, graphs, chain, noise, update law, run record and trajectory.
+"""What an experiment is, and what one step and one run of it are.
 
-This folder imports no other folder of msg_analysis; all others may import it.
+No predictions, files of runs or statistics. The folders, lowest first: network, arithmetic, experiment, step, run.
 """

@@ -1,4 +1,4 @@
-"""Sweeps: one experiment at many values of its keys, on the processors of this machine or of a cluster.
+"""Sweeps: one experiment at many values of its keys; the sweep file, the plan, the results.
 
-No ROS: networks run as processes of their own.
+What a worker does belongs to ``sweep.jobs``. May import sweep.jobs, inference and what is below it.
 """

@@ -14,11 +14,12 @@ from typing import Any, Literal
 import numpy as np
 
 from msg_analysis.errors import InputError
-from msg_analysis.inference.multiplicity import holm
-from msg_analysis.sweep.point import DONE, FAILED, Job, NetworkOptions, Outcome, evaluate
-from msg_analysis.sweep.software import installed
-from msg_analysis.sweep.store import Store
-from msg_analysis.sweep.workers import Lost, Workers
+from msg_analysis.inference.statistics.holm import holm
+from msg_analysis.sweep.jobs.evaluate import evaluate
+from msg_analysis.sweep.jobs.job import DONE, FAILED, Job, NetworkOptions, Outcome
+from msg_analysis.sweep.jobs.software import installed
+from msg_analysis.sweep.jobs.workers import Lost, Workers
+from msg_analysis.sweep.outcome_store import Store
 
 OtherSoftware = Literal["refuse", "redo", "keep"]
 NETWORK_PATIENCE = 60.0  # s that running networks have to end in order

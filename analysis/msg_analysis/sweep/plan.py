@@ -15,12 +15,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from msg_analysis.model.document import read_yaml
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.problems import ExperimentError, problem, show, translate
-from msg_analysis.sweep.keys import KeyProblemError, put
-from msg_analysis.sweep.point import Job
-from msg_analysis.sweep.spec import MOST_POINTS, Kind, SweepSpec
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.problems import ExperimentError, problem, show, translate
+from msg_analysis.model.experiment.yaml_document import read_yaml
+from msg_analysis.sweep.dotted_keys import KeyProblemError, put
+from msg_analysis.sweep.jobs.job import Job, Kind
+from msg_analysis.sweep.sweep_file import MOST_POINTS, SweepSpec
 
 SEED = "run.seed"
 _NAMED = 3  # points that a problem names

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msg_analysis.files import write_whole
+from msg_analysis.common.files import write_whole
 from msg_analysis.sweep.conduct import Judgement
+from msg_analysis.sweep.jobs.job import Outcome
 from msg_analysis.sweep.plan import Sweep
-from msg_analysis.sweep.point import Outcome
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -1,4 +1,4 @@
-"""Second moments of jump linear systems: reduced systems, equations and solvers, predictions, transients, leaders.
+"""Predictions of second moments: steady states, transients, settling, indices.
 
-Imports ``model`` and the small modules of ``msg_analysis`` (errors, types, markdown), never bags, inference or reports.
+Nothing measured belongs here. May import model; of its own folders, system and solvers are below, leaders above.
 """

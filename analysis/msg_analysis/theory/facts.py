@@ -13,11 +13,11 @@ import numpy as np
 import scipy.linalg
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.step import build_step_model
+from msg_analysis.model.step.step_model import build_step_model
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import Experiment
 
 MAX_UNKNOWNS = 1500  # largest n m^2: all eigenvalues of a matrix of this size take a few seconds
 

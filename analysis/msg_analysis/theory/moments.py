@@ -11,11 +11,11 @@ from typing import Literal
 import numpy as np
 
 from msg_analysis.errors import InputError
-from msg_analysis.theory import symmetric
-from msg_analysis.theory.dense import DenseSolver
-from msg_analysis.theory.iterative import IterativeSolver
-from msg_analysis.theory.report import MAX_RELATIVE_ERROR, SolverReport
-from msg_analysis.theory.system import JumpSystem
+from msg_analysis.theory.solvers.dense import DenseSolver
+from msg_analysis.theory.solvers.iterative import IterativeSolver
+from msg_analysis.theory.solvers.solver_report import MAX_RELATIVE_ERROR, SolverReport
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
 MAX_FALLBACK = 1000  # unknowns up to which equations that do not converge are solved densely
@@ -52,7 +52,7 @@ class MomentSolver:
         guess: FloatArray | None = None,
     ) -> None:
         self._system = system
-        unknowns = system.modes * symmetric.size(system.dimension)
+        unknowns = system.modes * packed_symmetric.size(system.dimension)
         self._dense_too = method == "auto" and 0 < unknowns <= MAX_FALLBACK
         if guess is not None and guess.shape != system.matrices.shape:
             raise InputError(

@@ -14,18 +14,18 @@ import networkx as nx
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from msg_analysis.common.markdown import markdown_table, number_text
 from msg_analysis.errors import InputError
-from msg_analysis.markdown import markdown_table, number_text
-from msg_analysis.model.sequential import StepLaw, build_run_model, step_law
-from msg_analysis.model.step import StepModel, build_step_model
-from msg_analysis.theory import system as systems
+from msg_analysis.model.step.sequential_law import StepLaw, build_run_model, step_law
+from msg_analysis.model.step.step_model import StepModel, build_step_model
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.report import SolverReport
-from msg_analysis.theory.system import JumpSystem
+from msg_analysis.theory.solvers.solver_report import SolverReport
+from msg_analysis.theory.system import jump_system as systems
+from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import Experiment
 
 
 ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding

@@ -12,12 +12,12 @@ import scipy.optimize
 import scipy.sparse.linalg
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.chain import Time
-from msg_analysis.theory import symmetric
-from msg_analysis.theory.operators import homogeneous_propagator, mean_propagator
-from msg_analysis.theory.propagator import Flow, Power
-from msg_analysis.theory.rational import RationalFlow, slowest_rate
-from msg_analysis.theory.system import JumpSystem
+from msg_analysis.model.network.markov_chain import Time
+from msg_analysis.theory.solvers.moment_operators import homogeneous_propagator, mean_propagator
+from msg_analysis.theory.solvers.propagator import Flow, Power
+from msg_analysis.theory.solvers.rational_krylov import RationalFlow, slowest_rate
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.theory.transient import (
     MAX_UNKNOWNS,
     Snapshot,
@@ -83,7 +83,7 @@ class _Judge:
         self, system: JumpSystem, steady: FloatArray, weights: FloatArray, allowed: float, fraction: float
     ) -> None:
         self._d = system.dimension
-        self._form = symmetric.pack(weights)
+        self._form = packed_symmetric.pack(weights)
         self._stationary, self._allowed, self._fraction = system.stationary, allowed, fraction
         values, vectors = np.linalg.eigh(steady)
         # Directions that noise hardly reaches would never pass the test; they get the size of rounding.
@@ -100,7 +100,7 @@ class _Judge:
 
     def settled(self, joint: FloatArray) -> bool:
         """Whether it can never be outside again."""
-        moments = symmetric.unpack(joint[:, :-1], self._d)
+        moments = packed_symmetric.unpack(joint[:, :-1], self._d)
         scaled = self._scale.transpose(0, 2, 1) @ moments @ self._scale
         size = np.abs(np.linalg.eigvalsh(scaled)).max(initial=0.0)
         law = np.abs(joint[:, -1] / self._stationary).max()
@@ -188,13 +188,13 @@ def asymptotic_rates(system: JumpSystem, steady: FloatArray) -> Rates:
 
 def _by_arnoldi(system: JumpSystem) -> float | None:
     def step(packed: FloatArray) -> FloatArray:
-        moments = symmetric.unpack(packed.reshape(system.modes, -1), system.dimension)
+        moments = packed_symmetric.unpack(packed.reshape(system.modes, -1), system.dimension)
         after = np.tensordot(system.chain, system.propagate(moments), axes=(0, 0))
-        return symmetric.pack(after).ravel()
+        return packed_symmetric.pack(after).ravel()
 
     size = unknowns(system) - system.modes
     operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=step, dtype=float)
-    start = symmetric.pack(np.broadcast_to(np.eye(system.dimension), system.matrices.shape)).ravel()
+    start = packed_symmetric.pack(np.broadcast_to(np.eye(system.dimension), system.matrices.shape)).ravel()
     try:
         values = scipy.sparse.linalg.eigs(operator, k=1, v0=start, tol=1e-9, maxiter=1000, return_eigenvectors=False)
     except scipy.sparse.linalg.ArpackNoConvergence:

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from msg_analysis.errors import InputError
-from msg_analysis.theory import symmetric
-from msg_analysis.theory.operators import mean_propagator, second_moment_propagator
-from msg_analysis.theory.propagator import Flow
-from msg_analysis.theory.rational import RationalFlow, slowest_rate
-from msg_analysis.theory.system import JumpSystem
+from msg_analysis.theory.solvers.moment_operators import mean_propagator, second_moment_propagator
+from msg_analysis.theory.solvers.propagator import Flow
+from msg_analysis.theory.solvers.rational_krylov import RationalFlow, slowest_rate
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import Experiment
 
 MAX_UNKNOWNS = 300  # largest n p + n, with p = d (d + 1) / 2, whose matrix is propagated as a whole
 MAX_BYTES = 2e9  # largest result
@@ -168,7 +168,7 @@ def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Fl
 
 def unknowns(system: JumpSystem) -> int:
     """Size n p + n of the joint equations of second moments and graph law."""
-    return system.modes * (symmetric.size(system.dimension) + 1)
+    return system.modes * (packed_symmetric.size(system.dimension) + 1)
 
 
 def joint_flow(system: JumpSystem, stack: FloatArray, slow: Callable[[], float], *, decays: bool) -> Flow:
@@ -200,7 +200,7 @@ def _powered(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Flo
     if steady is None:
         packed, laws = course(start, times, decays=False)
     else:
-        limit = symmetric.pack(steady)
+        limit = packed_symmetric.pack(steady)
         away, laws = course(distance(system, start, steady), times, decays=True)
         packed, laws = limit + away, laws + system.stationary
         # The distance is exact for long times. For short ones it may cancel with the limit; what has grown does not.
@@ -210,7 +210,7 @@ def _powered(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Flo
             grown, _ = course(start, times[early], decays=False)
             better = np.linalg.norm(grown, axis=(1, 2)) < left[early]
             packed[early[better]] = grown[better]
-    return Transient(system, times, laws, means, symmetric.unpack(packed, system.dimension))
+    return Transient(system, times, laws, means, packed_symmetric.unpack(packed, system.dimension))
 
 
 def distance(system: JumpSystem, snapshot: Snapshot, steady: FloatArray) -> Snapshot:
@@ -220,7 +220,7 @@ def distance(system: JumpSystem, snapshot: Snapshot, steady: FloatArray) -> Snap
 
 def joint_stack(snapshot: Snapshot) -> FloatArray:
     """(n, p + 1) packed second moments and probability of every mode."""
-    return np.concatenate([symmetric.pack(snapshot.moments), snapshot.law[:, None]], axis=1)
+    return np.concatenate([packed_symmetric.pack(snapshot.moments), snapshot.law[:, None]], axis=1)
 
 
 def advance(system: JumpSystem, snapshot: Snapshot) -> Snapshot:

@@ -13,9 +13,9 @@ import numpy as np
 import scipy.linalg
 
 from msg_analysis.errors import InputError
-from msg_analysis.theory import symmetric
-from msg_analysis.theory.operators import mode_operators
-from msg_analysis.theory.system import JumpSystem
+from msg_analysis.theory.solvers.moment_operators import mode_operators
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
 MAX_UNKNOWNS = 2000  # largest p = d (d + 1) / 2 for which the p x p matrices are built: about 60 agents
@@ -78,7 +78,7 @@ def two_topology(system: JumpSystem) -> TwoTopology:
     """
     if system.modes != 2:
         raise InputError(f"two-topology form: {system.modes} graphs, expected 2: use predict")
-    p = symmetric.size(system.dimension)
+    p = packed_symmetric.size(system.dimension)
     if p > MAX_UNKNOWNS:
         raise InputError(
             f"two-topology form: {len(system.output)} agents give {p} x {p} matrices, expected at most "
@@ -90,8 +90,8 @@ def two_topology(system: JumpSystem) -> TwoTopology:
     step = one - two
     weight_1, weight_2 = system.stationary
     rate = float(system.chain[0, 1] + system.chain[1, 0])
-    noise = symmetric.pack(system.noise)
-    forms = symmetric.pack(system.output[:, :, None] * system.output[:, None, :])
+    noise = packed_symmetric.pack(system.noise)
+    forms = packed_symmetric.pack(system.output[:, :, None] * system.output[:, None, :])
 
     held_2 = scipy.linalg.lu_solve(second, noise[1])
     held_1 = scipy.linalg.lu_solve(first, noise[0])

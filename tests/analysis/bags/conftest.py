@@ -1,31 +1,16 @@
-"""A small run, and rosbags as the independent judge of bytes and bags."""
+"""A small run."""
 
 from __future__ import annotations
 
 import uuid
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.record import RunRecord
-from msg_analysis.model.trajectory import Completeness, Trajectory
-
-ROOT = Path(__file__).parents[3]
-INTERFACES = ROOT / "ros_ws" / "src" / "msg_agents_interfaces" / "msg"
-
-
-@pytest.fixture(scope="session")
-def typestore() -> Any:
-    """Jazzy's types and ours, from the .msg files of the ROS package."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for file in sorted(INTERFACES.glob("*.msg")):
-        store.register(get_types_from_msg(file.read_text(), f"msg_agents_interfaces/msg/{file.stem}"))
-    return store
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Completeness, Trajectory
 
 
 @pytest.fixture

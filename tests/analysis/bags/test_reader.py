@@ -16,12 +16,12 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
-from msg_analysis.bags.cdr import ActiveGraph, AgentState, encode_string
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
 from msg_analysis.errors import BagError, InputError
-from msg_analysis.model.step import build_model
-from msg_analysis.model.trajectory import Trajectory
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.step_model import build_model
+from msg_analysis.wire.messages import ActiveGraph, AgentState, encode_string
+from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
 
 Message = tuple[str, str, bytes, int]  # topic, type, data, time
 MakeRun = Callable[..., Trajectory]

@@ -25,16 +25,16 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from msg_analysis.bags import chunks
-from msg_analysis.bags.cdr import ActiveGraph, AgentState, encode_string
-from msg_analysis.bags.cdr_stream import CdrError
-from msg_analysis.bags.chunks import DamageError, locate, unpack
+from msg_analysis.bags.format import mcap_chunks
+from msg_analysis.bags.format.mcap_chunks import DamageError, locate, unpack
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.schemas import AGENT_STATE, STRING
-from msg_analysis.bags.store import write_trajectory
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.record import RunRecord
-from msg_analysis.model.trajectory import Trajectory
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.wire.cdr_fields import CdrError
+from msg_analysis.wire.messages import ActiveGraph, AgentState, encode_string
+from msg_analysis.wire.schemas import AGENT_STATE, STRING
 
 STEPS, AGENTS, WIDTH, LOST = 5, 3, 2, 2**64 - 1
 NEIGHBOURS = ([0, 0, 0], [1, 2, 1], [2, 1, 1])  # how many: no graph, line, star
@@ -260,7 +260,7 @@ def test_unpack() -> None:
 
 
 def test_chunks_that_claim_too_much_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(chunks, "LIMIT", 10**6)
+    monkeypatch.setattr(mcap_chunks, "LIMIT", 10**6)
     bomb = bytes(10**7)
     with pytest.raises(DamageError):
         unpack(_chunk(bomb, b"zstd", zstandard.ZstdCompressor().compress(bomb), size=9), zstandard.ZstdDecompressor())

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from msg_analysis.inference.compare import compare
-from msg_analysis.inference.rates import find_rates
-from msg_analysis.inference.selection import Candidate, select
-from msg_analysis.model.chain import MarkovChain
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.record import RunRecord
-from msg_analysis.twin import new_record, simulate
+from msg_analysis.inference.blame.switching_rates import find_rates
+from msg_analysis.inference.statistics.forward_selection import Candidate, select
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.network.markov_chain import MarkovChain
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.twin.simulate import new_record, simulate
 
 PAIRS = {"line": [(1, 2), (2, 3), (3, 4)], "ring": [(1, 2), (2, 3), (3, 4), (4, 1)]}
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.inference.compare import compare
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.record import RunRecord
-from msg_analysis.model.trajectory import Completeness, Trajectory
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.theory.prediction import predict
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
 SEEDS = range(100, 140)
@@ -207,7 +207,7 @@ def test_document(short_run):
 
 def test_many_agents_get_no_joint_test_but_all_numbers(short_run, monkeypatch):
     all_ = compare(short_run)
-    monkeypatch.setattr("msg_analysis.inference.martingale.MAX_JOINT", 5)
+    monkeypatch.setattr("msg_analysis.inference.errors.time_means.MAX_JOINT", 5)
     few = compare(short_run)
     assert (few.covariance.chi2, few.covariance.dof, few.covariance.p) == (None, None, None)
     assert "too many agents" in few.covariance.note

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from msg_analysis.inference import given_path as module
-from msg_analysis.inference.given_path import given_path
-from msg_analysis.inference.martingale import time_means
-from msg_analysis.inference.observation import Observation
-from msg_analysis.model.experiment import Experiment
+from msg_analysis.inference.errors import given_path as module
+from msg_analysis.inference.errors.given_path import given_path
+from msg_analysis.inference.errors.time_means import time_means
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.theory.prediction import predict
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 
 BASE = {
     "name": "tiny",

@@ -5,13 +5,13 @@ import pytest
 import scipy.linalg
 from scipy import stats
 
-from msg_analysis.inference import innovations as module
-from msg_analysis.inference.innovations import innovation_tests, innovations, quadratic_form
-from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.regression import regressors
-from msg_analysis.model.experiment import Experiment
+from msg_analysis.inference.hypothesis_tests import innovations as module
+from msg_analysis.inference.hypothesis_tests.gain_regression import regressors
+from msg_analysis.inference.hypothesis_tests.innovations import innovation_tests, innovations, quadratic_form
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.theory.prediction import predict
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 
 
 def observe(**changes):
@@ -104,7 +104,7 @@ def test_gain_is_the_score_test_written_out(observation):
 
 def test_blocks_change_nothing(observation, monkeypatch):
     whole = innovation_tests(observation)
-    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 40)
+    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 40)
     split = innovation_tests(observation)
     assert split.p_covariance == pytest.approx(whole.p_covariance, rel=1e-9)
     assert split.p_whiteness == pytest.approx(whole.p_whiteness, rel=1e-9)

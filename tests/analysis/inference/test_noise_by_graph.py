@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.inference.compare import compare
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.twin import simulate
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.simulate import simulate
 
 SEEDS = range(40)
 SHARED = [[1.0, 0.5, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.0]]

@@ -8,16 +8,16 @@ import pytest
 from scipy import stats
 
 from msg_analysis.errors import InputError
-from msg_analysis.inference.compare import compare
-from msg_analysis.inference.evidence import Evidence
-from msg_analysis.inference.innovations import innovations, quadratic_form
-from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.inference.switching import Transitions
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.trajectory import Completeness
+from msg_analysis.inference.hypothesis_tests.innovations import innovations, quadratic_form
+from msg_analysis.inference.hypothesis_tests.switching import Transitions
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.inference.verdict.evidence import Evidence
+from msg_analysis.inference.verdict.pool import compare_pooled
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.trajectory import Completeness
 from msg_analysis.theory.prediction import predict
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 
 DOCUMENT = {
     "name": "tiny",

@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from msg_analysis.common.number_words import percent
 from msg_analysis.errors import InputError
-from msg_analysis.inference.compare import compare
-from msg_analysis.inference.events import order_events
-from msg_analysis.inference.heard_regression import HeardRegression
-from msg_analysis.inference.innovations import innovation_tests, innovations
-from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.reception import Reception, process_noise
-from msg_analysis.inference.timing import measure_timing
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.realtime import phases
-from msg_analysis.model.streams import STEPS_PER_BLOCK, Stream, normals
-from msg_analysis.model.trajectory import Completeness
-from msg_analysis.model.words import percent
+from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
+from msg_analysis.inference.hypothesis_tests.innovations import innovation_tests, innovations
+from msg_analysis.inference.observed.heard_values import Reception, process_noise
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.realtime.event_order import order_events
+from msg_analysis.inference.realtime.timing import measure_timing
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.trajectory import Completeness
+from msg_analysis.model.step.phases import phases
 from msg_analysis.theory.prediction import predict
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 
 CORRELATED = [[1.0, 0.3, 0.0], [0.0, 0.5, 0.2], [0.0, 0.0, 2.0]]
 

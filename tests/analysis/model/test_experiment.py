@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError, NotAvailableError
-from msg_analysis.model.experiment import Experiment, ExperimentError, json_schema
-from msg_analysis.model.spec import ExperimentSpec
+from msg_analysis.model.experiment.experiment import Experiment, ExperimentError, json_schema
+from msg_analysis.model.experiment.spec import ExperimentSpec
 from msg_analysis.types import FloatArray
 
 ROOT = Path(__file__).parents[3]

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from msg_analysis.model import memory
-from msg_analysis.model.experiment import Experiment, ExperimentError
+from msg_analysis.model.experiment import memory
+from msg_analysis.model.experiment.experiment import Experiment, ExperimentError
 
 GOOD: dict[str, Any] = {
     "name": "good",

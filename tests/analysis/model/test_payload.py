@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_analysis.model import payload
+from msg_analysis.model.arithmetic import payload
 
 DOUBLES = st.floats(width=64)
 SHAPES = st.tuples(st.integers(1, 5), st.integers(1, 20))

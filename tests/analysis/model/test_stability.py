@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from msg_analysis.model import validation
-from msg_analysis.model.graphs import Graph
+from msg_analysis.model.experiment import validation
+from msg_analysis.model.network.graphs import Graph
 from msg_analysis.types import FloatArray
 
 

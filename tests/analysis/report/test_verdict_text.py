@@ -4,7 +4,7 @@ import io
 
 from rich.console import Console
 
-from msg_analysis.report.verdict_text import order_statements, print_bags, print_blame, sentence
+from msg_analysis.report.terminal.verdict_text import order_statements, print_bags, print_blame, sentence
 
 NAMES = ["agent 1", "agent 2", "agent 3"]
 

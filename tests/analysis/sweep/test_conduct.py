@@ -13,12 +13,13 @@ import pytest
 from msg_analysis.errors import InputError
 from msg_analysis.sweep import conduct as conducting
 from msg_analysis.sweep.conduct import conduct, judge
-from msg_analysis.sweep.point import DONE, FAILED, Job, Outcome, evaluate
-from msg_analysis.sweep.series import picture
-from msg_analysis.sweep.store import Store
+from msg_analysis.sweep.figure_series import picture
+from msg_analysis.sweep.jobs.evaluate import evaluate
+from msg_analysis.sweep.jobs.job import DONE, FAILED, Job, Outcome
+from msg_analysis.sweep.jobs.workers import Lost, Workers
+from msg_analysis.sweep.outcome_store import Store
 from msg_analysis.sweep.table import arrow_table, rows_of
-from msg_analysis.sweep.workers import Lost, Workers
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 
 
 def document(rate: float = 1.0, **run: Any) -> dict[str, Any]:
@@ -70,7 +71,7 @@ def test_predictions_are_those_of_the_paper() -> None:
 
 def test_simulated_runs_are_those_of_the_twin() -> None:
     """Mean square of the disagreement, by numpy."""
-    from msg_analysis.model.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import Experiment
 
     what = document(seed=5)
     outcome = evaluate(Job.of("simulate", what))

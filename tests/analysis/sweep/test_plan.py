@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.sweep.keys import KeyProblemError, put
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.sweep.dotted_keys import KeyProblemError, put
 from msg_analysis.sweep.plan import Sweep, load_sweep, own_seed
-from msg_analysis.sweep.spec import json_schema
+from msg_analysis.sweep.sweep_file import json_schema
 
 EXPERIMENT: dict[str, Any] = {
     "name": "two",

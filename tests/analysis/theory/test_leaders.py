@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.theory.leaders import (
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.theory.leaders.selection import (
     LeaderProblem,
     joint_robustness_centrality,
     resolve_law,
@@ -234,7 +234,7 @@ def test_lazy_is_plain_and_the_bound_holds(seed: int, directed: bool, method: st
     class Plain(LeaderProblem):
         supermodular = False  # type: ignore[assignment]
 
-    from msg_analysis.theory.leader_search import LeaderSearch
+    from msg_analysis.theory.leaders.search import LeaderSearch
 
     search = LeaderSearch(Plain(experiment, "continuous"))
     order = search.greedy(3) if method == "greedy" else search.swap(3)

@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.chain import stationary_law
-from msg_analysis.theory import dense
+from msg_analysis.model.network.markov_chain import stationary_law
 from msg_analysis.theory.moments import MomentSolver, mode_potential, transient_mean
-from msg_analysis.theory.system import JumpSystem, held
+from msg_analysis.theory.solvers import dense
+from msg_analysis.theory.system.jump_system import JumpSystem, held
 
 MODELS = settings(max_examples=25, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from msg_analysis.model.chain import stationary_law
+from msg_analysis.model.network.markov_chain import stationary_law
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.system import JumpSystem
+from msg_analysis.theory.system.jump_system import JumpSystem
 
 RATES = [1e-8, 1e-4, 1.0, 1e3, 1e6]
 GAINS = [1e-3, 1.0, 1e3, 1e6]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.theory.prediction import predict, stationary_start_factor
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
@@ -116,7 +116,7 @@ def test_grounded_leaders_are_the_limit_of_large_gains():
     grounded = experiment(problem="tracking", leaders=leaders | {"gain": float("inf")}, noise=noise)
     # Only the continuous law has the limit (no step is short enough for the gain).
     from msg_analysis.theory.moments import MomentSolver
-    from msg_analysis.theory.system import JumpSystem
+    from msg_analysis.theory.system.jump_system import JumpSystem
 
     gain = np.diag([0.0, 1e8, 0.0, 0.0, 1e8])
     z = np.stack([graph.laplacian for graph in grounded.graph_list]) + gain

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.model.path import past_modes
-from msg_analysis.model.realtime import phases
-from msg_analysis.model.sequential import build_run_model, ideal_uses, sequential
-from msg_analysis.model.step import build_step_model
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.graph_path import past_modes
+from msg_analysis.model.step.phases import phases
+from msg_analysis.model.step.sequential_law import build_run_model, ideal_uses, sequential
+from msg_analysis.model.step.step_model import build_step_model
 from msg_analysis.theory.prediction import predict
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 
 CORRELATED = [[1.0, 0.3, 0.0, 0.0], [0.0, 0.5, 0.2, 0.0], [0.0, 0.0, 2.0, 0.0], [0.1, 0.0, 0.0, 0.7]]
 GRAPHS = {"a": {"path": [1, 2, 3, 4]}, "b": {"arcs": [[1, 2], [2, 3, 2.0], [3, 1], [1, 3], [3, 4], [4, 1]]}}

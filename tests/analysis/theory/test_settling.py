@@ -7,11 +7,11 @@ import pytest
 import scipy.linalg
 from switching_systems import LINE_RING, network, steady_of
 
-from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.theory import settling, transient
-from msg_analysis.theory import system as systems
 from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
+from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.transient import point_start, start_of
 
 

@@ -12,14 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.chain import stationary_law
-from msg_analysis.theory import equations, moments
-from msg_analysis.theory.averaged import AveragedEquations
-from msg_analysis.theory.equations import CoupledEquations
-from msg_analysis.theory.krylov import plain_conjugate_gradients
-from msg_analysis.theory.local import LocalSolves
+from msg_analysis.model.network.markov_chain import stationary_law
+from msg_analysis.theory import moments
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.system import JumpSystem, held
+from msg_analysis.theory.solvers import coupled_equations
+from msg_analysis.theory.solvers.averaged_equations import AveragedEquations
+from msg_analysis.theory.solvers.coupled_equations import CoupledEquations
+from msg_analysis.theory.solvers.krylov import plain_conjugate_gradients
+from msg_analysis.theory.solvers.lyapunov import LocalSolves
+from msg_analysis.theory.system.jump_system import JumpSystem, held
 
 MODELS = settings(max_examples=30, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
@@ -125,7 +126,7 @@ def test_large_systems_in_single_precision_are_as_accurate(rate, dt, reversible,
     model = system(random, 90, generator(random, 3, rate, reversible=reversible), dt=dt)
     solver = MomentSolver(model)
     measured, dual = solver.steady(), solver.dual(np.eye(89)[None])
-    monkeypatch.setattr(equations, "SINGLE_FROM", 1000)
+    monkeypatch.setattr(coupled_equations, "SINGLE_FROM", 1000)
     reference = MomentSolver(model)
     expected = reference.steady()
     assert reference.report.preconditioner == "two-level"
@@ -359,7 +360,7 @@ def test_drift_that_pushes_away_is_refused():
 
 
 def test_no_convergence_is_an_error_or_a_dense_solve(monkeypatch):
-    from msg_analysis.theory import iterative
+    from msg_analysis.theory.solvers import iterative
 
     monkeypatch.setattr(iterative, "MAX_ITERATIONS", 2)
     monkeypatch.setattr(iterative, "MAX_RELATIVE_ERROR", 1e-14)
@@ -376,7 +377,7 @@ def test_no_convergence_is_an_error_or_a_dense_solve(monkeypatch):
 
 
 def test_many_forms_are_solved_in_batches(monkeypatch):
-    from msg_analysis.theory import iterative
+    from msg_analysis.theory.solvers import iterative
 
     random = np.random.default_rng(13)
     model = system(random, 9, generator(random, 3))

@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from switching_systems import LINE_RING, network, steady_of
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.theory import rational, transient
-from msg_analysis.theory import system as systems
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.theory import transient
 from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
+from msg_analysis.theory.solvers import rational_krylov
+from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.transient import point_start, start_of, unreduced_consensus
 
 MODELS = settings(max_examples=20, deadline=None, derandomize=True)
@@ -270,7 +271,7 @@ def test_delay_and_loss():
 def test_memory_of_large_systems(monkeypatch):
     system = systems.continuous(Experiment.parse(LINE_RING))
     monkeypatch.setattr(transient, "MAX_UNKNOWNS", 1)
-    monkeypatch.setattr(rational, "MAX_BYTES", 1.0)
+    monkeypatch.setattr(rational_krylov, "MAX_BYTES", 1.0)
     with pytest.raises(InputError, match="GB in continuous time"):
         transient.transient(system, point_start(system, np.zeros(5)), np.array([1.0]), steady_of(system))
 

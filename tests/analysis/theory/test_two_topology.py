@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment import Experiment
-from msg_analysis.theory import system as systems
+from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
+from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.two_topology import MAX_UNKNOWNS, two_topology
 
 MODELS = settings(max_examples=25, deadline=None, derandomize=True)

@@ -2,7 +2,7 @@
 
     ros2 launch msg_agents_bringup network.launch.py experiment:=line_ring duration:=50.0
 
-What there is to decide is decided in msg_agents.launching; here it is only said to launch.
+What there is to decide is decided in msg_agents.running.launch_support; here it is only said to launch.
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.substitutions import ExecutableInPackage
 
-from msg_agents.launching import NETWORK_ARGUMENTS, LaunchedNetwork, environment
+from msg_agents.running.launch_support import NETWORK_ARGUMENTS, LaunchedNetwork, environment
 
 
 def generate_launch_description():

@@ -10,7 +10,7 @@ from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from msg_agents.launching import REPLAY_ARGUMENTS, LaunchFailedError, replay_commands
+from msg_agents.running.launch_support import REPLAY_ARGUMENTS, LaunchFailedError, replay_commands
 
 
 def generate_launch_description():

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.experiment.experiment import Experiment
 
 PACKAGE = Path(__file__).parents[1]
 

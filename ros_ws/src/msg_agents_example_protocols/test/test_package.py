@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from ament_index_python.packages import get_package_share_directory
 
-from msg_analysis.model.experiment import Experiment
+from msg_analysis.model.experiment.experiment import Experiment
 
 EXPERIMENTS = Path(get_package_share_directory("msg_agents_example_protocols")) / "experiments"
 

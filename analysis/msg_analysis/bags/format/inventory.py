@@ -1,0 +1,136 @@
+"""What the files of a bag hold, counted while they are read, whatever the messages are and however a file ends.
+
+Also the check of a file's summary, which the library reads without looking at its checksum.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import yaml
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, ChunkIndex
+from mcap.summary import Summary
+
+from msg_analysis.bags.format.mcap_file import Batch, McapFile
+from msg_analysis.bags.format.metadata import ChannelCount, FileCount
+
+RECORD_LIMIT = 2**28  # bytes of a record at the end of a file; only damage claims more
+_FOOTER = struct.Struct("<9xQQI8x")  # starts of summary and summary offsets; CRC of all from the summary up to itself
+_BEHIND_CRC = 12  # bytes of the CRC and the closing magic
+_CHUNK = struct.Struct("<BQQQQ")  # opcode, length, first and last log time, size when unpacked
+_CHUNK_CRC = 4  # bytes of the CRC behind `_CHUNK`
+_PACKED = struct.Struct("<Q")  # compressed size, behind the name of the compression
+_RECORD_HEAD = 9  # bytes of opcode and length
+
+
+@dataclass(slots=True)
+class FileInventory:
+    """One file: what it holds and what is wrong with it, complete once ``watch`` has run to its end."""
+
+    file: McapFile
+    count: FileCount
+    summary: Summary | None = None  # None where the file has none that is correct
+    problem: str | None = None  # why nothing of the file can be read
+
+    def watch(self) -> Iterator[Batch]:
+        """The batches of the file, counted as they pass."""
+        for batch in self.file.batches():
+            numbers, counts = np.unique(batch.channel, return_counts=True)
+            known = [number in self.file.channels for number in numbers.tolist()]
+            for number, messages in zip(numbers[known].tolist(), counts[known].tolist(), strict=True):
+                self._channel(number).messages += messages
+            times = batch.table[np.isin(batch.channel, numbers[known]), 2]
+            if len(times):
+                self.count.start = min(self.count.start, int(times.min()))
+                self.count.end = max(self.count.end, int(times.max()))
+            yield batch
+        for number in self.file.channels:
+            self._channel(number)
+        if self.file.torn is None:
+            self.summary = summary_of(self.file.path)
+
+    def _channel(self, number: int) -> ChannelCount:
+        channel = self.file.channels[number]
+        if channel.topic not in self.count.channels:
+            schema = self.file.schemas.get(channel.schema_id)
+            self.count.channels[channel.topic] = channel_count(channel, schema.name if schema else "")
+        return self.count.channels[channel.topic]
+
+    @property
+    def whole(self) -> bool:
+        """Whether other programs can read it as it is: not torn, not damaged, with a correct summary."""
+        return self.lost_messages == 0 and not self.file.damaged_chunks and not self.file.false_indexes
+
+    @property
+    def lost_messages(self) -> int | None:
+        """How many messages fewer were read than its summary states; None without a summary."""
+        statistics = self.summary.statistics if self.summary else None
+        if statistics is None:
+            return None
+        promised: int = statistics.message_count
+        return max(0, promised - self.count.messages)
+
+    @property
+    def compression(self) -> str | None:
+        """Compression of its chunks: "none", "zstd", "lz4", or several; None without a summary or chunks."""
+        kinds = {index.compression or "none" for index in self.summary.chunk_indexes} if self.summary else set()
+        return ", ".join(sorted(kinds)) or None
+
+
+@dataclass(slots=True)
+class Inventory:
+    """All files of a bag, in their order."""
+
+    files: list[FileInventory] = field(default_factory=list)
+
+    def add(self, file: McapFile) -> FileInventory:
+        """Add a file that has not been read yet."""
+        self.files.append(FileInventory(file, FileCount(file.path.name)))
+        return self.files[-1]
+
+
+def summary_of(file: Path) -> Summary | None:
+    """The summary at the end of an MCAP file; None where it has none, or where it or its chunk indexes are wrong."""
+    try:
+        with file.open("rb") as stream:
+            stream.seek(-_FOOTER.size, io.SEEK_END)
+            start, _, crc = _FOOTER.unpack(stream.read())
+            stream.seek(start)
+            if crc and crc != zlib.crc32(stream.read()[:-_BEHIND_CRC]):  # the library does not check it
+                return None
+            stream.seek(0)
+            summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary()
+            return summary if summary and all(_is_there(stream, index) for index in summary.chunk_indexes) else None
+    except Exception:  # the library raises many kinds of errors on damage
+        return None
+
+
+def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
+    """Whether the chunk that an index describes stands where the index says, with the same head."""
+    name = index.compression.encode()
+    times = (index.message_start_time, index.message_end_time)
+    head = _CHUNK.pack(Opcode.CHUNK, index.chunk_length - _RECORD_HEAD, *times, index.uncompressed_size)
+    rest = len(name).to_bytes(4, "little") + name + _PACKED.pack(index.compressed_size)
+    stream.seek(index.chunk_start_offset)
+    found = stream.read(len(head) + _CHUNK_CRC + len(rest))
+    filled = len(found) + index.compressed_size == index.chunk_length
+    return filled and found.startswith(head) and found.endswith(rest)
+
+
+def channel_count(channel: Channel, type_name: str) -> ChannelCount:
+    """A topic without messages yet, from an MCAP channel; ``type_name`` is ``package/msg/Name``."""
+    try:
+        qos: Any = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "[]"))
+    except (ValueError, RecursionError, yaml.YAMLError):
+        qos = []
+    type_hash = channel.metadata.get("topic_type_hash", "")
+    return ChannelCount(channel.topic, type_name, type_hash, qos if isinstance(qos, list) else [])

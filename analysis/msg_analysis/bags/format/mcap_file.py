@@ -1,0 +1,288 @@
+"""The messages of an MCAP file, whole or torn, in batches that numpy can work on.
+
+A file is read once, from front to back. Damaged chunks are counted and left out; a tear ends the reading.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
+
+from msg_analysis.bags.format.mcap_chunks import (
+    LIMIT,
+    MESSAGE_HEAD,
+    RECORD,
+    DamageError,
+    gather,
+    indexed,
+    locate,
+    run_of_messages,
+    unpack,
+)
+from msg_analysis.errors import BagError
+from msg_analysis.types import AnyArray, BoolArray, IntArray
+
+MAGIC = b"\x89MCAP0\r\n"
+_LOOSE = 2**18  # bytes of a batch of messages that are not in chunks
+_ZSTD = ".zstd"  # suffix of rosbag2's compression mode `file`
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """Messages in the order of the file; the CDR bytes of each lie behind the rest of its record in ``data``."""
+
+    data: bytes
+    start: IntArray  # (messages,) offset of the CDR bytes in ``data``
+    size: IntArray  # (messages,) number of CDR bytes
+    head: AnyArray  # (messages,) of type ``MESSAGE_HEAD``
+    end: int  # bytes of the file up to the end of the chunk, or of the last record, of these messages
+
+    @classmethod
+    def of_contents(cls, data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
+        """A batch from the offsets and sizes, (messages,), of the contents of its message records in ``data``.
+
+        DamageError: a record too short for a message, or a time of 2^63 ns or more.
+        """
+        if (size < MESSAGE_HEAD.itemsize).any():
+            raise DamageError
+        head = gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+        if _no_time(head).any():
+            raise DamageError
+        return cls(data, start + MESSAGE_HEAD.itemsize, size - MESSAGE_HEAD.itemsize, head, end)
+
+    @property
+    def channel(self) -> AnyArray:
+        """(messages,) channel number."""
+        return np.asarray(self.head["channel"])
+
+    @property
+    def table(self) -> IntArray:
+        """(messages, 6) int64: channel number, sequence, log time [ns], publish time [ns], start, size."""
+        columns = [self.head[name].astype(np.int64) for name in MESSAGE_HEAD.names or ()]
+        return np.column_stack((*columns, self.start, self.size))
+
+    def message(self, index: int) -> bytes:
+        """CDR bytes of the message at an index of the batch."""
+        start = int(self.start[index])
+        return self.data[start : start + int(self.size[index])]
+
+
+@dataclass(slots=True)
+class _Chunk:
+    """A chunk and the message index records behind it."""
+
+    content: bytes
+    end: int  # bytes of the file up to the end of its record
+    index: list[bytes] = field(default_factory=list)
+    _filled: int = 0
+
+    def add_index(self, content: bytes) -> None:
+        """Take the content of one more index record, up to ``LIMIT`` bytes of all."""
+        self._filled += len(content)
+        if self._filled <= LIMIT:
+            self.index.append(content)
+
+
+class _Source:
+    """A stream of records that gives out many message records in a row at once; nothing else may read the stream."""
+
+    def __init__(self, stream: io.BufferedReader) -> None:
+        self._stream = stream
+        self._buffer, self._at = b"", 0  # bytes read from the stream, and how many of them were given out
+
+    def read(self, size: int) -> bytes:
+        """So many bytes; fewer at the end."""
+        found = self._buffer[self._at : self._at + size]
+        self._at += size
+        if len(found) < size:
+            self._buffer, self._at = b"", 0
+            found += self._stream.read(size - len(found))
+        return found
+
+    def messages(self, head: bytes) -> tuple[bytes, IntArray, IntArray, int]:
+        """Buffer, (messages,) content offsets and sizes in it, and bytes of all, of whole message records in a row.
+
+        The first is the one whose ``head`` was read last. 0 bytes where it is cut off or does not fit into ``_LOOSE``
+        bytes.
+        """
+        if self._at >= len(head):
+            self._at -= len(head)
+        else:
+            self._buffer, self._at = head, 0
+        for _ in range(2):
+            start, size, end = run_of_messages(self._buffer, self._at)
+            if len(start):
+                break
+            self._buffer, self._at = self._buffer[self._at :] + self._stream.read(_LOOSE), 0
+        length, self._at = end - self._at, end
+        if not length:
+            self._at += len(head)  # the head counts as read again
+        return self._buffer, start, size, length
+
+
+@dataclass(slots=True)
+class McapFile:
+    """An MCAP file to be read once, by iterating over ``batches()``; compressed as a whole if named *.zstd."""
+
+    path: Path
+    channels: dict[int, Channel] = field(default_factory=dict)  # by number; these and the following: seen so far
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    metadata: list[Metadata] = field(default_factory=list)
+    attachments: list[Attachment] = field(default_factory=list)
+    profile: str = ""
+    library: str = ""
+    whole_bytes: int = 0  # length of the whole records so far, with the magic bytes; of a .zstd file, unpacked
+    torn: str | None = None  # what is there instead of the end of the file, known when all is read
+    damaged_chunks: int = 0  # chunks that are left out
+    false_indexes: int = 0  # chunks whose index is wrong: here the records decide, other programs use the index
+
+    def batches(self) -> Iterator[Batch]:
+        """The messages of all whole records; BagError: not an MCAP file, empty, or one that cannot be read."""
+        try:
+            size = self.path.stat().st_size
+            with contextlib.ExitStack() as stack:
+                stream = stack.enter_context(self.path.open("rb"))
+                if self.path.suffix == _ZSTD:
+                    size = 2**62  # not known before all is unpacked
+                    unpacked = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
+                    stream = stack.enter_context(io.BufferedReader(unpacked))
+                yield from self._batches(stream, size)
+        except (OSError, zstandard.ZstdError) as error:
+            if self.whole_bytes and isinstance(error, zstandard.ZstdError):
+                self.torn = f"cannot be unpacked beyond byte {self.whole_bytes}"
+                return
+            raise BagError(f"{self.path}: cannot be read ({error})") from error
+
+    def _batches(self, stream: io.BufferedReader, size: int) -> Iterator[Batch]:
+        start = stream.read(len(MAGIC))
+        if not start:
+            raise BagError(f"{self.path}: is empty: nothing was recorded")
+        if start != MAGIC:
+            raise BagError(f"{self.path}: is no MCAP file: expected a bag of ROS 2's mcap storage")
+        self.whole_bytes = len(MAGIC)
+        _keep_memory()
+        zstd = zstandard.ZstdDecompressor()
+        chunk: _Chunk | None = None
+        for opcode, content, places in self._records(_Source(stream), size):
+            if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
+                chunk.add_index(content)
+                continue
+            if chunk is not None:
+                yield from self._chunk(chunk, zstd)
+                chunk = None
+            if opcode == Opcode.CHUNK:
+                chunk = _Chunk(content, self.whole_bytes)
+            elif opcode == Opcode.MESSAGE:
+                yield _loose_batch(content, *places, self.whole_bytes)
+            else:
+                with contextlib.suppress(DamageError):
+                    self._note(opcode, content)
+        if chunk is not None:
+            yield from self._chunk(chunk, zstd)
+
+    def _records(self, stream: _Source, size: int) -> Iterator[tuple[int, bytes, tuple[IntArray, IntArray]]]:
+        """Opcode, content and (offsets, sizes) of each record; message records in a row come together."""
+        while True:
+            head = stream.read(RECORD.size)
+            if len(head) < RECORD.size:
+                self.torn = f"ends after {self.whole_bytes} bytes without a footer"
+                return
+            opcode, length = RECORD.unpack(head)
+            content = b""
+            if opcode == Opcode.MESSAGE:
+                data, start, sizes, whole = stream.messages(head)
+                if whole:
+                    self.whole_bytes += whole
+                    yield opcode, data, (start, sizes)
+                    continue
+            if not opcode:  # a power cut leaves zeros
+                self.torn = f"no record at byte {self.whole_bytes}, where one should be"
+                return
+            if length <= min(LIMIT, size - self.whole_bytes):
+                content = stream.read(length)
+            if len(content) < length:
+                self.torn = f"the record at byte {self.whole_bytes} is cut off or damaged"
+                return
+            self.whole_bytes += RECORD.size + length
+            if opcode == Opcode.FOOTER:
+                if stream.read(len(MAGIC)) != MAGIC:
+                    self.torn = "the closing magic bytes are missing"
+                return
+            yield opcode, content, (np.array([0]), np.array([length]))
+
+    def _note(self, opcode: int, content: bytes) -> None:
+        stream = ReadDataStream(io.BytesIO(content))
+        try:
+            if opcode == Opcode.HEADER:
+                header = Header.read(stream)
+                self.profile, self.library = header.profile, header.library
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream)
+                self.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(stream)
+                self.channels[channel.id] = channel
+            elif opcode == Opcode.METADATA:
+                self.metadata.append(Metadata.read(stream))
+            elif opcode == Opcode.ATTACHMENT:
+                self.attachments.append(Attachment.read(stream))
+        except Exception as error:  # the library raises many kinds of errors on damage
+            raise DamageError from error
+
+    def _chunk(self, chunk: _Chunk, zstd: zstandard.ZstdDecompressor) -> Iterator[Batch]:
+        try:
+            data = unpack(chunk.content, zstd)
+            places = locate(data, chunk.index)
+            if places is None:
+                walked = np.array(list(self._walk(data)), dtype=np.int64).reshape(-1, 2)
+                places = walked[:, 0], walked[:, 1]
+                self.false_indexes += bool(chunk.index) and not indexed(places[0], chunk.index)
+            batch = Batch.of_contents(data, *places, chunk.end)
+        except Exception:  # decompressors and the library raise many kinds of errors on damage
+            self.damaged_chunks += 1
+            return
+        yield batch
+
+    def _walk(self, data: bytes) -> Iterator[tuple[int, int]]:
+        at, end = 0, len(data)
+        while at < end:
+            opcode, length = RECORD.unpack_from(data, at)
+            at += RECORD.size
+            if length > end - at or not opcode:
+                raise DamageError
+            if opcode == Opcode.MESSAGE:
+                yield at, length
+            else:
+                self._note(opcode, data[at : at + length])
+            at += length
+
+
+def _keep_memory() -> None:
+    """Let the C library keep large blocks that are freed from chunk to chunk, instead of mapping fresh pages each time.
+
+    Touching fresh pages takes longer than all that is done with a chunk. Freeing one large block raises the threshold
+    (mallopt(3), M_MMAP_THRESHOLD).
+    """
+    np.empty(2**24, np.uint8)
+
+
+def _loose_batch(data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
+    """Messages that are not in a chunk; damaged ones are left out one by one."""
+    start, size = start[size >= MESSAGE_HEAD.itemsize], size[size >= MESSAGE_HEAD.itemsize]
+    timed = ~_no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
+    return Batch.of_contents(data, start[timed], size[timed], end)
+
+
+def _no_time(head: AnyArray) -> BoolArray:
+    """(messages,) whether the log or publish time is 2^63 ns or more, which no clock shows."""
+    octets = head.view(np.uint8).reshape(len(head), MESSAGE_HEAD.itemsize)
+    return np.asarray((octets[:, 13] | octets[:, 21]) >= 128)  # the highest byte of either

@@ -1,0 +1,290 @@
+"""The states of a run, written into the arrays of the result as they come out of the bag, in any order.
+
+Beside these arrays only a few numbers per state are kept, whatever the length of the bag.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import cached_property
+
+import numpy as np
+
+from msg_analysis.bags.format.mcap_file import Batch
+from msg_analysis.bags.state_columns import States, decode_states, run_number
+from msg_analysis.errors import BagError
+from msg_analysis.model.experiment.memory import amount, available_memory
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.step.air import LOST
+from msg_analysis.model.step.step_model import Wiring
+from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
+
+_NEVER = np.zeros(1, dtype=np.bool_)
+_OTHER_COLUMNS = 4  # numbers of 8 bytes per state beside its own values, some only while it is processed
+
+
+class Collector:
+    """Takes the states of one kind of topic (`state` or `truth`), of any runs.
+
+    States of runs whose record has not been seen yet wait for it, as bytes: in most bags the record comes first.
+    """
+
+    def __init__(self) -> None:
+        self._undecodable = 0
+        self._position = 0
+        self._counts: Counter[tuple[int, int]] = Counter()
+        self._expected: dict[tuple[int, int], tuple[RunRecord, int]] = {}
+        self._collected: dict[tuple[int, int], Collected] = {}
+        self._waiting: list[tuple[tuple[int, int], States]] = []
+
+    def add(self, batch: Batch, chosen: IntArray) -> None:
+        """Take from a batch the states: the messages with the indices ``chosen``, (k,)."""
+        states, undecodable = decode_states(batch, chosen, self._position)
+        self._undecodable += undecodable
+        self._position += len(chosen)
+        for run, part in _by_run(states):
+            self._counts[run] += len(part)
+            if run in self._expected:
+                self._of(run).add(part)
+            else:
+                self._waiting.append((run, part.alone()))
+
+    def expect(self, record: RunRecord, width: int) -> None:
+        """From now on collect the states, of length ``width``, of this run; nothing where it is expected already.
+
+        BagError where the result does not fit into the memory of this machine.
+        """
+        expected = run_number(record.run.bytes)
+        if expected in self._expected:
+            return
+        self._expected[expected] = record, width
+        waiting, self._waiting = self._waiting, []
+        for run, part in waiting:
+            if run == expected:
+                self._of(run).add(part)
+            else:
+                self._waiting.append((run, part))
+
+    def _of(self, run: tuple[int, int]) -> Collected:
+        """The result of a run, made for its first state: a bag may have records of runs without states."""
+        if run not in self._collected:
+            self._collected[run] = Collected(*self._expected[run])
+        return self._collected[run]
+
+    def count(self, run: bytes) -> int:
+        """Number of states of a run, given the 16 bytes of its id."""
+        return self._counts[run_number(run)]
+
+    def finish(self, record: RunRecord, width: int) -> Collected:
+        """All that was collected of a run; call it after the last batch. Arguments and errors as of ``expect``."""
+        self.expect(record, width)
+        collected = self._of(run_number(record.run.bytes))
+        collected.refused["undecodable"] += self._undecodable
+        collected.refused["other run"] += self._counts.total() - self.count(record.run.bytes)
+        collected.finish()
+        return collected
+
+
+def _by_run(states: States) -> list[tuple[tuple[int, int], States]]:
+    """The states of each run."""
+    run = states.run
+    if not len(run):
+        return []
+    if (run == run[0]).all():
+        return [(run_number(run[0].tobytes()), states)]
+    runs, owner = np.unique(run, axis=0, return_inverse=True)
+    return [(run_number(one.tobytes()), states[owner.ravel() == i]) for i, one in enumerate(runs)]
+
+
+class Collected:
+    """The states of a run on one kind of topic, each once, by step and agent. BagError: too large for the memory.
+
+    After ``finish``: ``states`` (N + 1, m, width), NaN where missing; ``modes`` (N + 1, m) from 0, -1 where missing;
+    ``lost``, ``used`` and ``made`` as in ``Trajectory``; the counts as in ``Completeness``.
+    """
+
+    def __init__(self, record: RunRecord, width: int) -> None:
+        experiment = record.experiment
+        self._shape = experiment.steps + 1, experiment.agents
+        self._width = width
+        self._graphs = len(experiment.graph_list)
+        self._realtime = experiment.run.pace == "realtime"
+        self._record, self._experiment = record, experiment
+        self._lossy = bool(experiment.noise.loss) or self._realtime
+        most = self._links.most if self._lossy else 0
+        cells = self._shape[0] * self._shape[1]
+        # The result has the size that the record states, however little of it the bag holds.
+        needed, available = 8 * cells * (width + _OTHER_COLUMNS + most), available_memory()
+        try:
+            if needed > available:
+                raise MemoryError
+            # Zeros cost no memory before they are written, so 0 means missing: position, modes, used and made are
+            # kept plus one until `finish`. The position is that of the copy that was kept.
+            self._position = np.zeros(cells, dtype=np.int64)
+            self._states: FloatArray = np.zeros((cells, width))
+            self._modes = np.zeros(cells, dtype=np.int64)
+            self._used = np.zeros((cells, most if self._realtime else 0), dtype=np.int64)
+            self._made = np.zeros(cells if self._realtime else 0, dtype=np.int64)
+            self._lost = np.zeros((cells, 0 if self._realtime else most), dtype=np.bool_)
+            self._listed = np.zeros(cells if self._lossy else 0, dtype=np.bool_)  # whether ``heard`` was not empty
+        except (MemoryError, ValueError) as error:
+            raise BagError(
+                f"run {record.run}: {experiment.steps} steps of {experiment.agents} agents need {amount(needed)}, "
+                f"expected at most {amount(available)}, the memory available: read it on a larger machine"
+            ) from error
+        self._contradicted: list[IntArray] = []
+        self.lost: BoolArray | None = None
+        self.used: IntArray | None = None
+        self.made: IntArray | None = None
+        self.received = self.duplicates = self.out_of_order = 0
+        self.refused: Counter[str] = Counter()
+
+    def add(self, states: States) -> None:
+        """Put states of this run in their places; they come in the order of the bag, from call to call too."""
+        states, values = self._good(states)
+        cell = states.step * self._shape[1] + states.agent - 1
+        place = states.position + 1
+        before = self._position[cell]
+        if not before.any():
+            self._position[cell] = place
+            if np.array_equal(self._position[cell], place):  # no two are of the same agent and step
+                self._write(cell, states, values)
+                return
+            self._position[cell] = 0
+        _, first = np.unique(cell, return_index=True)
+        new = first[before[first] == 0]  # of several copies, the first in the bag
+        self._position[cell[new]] = place[new]
+        self._write(cell[new], states[new], values[new])
+        again = np.delete(np.arange(len(cell)), new)
+        differs = self._differ(cell[again], states[again], values[again])
+        self.duplicates += len(again)
+        self.refused["contradicts an earlier copy"] += int(differs.sum())
+        self._contradicted.append(np.unique(cell[again[differs]]))
+
+    @cached_property
+    def _links(self) -> _Links:
+        """Made when the first ``heard`` has to be interpreted: most runs have none."""
+        return _Links(self._record.model, self._experiment.steps)
+
+    def _good(self, states: States) -> tuple[States, FloatArray]:
+        """Those that can be states of this run, and their values; the others are counted by reason."""
+        right = states.replicas == self._width
+        if not right.all():
+            self.refused["wrong length"] += int((~right).sum())
+            states = states[right]
+        values = states.state(self._width)
+        finite = np.isfinite(values)
+        good = np.ones(len(states), dtype=np.bool_)
+        for reason, bad in (
+            ("unknown agent", (states.agent < 1) | (states.agent > self._shape[1])),
+            ("step out of range", states.step >= self._shape[0]),
+            ("unknown mode", states.mode > self._graphs),
+            ("not finite", _NEVER if finite.all() else ~finite.all(axis=1)),
+            ("stamped before the start", states.stamp < 0 if self._realtime else _NEVER),
+        ):
+            if bad.any():
+                self.refused[reason] += int((good & bad).sum())
+                good &= ~bad
+        if not good.all():
+            states, values = states[good], values[good]
+        if self._lossy or states.heard_count.any():
+            fits = self._links.fit(states, realtime=self._realtime, lossy=self._lossy)
+            self.refused["heard what it cannot have"] += int((~fits).sum())
+            states, values = states[fits], values[fits]
+        return states, values
+
+    def _write(self, cell: IntArray, states: States, values: FloatArray) -> None:
+        self._states[cell] = values
+        self._modes[cell] = states.mode
+        if not self._lossy:
+            return
+        heard = states.heard(self._links.most)
+        self._listed[cell] = states.heard_count > 0
+        if self._realtime:
+            listed = np.arange(self._links.most) < states.heard_count[:, None]
+            self._used[cell] = np.where(listed & (heard != LOST), heard.astype(np.int64) + 1, 0)
+            self._made[cell] = states.stamp + 1
+        else:
+            self._lost[cell] = heard == LOST
+
+    def _differ(self, cell: IntArray, states: States, values: FloatArray) -> BoolArray:
+        """(copies,) whether these copies differ from the first ones, which are in their places."""
+        differs = (values != self._states[cell]).any(axis=1) | (states.mode != self._modes[cell])
+        if self._lossy:
+            differs |= (states.heard(self._links.most) != self._heard(cell)).any(axis=1)
+        if self._realtime:
+            differs |= states.stamp + 1 != self._made[cell]
+        return np.asarray(differs)
+
+    def _heard(self, cell: IntArray) -> AnyArray:
+        """(cells, D) ``heard`` of the copies that were kept; 0 beyond its end."""
+        step, agent = np.divmod(cell, self._shape[1])
+        count = self._links.neighbours(self._modes[cell], agent) * self._listed[cell]
+        if self._realtime:
+            used = self._used[cell]
+            heard = np.where(used > 0, used.astype(np.uint64) - np.uint64(1), LOST)
+        else:
+            heard = np.where(self._lost[cell], LOST, (step - 1).astype(np.uint64)[:, None])
+        return np.where(np.arange(self._links.most) < count[:, None], heard, np.uint64(0))
+
+    def finish(self) -> None:
+        """Mark what is missing; call it after the last state."""
+        if self._contradicted:
+            # One of the copies is wrong and it is not known which: the state counts as missing.
+            cells = np.concatenate(self._contradicted)
+            for array in (self._position, self._modes, self._used, self._made, self._lost):
+                if len(array):
+                    array[cells] = 0
+        missing = self._position == 0
+        self._states[missing] = np.nan
+        self.received = len(missing) - int(missing.sum())
+        self.out_of_order = _out_of_order(self._position.reshape(self._shape))
+        self._modes -= 1
+        self.states = self._states.reshape(*self._shape, self._width)
+        self.modes = self._modes.reshape(self._shape)
+        if self._realtime:
+            self._used -= 1
+            self._made -= 1
+            self.used = self._used.reshape(*self._shape, self._used.shape[1])[1:]
+            self.made = self._made.reshape(self._shape)
+        elif self._lossy:
+            self.lost = self._lost.reshape(*self._shape, self._lost.shape[1])[1:]
+
+
+def _out_of_order(position: IntArray) -> int:
+    """How many states came after a later one of their agent, by (N + 1, m) place in the bag, from 1; 0: missing."""
+    late = 0
+    for column in position.T:  # one agent at a time: less memory
+        came = np.where(column > 0, column, np.iinfo(np.int64).max)
+        first_of_later = np.minimum.accumulate(came[::-1])[::-1]
+        late += int((first_of_later[1:] < column[:-1]).sum())
+    return late
+
+
+class _Links:
+    """What ``heard`` can be; ``most`` is the largest number of neighbours of any agent."""
+
+    def __init__(self, model: Wiring, steps: int) -> None:
+        self._last = np.uint64(steps)
+        self.most = model.most_neighbours
+        self._neighbours = np.zeros((model.modes + 1, model.agents), dtype=np.int64)  # row 0: no graph led to step 0
+        for mode in range(model.modes):
+            self._neighbours[mode + 1] = [len(model.neighbours(mode, i)) for i in range(model.agents)]
+
+    def neighbours(self, mode: IntArray, agent: IntArray) -> IntArray:
+        """How many neighbours these agents (from 0) have in these graphs (from 1; 0: none, at step 0)."""
+        return np.asarray(self._neighbours[mode, agent])
+
+    def fit(self, states: States, *, realtime: bool, lossy: bool) -> BoolArray:
+        """Whether ``heard`` is possible: one entry per neighbour in their graph, each a step that can be.
+
+        In lockstep that is the step before, and an empty ``heard`` says so of all; ``LOST`` is possible if ``lossy``.
+        """
+        heard, count = states.heard(self.most), states.heard_count
+        before = (states.step.astype(np.uint64) - np.uint64(1))[:, None]
+        possible = heard <= self._last if realtime else heard == before
+        if lossy:
+            possible |= heard == LOST
+        known = possible | (np.arange(self.most) >= count[:, None])
+        fits = (count == self.neighbours(states.mode, states.agent - 1)) & known.all(axis=1)
+        return np.asarray(fits if realtime else fits | (count == 0))

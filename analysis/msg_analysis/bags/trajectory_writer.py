@@ -1,0 +1,132 @@
+"""Writes a trajectory as a bag with the topics and the layout of a recorded network run.
+
+States that are missing in the trajectory are missing in the bag.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from msg_analysis.bags.format.storage_options import DEFAULT, Storage
+from msg_analysis.bags.writer import BagWriter
+from msg_analysis.errors import BagError
+from msg_analysis.model.arithmetic.payload import to_payload
+from msg_analysis.model.arithmetic.step_clock import StepClock
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.air import LOST
+from msg_analysis.types import IntArray
+from msg_analysis.wire.messages import ActiveGraph, StateCodec, encode_string
+from msg_analysis.wire.schemas import network_topics, state_topic, truth_topic
+
+
+def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT) -> None:
+    """Write a bag, whole or not at all; BagError where the directory exists or cannot be written."""
+    directory = Path(directory).absolute()
+    if directory.exists():
+        raise BagError(f"{directory}: exists already: choose another name, or move it away first")
+    record = trajectory.record.to_json()
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{directory.name}.", dir=directory.parent) as workshop:
+            # It has its final name already: the name of its file derives from it.
+            unfinished = Path(workshop) / directory.name
+            noisy = trajectory.published is not None
+            topics = network_topics(trajectory.record.experiment.agents, truth=noisy)
+            with BagWriter(unfinished, topics, record=record, storage=storage) as bag:
+                bag.write("/experiment", encode_string(record), 0)
+                for topic, data, time in _messages(trajectory):
+                    bag.write(topic, data, time)
+            unfinished.rename(directory)
+    except OSError as error:
+        raise BagError(f"{directory}: cannot be written ({error.strerror}): choose another place") from error
+
+
+def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
+    """(topic, CDR bytes, time [ns]), in the order of time."""
+    experiment = trajectory.record.experiment
+    run, dt, modes = trajectory.record.run.bytes, experiment.step_length, trajectory.modes
+    time = StepClock(dt).nanoseconds
+    used = trajectory.agent_modes
+    if used is None:
+        used = np.repeat(np.concatenate(([-1], modes))[:, None], experiment.agents, axis=1)
+    truth = state_topic if trajectory.published is None else truth_topic
+    streams = [(_names(truth, experiment.agents), trajectory.states)]
+    if trajectory.published is not None:
+        streams.append((_names(state_topic, experiment.agents), trajectory.published))
+    present = [np.asarray(~np.isnan(states).any(axis=2)) for _, states in streams]
+    widths = [states.shape[2] for _, states in streams]
+    codecs = [[StateCodec(run, i + 1, width, dt) for i in range(experiment.agents)] for width in widths]
+    heard = _heard(trajectory, used)
+    sojourns = _sojourns(trajectory)
+    sojourn = next(sojourns, None)
+    made = trajectory.made
+    if made is None:
+        steps = range(len(trajectory.states))
+        made = np.repeat(np.array([time(k) for k in steps])[:, None], experiment.agents, axis=1)
+    for cell in np.argsort(made, axis=None, kind="stable").tolist():
+        k, i = divmod(cell, experiment.agents)
+        now = int(made[k, i])
+        while sojourn is not None and sojourn.stamp <= now:
+            yield "/graph", sojourn.encode(), sojourn.stamp
+            sojourn = next(sojourns, None)
+        for (topics, states), there, codec in zip(streams, present, codecs, strict=True):
+            if there[k, i]:
+                payload = to_payload(states[k, i])
+                yield topics[i], codec[i].wrap(k, int(used[k, i]) + 1, payload, heard(k, i), now), now
+    while sojourn is not None:
+        yield "/graph", sojourn.encode(), sojourn.stamp
+        sojourn = next(sojourns, None)
+
+
+def _names(topic: Callable[[str, int], str], agents: int) -> list[str]:
+    return [topic("/", i + 1) for i in range(agents)]
+
+
+def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[int]]:
+    """Function of (k, agent from 0) that gives ``heard`` of that state: the steps used in the step that led there.
+
+    Empty in lockstep where nothing was lost; complete in real time.
+    """
+    lost, values = trajectory.lost, trajectory.used
+    if lost is None and values is None:
+        return lambda _k, _i: []
+    model = trajectory.record.model
+    modes, agents = range(model.modes), range(model.agents)
+    counts = [[len(model.neighbours(mode, i)) for i in agents] for mode in modes]
+
+    def listed(k: int, i: int) -> list[int]:
+        if k == 0:
+            return []
+        neighbours = counts[used[k, i]][i]
+        if values is not None:
+            return [LOST if step < 0 else step for step in values[k - 1, i, :neighbours].tolist()]
+        if lost is None or not lost[k - 1, i].any():
+            return []
+        return [LOST if gone else k - 1 for gone in lost[k - 1, i, :neighbours].tolist()]
+
+    return listed
+
+
+def _sojourns(trajectory: Trajectory) -> Iterator[ActiveGraph]:
+    """The stretches of equal graph, without those whose graph is not known."""
+    experiment, modes = trajectory.record.experiment, trajectory.modes
+    time = StepClock(experiment.step_length).nanoseconds
+    first = np.flatnonzero(np.diff(modes, prepend=-2))
+    last = np.append(first[1:], len(modes)) - 1
+    known = modes[first] >= 0
+    for sequence, (start, end) in enumerate(zip(first[known].tolist(), last[known].tolist(), strict=True)):
+        graph = experiment.graph_list[modes[start]]
+        yield ActiveGraph(
+            stamp=time(start),
+            run=trajectory.record.run.bytes,
+            sequence=sequence,
+            mode=int(modes[start]) + 1,
+            name=graph.name,
+            first_step=start,
+            last_step=end,
+            arcs=graph.arcs,
+        )

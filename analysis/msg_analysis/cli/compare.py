@@ -1,0 +1,80 @@
+"""Commands of ``msg-analysis`` about runs: ``compare`` (bags with the prediction) and ``tabulate`` (saved results)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from msg_analysis.cli.console import examples, print_json, result_console
+from msg_analysis.cli.options import BAG, FILE, RESULT, json_option, level_option
+from msg_analysis.common.files import require_place
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis compare line_ring_twin",
+        "msg-analysis compare line_ring_twin --report report.html",
+        "msg-analysis compare runs/line_ring_* --level 0.001 --json > pooled.json",
+    )
+)
+@click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=BAG)
+@level_option("Chance of a false 'disagrees', all tests together.")
+@click.option("--report", type=FILE, metavar="FILE", help="Write a report (HTML) as well.")
+@json_option
+@click.pass_context
+def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level: float, report: Path | None) -> None:
+    """Compare what the run in BAG did with what theory predicts.
+
+    Several bags, runs of one experiment with different seeds, get one verdict together.
+
+    Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
+    """
+    from msg_analysis import api
+
+    require_place(report)
+    comparison = api.compare(*bags, level=level)
+    if report:
+        api.write_report(comparison, report)
+    if as_json:
+        print_json(comparison.to_json())
+    else:
+        from msg_analysis.report.terminal.result_text import print_comparison
+
+        print_comparison(comparison.to_json(), result_console())
+    context.exit(comparison.exit_code)
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis compare leader_1 --json > leader_1.json",
+        "msg-analysis tabulate leader_*.json",
+        "msg-analysis tabulate runs/*/result.json --format csv > runs.csv",
+    )
+)
+@click.argument("results", metavar="RESULT...", nargs=-1, required=True, type=RESULT)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["table", "markdown", "csv", "json"]),
+    default="table",
+    help="A table says in words as well which system errors can be told apart.",
+)
+@level_option("Chance of telling any two system errors apart wrongly.")
+@json_option
+def tabulate(results: tuple[Path, ...], form: str, level: float, as_json: bool) -> None:
+    """Put saved results side by side: files that ``compare --json`` or ``msg-agents run`` wrote.
+
+    A RESULT may be the directory of a run, too. Independent runs, that is other seeds, are taken for granted.
+    """
+    from msg_analysis.report.terminal import saved_results as saved
+
+    rows = [saved.read_result(path) for path in results]
+    if as_json or form == "json":
+        print_json(saved.to_json(rows, level))
+    elif form == "csv":
+        click.echo(saved.to_csv(rows), nl=False)
+    elif form == "markdown":
+        click.echo(saved.to_markdown(rows), nl=False)
+    else:
+        saved.print_results(rows, level, result_console())

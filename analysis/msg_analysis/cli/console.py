@@ -1,0 +1,134 @@
+"""What the command lines share: streams, errors and exit codes, JSON, and the examples in help pages."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import stat
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+import click
+from click.exceptions import Exit
+
+from msg_analysis.common.json_numbers import finite
+from msg_analysis.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+BROKEN_PIPE = 141
+NOT_WRITTEN = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF}
+
+
+class CommandGroup(click.Group):
+    """A click group that turns errors of the user into messages and exit codes; all help pages share its settings."""
+
+    def __init__(self, *args: Any, **attributes: Any) -> None:
+        attributes["context_settings"] = {"help_option_names": ["-h", "--help"], "show_default": True}
+        super().__init__(*args, **attributes)
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """Run the program; see click.Command."""
+        _open_closed_streams()
+        return super().main(*args, **extra)
+
+    def make_context(self, *args: Any, **extra: Any) -> click.Context:
+        """Parse the command line, answer ``--help`` and ``--version``; see click.Command."""
+        with _exit_codes():
+            return super().make_context(*args, **extra)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; see click.Group."""
+        with _exit_codes():
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _exit_codes() -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        complain(str(error))
+        raise Exit(BAD_INPUT) from error
+    except BrokenPipeError as error:
+        _drop_stdout()
+        raise Exit(BROKEN_PIPE) from error
+    except OSError as error:
+        if error.filename is not None:
+            complain(f"{error.filename}: {error.strerror}")
+        elif error.errno in NOT_WRITTEN:
+            place = "stdout" if _stdout_can_fail() else "a file"
+            _drop_stdout()
+            complain(f"{place}: {error.strerror}: the result could not be written")
+        else:
+            raise
+        raise Exit(BAD_INPUT) from error
+    except KeyboardInterrupt as error:
+        raise Exit(INTERRUPTED) from error
+
+
+def _open_closed_streams() -> None:
+    """Occupy the numbers of closed standard streams, so that no file or socket gets them and receives what is printed.
+
+    Printing to a closed stdout then fails, as in other programs; what is printed to a closed stderr is dropped.
+    """
+    for number, mode in ((0, os.O_WRONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, mode)  # takes the lowest free number
+            if number == 1:
+                sys.stdout = os.fdopen(1, "w")
+            elif number == 2:
+                sys.stderr = os.fdopen(2, "w")
+
+
+def _stdout_can_fail() -> bool:
+    """Whether an error without a file name is that of stdout: our files have names; pipes, terminals are never full."""
+    try:
+        number = sys.stdout.fileno()
+        return stat.S_ISREG(os.fstat(number).st_mode) or (
+            stat.S_ISCHR(os.fstat(number).st_mode) and not os.isatty(number)
+        )
+    except (OSError, ValueError):  # a stream without a file, in tests
+        return False
+
+
+def _drop_stdout() -> None:
+    """Redirect stdout to /dev/null, so that the flush at exit does not fail again."""
+    with suppress(OSError, ValueError):  # a stream without a file, in tests
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def complain(text: str, label: str = "error:") -> None:
+    """Print one error on stderr, behind a label that is red on a terminal."""
+    color = False if os.environ.get("NO_COLOR") else None
+    click.echo(f"{click.style(label, fg='red', bold=True)} {text}", err=True, color=color)
+
+
+def examples(*lines: str) -> str:
+    """Epilog of a command's help: commands as a user would type them."""
+    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def result_console() -> Console:
+    """The rich console for tables on stdout."""
+    from rich.console import Console
+
+    class ResultConsole(Console):
+        def on_broken_pipe(self) -> None:
+            # Rich exits with 1, which means "disagrees" here.
+            raise BrokenPipeError
+
+    return ResultConsole(highlight=False, markup=False)
+
+
+def print_json(document: dict[str, Any]) -> None:
+    """Print one JSON object on stdout; infinite numbers and NaN become null."""
+    click.echo(json.dumps(finite(document), allow_nan=False))

@@ -1,0 +1,275 @@
+"""The command line ``msg-analysis``: each command parses, calls one function and prints.
+
+Results go to stdout, everything else to stderr. Exit codes: 0 fine or agrees, 1 disagrees, 2 bad usage or
+input, 3 data incomplete. Slow imports are made inside the commands that need them.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from msg_analysis.cli import compare, sweep, theory
+from msg_analysis.cli.console import CommandGroup, examples, print_json, result_console
+from msg_analysis.cli.options import (
+    BAG,
+    PATH,
+    InputPath,
+    duration_option,
+    experiment_argument,
+    json_option,
+    seed_option,
+)
+from msg_analysis.cli.storage_options import storage, storage_options
+from msg_analysis.common.version import __version__
+from msg_analysis.errors import InputError
+
+if TYPE_CHECKING:
+    from msg_analysis.bags.format.storage_options import Compression
+    from msg_analysis.sweep.conduct import OtherSoftware
+
+
+_SOURCE = InputPath(".yaml", ".yml", ".json", ".mcap", ".mcap.zstd", holds=("metadata.yaml", "*.mcap"))
+
+
+@click.group(cls=CommandGroup)
+@click.version_option(__version__, prog_name="msg-analysis")
+def main() -> None:
+    """Theory, simulation and statistics of Markov-switching networks of agents."""
+
+
+@main.command(
+    epilog=examples("msg-analysis predict line_ring.yaml", "msg-analysis predict line_ring.yaml --json | jq .emulated")
+)
+@experiment_argument
+@json_option
+def predict(experiment: Path, as_json: bool) -> None:
+    """Predict the steady errors of EXPERIMENT, exactly."""
+    from msg_analysis.api import Experiment
+
+    document = Experiment.load(experiment).predict().to_json()
+    if as_json:
+        print_json(document)
+    else:
+        from msg_analysis.report.terminal.result_text import print_prediction
+
+        print_prediction(document, result_console())
+
+
+@main.command(
+    epilog=examples(
+        "msg-analysis simulate line_ring.yaml", "msg-analysis simulate line_ring.yaml --seed 8 --out twin_8"
+    )
+)
+@experiment_argument
+@click.option("--out", type=PATH, metavar="BAG", show_default="<name>_twin", help="Bag to write; must not exist.")
+@seed_option
+@duration_option
+@storage_options
+@json_option
+def simulate(
+    experiment: Path,
+    out: Path | None,
+    seed: int | None,
+    duration: float | None,
+    compression: Compression,
+    split_size: float | None,
+    as_json: bool,
+) -> None:
+    """Run EXPERIMENT without ROS and write its bag, whose name is printed."""
+    from msg_analysis.api import Experiment
+
+    loaded = Experiment.load(experiment)
+    directory = out or Path(f"{loaded.name}_twin")
+    if directory.exists():
+        raise InputError(f"{directory}: exists already: remove it, or choose another name with --out")
+    chosen = storage(compression, split_size)
+    run = loaded.simulate(seed=seed, duration=duration)
+    run.save(directory, chosen)
+    if as_json:
+        print_json(
+            {
+                "bag": str(directory),
+                "run": str(run.record.run),
+                "experiment": loaded.name,
+                "seed": run.experiment.run.seed,
+                "steps": run.experiment.steps,
+            }
+        )
+    else:
+        click.echo(directory)
+
+
+@main.command(
+    epilog=examples(
+        "msg-analysis leaders line_ring.yaml --count 2",
+        "msg-analysis leaders line_ring.yaml --count 2 --gain 0.5 --json",
+    )
+)
+@experiment_argument
+@click.option("--count", type=int, metavar="K", required=True, help="Number of leaders.")
+@click.option(
+    "--method",
+    type=click.Choice(["auto", "exhaustive", "greedy", "swap"]),
+    default="auto",
+    help="How to search; auto: exhaustive where there are at most 1000 sets, else swap.",
+)
+@click.option(
+    "--law",
+    type=click.Choice(["continuous", "emulated", "discrete"]),
+    show_default="the paper's, where there is one",
+    help="The law that the error is of.",
+)
+@click.option(
+    "--gain", type=float, metavar="KAPPA", default=float("inf"), help="Pull of the leaders; inf holds them in place."
+)
+@click.option("--top", type=int, metavar="N", default=10, help="How many sets to list.")
+@json_option
+def leaders(experiment: Path, count: int, method: str, law: str | None, gain: float, top: int, as_json: bool) -> None:
+    """Find the best leaders for the network of EXPERIMENT, by joint robustness centrality.
+
+    Leaders that EXPERIMENT names do not count.
+    """
+    from msg_analysis.api import Experiment
+    from msg_analysis.cli.progress import SolveProgress
+
+    loaded = Experiment.load(experiment)
+    with SolveProgress(loaded.name) as progress:
+        selection = loaded.select_leaders(
+            count,
+            method=method,  # type: ignore[arg-type]  # click has checked it
+            law=law,  # type: ignore[arg-type]
+            gain=gain,
+            top=top,
+            watch=progress,
+        )
+    document = selection.to_json()
+    if as_json:
+        print_json(document)
+    else:
+        from msg_analysis.report.terminal.result_text import print_leaders
+
+        print_leaders(document, result_console())
+
+
+@main.command(
+    epilog=examples(
+        "msg-analysis figures",
+        "msg-analysis figures 3 --out paper --format pdf",
+        "msg-analysis figures 1 --emulate",
+    )
+)
+@click.argument("example", type=click.Choice(["1", "2", "3", "all"]), default="all")
+@click.option("--out", type=PATH, metavar="DIR", default=Path("figures"), help="Where the files are written.")
+@click.option(
+    "--format",
+    "formats",
+    type=click.Choice(["png", "svg", "pdf"]),
+    multiple=True,
+    default=("png", "svg", "pdf"),
+    help="Of the drawings. Repeatable.",
+)
+@click.option(
+    "--emulate", is_flag=True, help="Run networks as well (msg-agents, minutes), and draw what they measured."
+)
+@sweep.other_software
+@json_option
+@click.pass_context
+def figures(
+    context: click.Context,
+    example: str,
+    out: Path,
+    formats: tuple[str, ...],
+    *,
+    emulate: bool,
+    other_software: OtherSoftware,
+    as_json: bool,
+) -> None:
+    """Draw the EXAMPLEs of the paper, with the numbers as CSV; print the files' names.
+
+    Files of the same names in the directory are replaced. With --emulate, real networks are run and their points drawn
+    on the curves, in files of their own; what has been run is kept, and exit code 1 says that some point disagrees with
+    theory, 3 that some network failed.
+    """
+    from msg_analysis.paper.figures import write_figures
+
+    numbers = (1, 2, 3) if example == "all" else (int(example),)
+    chosen = tuple(dict.fromkeys(formats))
+    if emulate:
+        context.exit(sweep.emulate(context, numbers, out, chosen, other_software, as_json=as_json))
+    written: list[str] = []
+    for number in numbers:
+        for path in write_figures([number], out, chosen):
+            written.append(str(path))
+            if not as_json:
+                click.echo(path)
+    if as_json:
+        print_json({"files": written})
+
+
+@main.command(epilog=examples("msg-analysis info line_ring.yaml", "msg-analysis info line_ring_twin --json"))
+@click.argument("source", metavar="EXPERIMENT|BAG", type=_SOURCE)
+@json_option
+def info(source: Path, as_json: bool) -> None:
+    """Explain an experiment file, or say what a bag holds."""
+    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.report.documents.info import describe_bag, describe_experiment
+    from msg_analysis.report.terminal import bag_text, result_text
+
+    if source.is_dir() or ".mcap" in source.suffixes:
+        document, show = describe_bag(source), bag_text.print_bag
+    else:
+        document, show = describe_experiment(Experiment.load(source)), result_text.print_experiment
+    if as_json:
+        print_json(document)
+    else:
+        show(document, result_console())
+
+
+@main.command(epilog=examples("msg-analysis salvage runs/line_ring_20250101_120000 whole"))
+@click.argument("bag", type=BAG)
+@click.argument("out", type=PATH)
+@json_option
+def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
+    """Make OUT, a valid bag, of what is whole in the torn or damaged BAG; say what was dropped.
+
+    BAG is left as it is; OUT must not exist.
+    """
+    from msg_analysis.bags.salvage import salvage as salvage_bag
+    from msg_analysis.report.documents.info import describe_salvage
+
+    document = describe_salvage(out, salvage_bag(bag, out))
+    if as_json:
+        print_json(document)
+    else:
+        from msg_analysis.report.terminal.bag_text import print_salvage
+
+        print_salvage(document, result_console())
+
+
+main.add_command(compare.compare)
+main.add_command(compare.tabulate)
+main.add_command(theory.transient)
+main.add_command(theory.facts)
+main.add_command(sweep.sweep)
+
+
+@main.command(
+    epilog=examples("msg-analysis schema > experiment.schema.json", "msg-analysis schema sweep > sweep.schema.json")
+)
+@click.argument("what", type=click.Choice(["experiment", "sweep"]), default="experiment")
+def schema(what: str) -> None:
+    """Print the JSON Schema of experiment files, or of sweep files, for editors."""
+    if what == "sweep":
+        from msg_analysis.sweep.sweep_file import json_schema
+    else:
+        from msg_analysis.model.experiment.experiment import json_schema
+
+    click.echo(json.dumps(json_schema(), indent=2))
+
+
+if __name__ == "__main__":
+    main(prog_name="msg-analysis")

@@ -1,0 +1,41 @@
+"""The options of every command that writes a bag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import click
+
+from msg_analysis.bags.format.storage_options import COMPRESSIONS, DEFAULT, MEGABYTE, Compression, Storage
+from msg_analysis.errors import InputError
+
+SMALLEST_SPLIT = 0.1  # MB; about the size of a chunk
+
+
+def storage_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the arguments ``compression`` and ``split_size`` [MB, 10^6 bytes] to a command; see :func:`storage`."""
+    for option in (
+        click.option(
+            "--compression",
+            type=click.Choice(COMPRESSIONS),
+            default=DEFAULT.compression,
+            help="Of the bag, chunk by chunk.",
+        ),
+        click.option(
+            "--split-size",
+            type=click.FloatRange(SMALLEST_SPLIT),
+            metavar="MB",
+            help="Go on in a new file of the bag after so many MB (10^6 bytes).",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def storage(compression: Compression, split_size: float | None) -> Storage:
+    """The storage that these options ask for; ``split_size`` [MB, 10^6 bytes] is None for one file."""
+    try:
+        size = None if split_size is None else round(split_size * MEGABYTE)
+    except (ValueError, OverflowError) as error:  # nan, inf
+        raise InputError(f"--split-size: {split_size}: expected a number of MB") from error
+    return Storage(compression, size)

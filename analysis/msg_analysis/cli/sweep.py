@@ -1,0 +1,217 @@
+"""The command ``sweep`` of ``msg-analysis``, and the networks of ``figures --emulate``: many runs or predictions."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from msg_analysis.cli.console import complain, examples, print_json, result_console
+from msg_analysis.cli.options import PATH, InputPath, json_option
+from msg_analysis.common.json_numbers import finite
+from msg_analysis.errors import InputError
+from msg_analysis.sweep.jobs.software import require_libraries
+
+if TYPE_CHECKING:
+    from msg_analysis.sweep.conduct import Conducted, OtherSoftware
+    from msg_analysis.sweep.jobs.job import Job
+    from msg_analysis.sweep.outcome_store import Store
+
+DISAGREES, INCOMPLETE = 1, 3
+
+other_software = click.option(
+    "--other-software",
+    type=click.Choice(["refuse", "redo", "keep"]),
+    default="refuse",
+    show_default=True,
+    help="What to do with results in the directory that other versions made.",
+)
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis sweep rates.yaml",
+        "msg-analysis sweep rates.yaml --workers 4 --json > rates.json",
+        "msg-analysis sweep rates.yaml --scheduler tcp://10.0.0.1:8786",
+    )
+)
+@click.argument("sweep_file", metavar="SWEEP", type=InputPath(".yaml", ".yml", ".json"))
+@click.option("--out", type=PATH, metavar="DIR", show_default="sweeps/<name>", help="Directory of the results.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1),
+    metavar="N",
+    show_default="one for each CPU; one where networks run",
+    help="Processes. A network needs a machine.",
+)
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of this Dask scheduler instead.")
+@click.option(
+    "--column", metavar="NAME", show_default="system_error", help="Column of the tables that is drawn and listed."
+)
+@click.option("--retry", is_flag=True, help="Try again what has failed.")
+@other_software
+@click.option("--keep-bags", is_flag=True, help="Keep the bags of networks that agree with the prediction, too.")
+@json_option
+@click.pass_context
+def sweep(
+    context: click.Context,
+    sweep_file: Path,
+    *,
+    out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    column: str | None,
+    retry: bool,
+    other_software: OtherSoftware,
+    keep_bags: bool,
+    as_json: bool,
+) -> None:
+    """Predict, simulate or run an experiment at many values of its keys, as the file SWEEP says.
+
+    What has been done is kept: after an interruption, the same command goes on. Tables (Parquet, CSV, JSON) and a
+    figure are written beside it.
+
+    Exit code 0: fine, 1: some run disagrees with its prediction, all runs judged together, 3: some point has no result.
+    """
+    if workers and scheduler:
+        raise InputError("--workers: given with --scheduler, whose workers are used: give one of them")
+    require_libraries()
+    if not scheduler:
+        from msg_analysis.sweep.jobs.workers import warm_up
+
+        warm_up()  # the workers import while the points are checked
+    from msg_analysis.cli.progress import SweepProgress
+    from msg_analysis.report.figures.sweep_figure import write_figure
+    from msg_analysis.report.terminal.sweep_text import describe_sweep, print_sweep
+    from msg_analysis.sweep.conduct import judge
+    from msg_analysis.sweep.figure_series import picture
+    from msg_analysis.sweep.jobs.network_run import options
+    from msg_analysis.sweep.outcome_store import Store
+    from msg_analysis.sweep.plan import load_sweep
+    from msg_analysis.sweep.table import rows_of, write_tables
+
+    with SweepProgress("checking the points") as checking:
+        plan = load_sweep(sweep_file, checking.checked)
+    directory = out or Path("sweeps") / plan.name
+    network = options(directory, keep_bags, workers or 1) if plan.kind == "network" else None
+    with Store.open(directory) as store:
+        done = _conduct(
+            context,
+            plan.name,
+            [point.job for point in plan.points],
+            store,
+            workers=workers,
+            scheduler=scheduler,
+            network=network,
+            other_software=other_software,
+            retry=retry,
+        )
+        judgement = judge(done.outcomes, plan.spec.level)
+        rows = rows_of(plan, done.outcomes, judgement)
+        document = finite(describe_sweep(plan, done, judgement, rows))
+        try:
+            files = write_tables(rows, document, directory)
+            shown = picture(plan, rows, column)
+            files += write_figure(shown, f"{plan.name}: {plan.kind}", directory)
+        except OSError as error:
+            raise InputError(f"{error.filename or directory}: cannot be written: {error.strerror}") from error
+    if as_json:
+        print_json(document | {"files": [str(file) for file in files]})
+    else:
+        print_sweep(plan, document, shown, result_console())
+        for file in files:
+            click.echo(file)
+    context.exit(judgement.exit_code)
+
+
+class _EndedBySignal(KeyboardInterrupt):
+    """A signal that ends the program as Ctrl-C does, with another exit code."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+def _end(number: int, _: object) -> None:
+    from msg_analysis.sweep.jobs.workers import ENDING
+
+    for each in ENDING:
+        signal.signal(each, signal.SIG_IGN)
+    raise _EndedBySignal(number)
+
+
+def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Store, **how: Any) -> Conducted:
+    """Do all jobs, with progress on stderr; if interrupted, say what is kept and exit."""
+    from msg_analysis.cli.progress import SweepProgress
+    from msg_analysis.sweep.conduct import conduct
+    from msg_analysis.sweep.jobs.workers import ENDING, WorkersLostError
+
+    if store.damaged:
+        click.echo(f"note: {store.directory}: {store.damaged} lines cannot be read: done again", err=True)
+    for number in ENDING:
+        if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+            signal.signal(number, _end)
+    try:
+        with SweepProgress(title) as progress:
+            return conduct(jobs, store, watch=progress.done, **how)
+    except (KeyboardInterrupt, WorkersLostError) as error:
+        there = sum(job.id in store.outcomes for job in jobs)
+        kept = f"{there} of {len(jobs)} points are kept in {store.directory}: the same command goes on"
+        if isinstance(error, KeyboardInterrupt):
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the exit
+            click.echo(f"\ninterrupted: {kept}", err=True)
+            if isinstance(error, _EndedBySignal):
+                context.exit(128 + error.number)
+            raise
+        complain(f"{error}: {kept}")
+        context.exit(INCOMPLETE)
+
+
+def emulate(
+    context: click.Context,
+    numbers: Sequence[int],
+    out: Path,
+    formats: Sequence[str],
+    other_software: OtherSoftware,
+    *,
+    as_json: bool,
+) -> int:
+    """``msg-analysis figures --emulate``: run the networks, write the figures; returns the exit code."""
+    from msg_analysis.paper.emulation import disagreeing, measured, runs_of, summary
+    from msg_analysis.paper.figures import write_figures
+    from msg_analysis.sweep.jobs.job import FAILED
+    from msg_analysis.sweep.jobs.network_run import options
+    from msg_analysis.sweep.outcome_store import Store
+
+    require_libraries()
+    runs = [run for number in numbers for run in runs_of(number)]
+    directory = out / "emulation"
+    network = options(directory, False, 1)
+    with Store.open(directory) as store:
+        jobs = [run.job() for run in runs]
+        done = _conduct(context, "networks", jobs, store, network=network, other_software=other_software, retry=True)
+    points = measured(runs, done.outcomes)
+    failed = [outcome for outcome in done.outcomes if outcome.status == FAILED]
+    for outcome in failed:
+        complain(f"no result: {outcome.reason}")
+    if not points:
+        return INCOMPLETE
+    files = write_figures(numbers, out, formats, points)
+    if as_json:
+        rows = [asdict(point) | {"agent": _number(point.agent)} for point in points]
+        for row in rows:
+            row["run"]["leader"] = _number(row["run"]["leader"])
+        print_json({"files": [str(file) for file in files], "points": rows, "agree": not disagreeing(points)})
+    else:
+        for path in files:
+            click.echo(path)
+        click.echo(summary(points, len(runs) - len(failed)))
+    return DISAGREES if disagreeing(points) else INCOMPLETE if failed else 0
+
+
+def _number(agent: int | None) -> int | None:
+    """Number of an agent in texts and JSON, from 1; None for the system."""
+    return None if agent is None else agent + 1

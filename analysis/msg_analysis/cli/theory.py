@@ -1,0 +1,88 @@
+"""Commands of ``msg-analysis`` for theory beyond the steady state: ``transient`` and ``facts``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from msg_analysis.cli.console import examples, print_json, result_console
+from msg_analysis.cli.options import FILE, experiment_argument, json_option
+from msg_analysis.common.files import require_place
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis transient line_ring.yaml --times 0:10:0.5",
+        "msg-analysis transient line_ring.yaml --times 0,1,10 --law continuous",
+    )
+)
+@experiment_argument
+@click.option(
+    "--times", metavar="TIMES", required=True, help="START:STOP:STEP or t1,t2,... in units of simulated time."
+)
+@click.option(
+    "--law",
+    type=click.Choice(["emulated", "continuous"]),
+    default="emulated",
+    help="The steps of the run, or the paper's continuous time.",
+)
+@click.option("--unreduced", is_flag=True, help="Consensus: of the states themselves, not of the disagreement.")
+@click.option("--fraction", type=float, metavar="F", default=0.05, help="Of the steady error, for the settling time.")
+@click.option("--moments", is_flag=True, help="With --json: means and second moments of every graph as well.")
+@click.option("--csv", "table", type=FILE, metavar="FILE", help="Write a table as well.")
+@json_option
+def transient(
+    experiment: Path,
+    times: str,
+    law: str,
+    unreduced: bool,
+    fraction: float,
+    moments: bool,
+    table: Path | None,
+    as_json: bool,
+) -> None:
+    """Predict the errors of EXPERIMENT over time, from its own start, exactly."""
+    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.report.documents.transient_and_facts import describe_transient, parse_times, write_transient_csv
+
+    require_place(table)
+    loaded = Experiment.load(experiment)
+    loaded.require_available("predict")
+    document = describe_transient(
+        loaded,
+        parse_times(times),
+        law=law,  # type: ignore[arg-type]  # click has checked it
+        unreduced=unreduced,
+        moments=moments,
+        fraction=fraction,
+    )
+    if table:
+        write_transient_csv(document, table)
+    if as_json:
+        print_json(document)
+    else:
+        from msg_analysis.report.terminal.theory_text import print_transient
+
+        print_transient(document, result_console())
+
+
+@click.command(
+    epilog=examples("msg-analysis facts line_ring.yaml", "msg-analysis facts line_ring.yaml --json | jq .bounds")
+)
+@experiment_argument
+@json_option
+def facts(experiment: Path, as_json: bool) -> None:
+    """Check the paper's lemmas on EXPERIMENT; bounds, indices of its graphs, two graphs in closed form."""
+    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.report.documents.transient_and_facts import describe_facts
+
+    loaded = Experiment.load(experiment)
+    loaded.require_available("predict")
+    document = describe_facts(loaded)
+    if as_json:
+        print_json(document)
+    else:
+        from msg_analysis.report.terminal.theory_text import print_facts
+
+        print_facts(document, result_console())

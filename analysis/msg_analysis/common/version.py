@@ -1,0 +1,8 @@
+"""Version of the installed package."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("msg_analysis")
+except PackageNotFoundError:  # run from a source tree that nobody installed
+    __version__ = "0.0.0"

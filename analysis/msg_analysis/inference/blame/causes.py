@@ -1,0 +1,314 @@
+"""Diagnosis of a run that disagrees: single causes that explain it, with estimates, in words.
+
+Causes are searched for in groups: frozen agents; gains, references and ignored messages (regression of the
+innovations); noise variances; switching rates; losses; broadcast noise. Within a group they are selected forwards, each
+given the others. Consequences across groups are removed: frozen agents are left out of the regression and of the noise,
+and the part of the innovations that wrong gains explain is not counted as noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy import stats
+
+from msg_analysis.common.number_words import percent
+from msg_analysis.inference.blame import suspects
+from msg_analysis.inference.blame.switching_rates import find_rates
+from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
+from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import BroadcastSums, LossTally
+from msg_analysis.inference.hypothesis_tests.switching import Transitions
+from msg_analysis.inference.statistics.forward_selection import Selected, select
+from msg_analysis.model.network.markov_chain import MarkovChain
+
+Kind = Literal[
+    "frozen",
+    "gain",
+    "ignored",
+    "reference",
+    "offset",
+    "noise",
+    "correlation",
+    "switching",
+    "loss",
+    "broadcast",
+    "unknown",
+]
+MAX_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One thing that is wrong."""
+
+    kind: Kind
+    words: str  # a sentence
+    agent: int | None = None  # from 1; None where the cause is not one agent
+    link: tuple[int, int] | None = None  # from 1: sender and receiver, or the two ends of an edge or of a correlation
+    graph: str | list[str] | None = None  # name; for switching [from, to] or [from]; None: all graphs
+    estimate: float | None = None  # measured: factor of a gain or variance, share, rate, correlation or value
+    interval: tuple[float, float] | None = None  # 95 %, for this cause alone
+    expected: float | None = None  # the same according to the experiment; 1 for a factor
+    p: float | None = None  # adjusted for all candidate causes; 0 where the law makes it impossible
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON document."""
+        return {
+            "kind": self.kind,
+            "words": self.words,
+            "agent": self.agent,
+            "link": list(self.link) if self.link else None,
+            "graph": self.graph,
+            "estimate": self.estimate,
+            "interval": list(self.interval) if self.interval else None,
+            "expected": self.expected,
+            "p": self.p,
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Accused:
+    """What is known of runs that disagree: the law, and sums over the runs."""
+
+    names: Sequence[str]  # of the graphs
+    chain: MarkovChain
+    dt: float  # simulated time of a step
+    reference: float
+    innovations: InnovationSums
+    transitions: Transitions
+    loss: LossTally | None  # None without loss
+    broadcast: BroadcastSums | None  # None without broadcast noise
+
+
+def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list[Cause]:
+    """Find what is wrong with runs that disagree: frozen agents first, then by p-value; never empty.
+
+    ``level`` bounds the probability of finding a cause where nothing is wrong. Where nothing is found, one cause of
+    kind "unknown" names the ``rejected`` tests.
+    """
+    sums, names = accused.innovations, accused.names
+    still = suspects.frozen(sums)
+    pardoned = [agent for agent, _, _ in still]
+    gains = suspects.gains(sums, pardoned)
+    losses = broadcast = None
+    if accused.loss:
+        tally = accused.loss
+        losses = suspects.losses(tally.pairs, tally.messages, tally.lost, tally.probability)
+    if accused.broadcast:
+        broadcast = suspects.variances(np.diag(accused.broadcast.scatter), accused.broadcast.samples)
+    # All classes count before anything is selected: also the 3 of the rates and the 1 of the pairs.
+    guess = suspects.noise(sums, pardoned, np.zeros(len(sums.terms)))
+    groups = (gains, guess, losses, broadcast)
+    families = sum(len(group.classes) for group in groups if group) + 4
+    found = [_frozen_words(*entry) for entry in still]
+    found += _switching(accused, families, level)
+    change = np.zeros(len(sums.terms))
+    if gains:
+        selected, change = select(gains.score, gains.information, gains.classes, families, level)
+        found += [_gain_words(one, accused) for one in selected]
+    noise = suspects.noise(sums, pardoned, change)
+    if noise:
+        selected, _ = select(noise.score, noise.information, noise.classes, families, level)
+        found += [_noise_words(one, names) for one in selected]
+        if not change.any():  # wrong gains correlate the agents' innovations, too
+            found += _correlations(sums, pardoned, families, level)
+    if losses and accused.loss:
+        selected, _ = select(losses.score, losses.information, losses.classes, families, level)
+        found += [_loss_words(one, accused.loss) for one in selected]
+    if broadcast:
+        selected, _ = select(broadcast.score, broadcast.information, broadcast.classes, families, level)
+        found += [_broadcast_words(one) for one in selected]
+    if not found:
+        return [_unknown(rejected)]
+    return sorted(found, key=lambda cause: (cause.kind != "frozen", cause.p or 0.0))
+
+
+def _frozen_words(agent: int, still: int, steps: int) -> Cause:
+    share = still / steps
+    low, high = _share_interval(still, steps)
+    when = "in any of its steps" if still == steps else f"in {percent(share)} of its steps"
+    words = f"agent {agent + 1} does not move {when}, although it has noise"
+    return Cause("frozen", words, agent=agent + 1, estimate=share, interval=(low, high), expected=0.0, p=0.0)
+
+
+def _gain_words(one: Selected, accused: Accused) -> Cause:
+    part, what = one.part, one.what
+    names, p = accused.names, math.exp(one.log_p)
+    low, high = one.interval
+    if part == "reference":
+        at = accused.reference
+        numbers = _numbers(at + one.estimate, (at + low, at + high))
+        words = f"the leaders are pulled to {numbers}, not to the reference {at:g}"
+        return Cause("reference", words, None, None, None, at + one.estimate, (at + low, at + high), at, p)
+    if part == "offset":
+        value, interval = one.estimate / accused.dt, (low / accused.dt, high / accused.dt)
+        words = f"agent {what + 1} drifts by {_numbers(value, interval)} per unit of time, for no reason"
+        return Cause("offset", words, what + 1, None, None, value, interval, 0.0, p)
+    factor, interval = 1.0 + one.estimate, (1.0 + low, 1.0 + high)
+    if part in ("all", "sender") and -1.2 < one.estimate < 0.0:
+        share, around = -one.estimate, (max(-high, 0.0), -low)
+        whose = "all messages" if part == "all" else f"the messages of agent {what + 1}"
+        shown = f"{percent(share)} ({100 * around[0]:.3g} to {100 * around[1]:.3g} %)"
+        words = f"{shown} of {whose} have no effect: they are ignored, or all gains on them are that much too small"
+        return Cause("ignored", words, None if part == "all" else what + 1, None, None, share, around, 0.0, p)
+    whose, agent, link, graph = _whose_gain(part, what)
+    name = None if graph is None else names[graph]
+    where = "" if name is None else f" in graph {name}"
+    words = f"{whose}{where} is {_numbers(factor, interval)} times what the file says"
+    return Cause("gain", words, agent, link, name, factor, interval, 1.0, p)
+
+
+def _whose_gain(part: str, what: Any) -> tuple[str, int | None, tuple[int, int] | None, int | None]:
+    """In words; agent and link from 1, graph from 0."""
+    if part == "link":
+        sender, receiver, graph = what
+        return f"the gain of agent {receiver + 1} on agent {sender + 1}", None, (sender + 1, receiver + 1), graph
+    if part == "edge":
+        pair, graph = what
+        first, second = sorted(pair)
+        return f"the gain of the edge {first + 1}-{second + 1}, both ways,", None, (first + 1, second + 1), graph
+    if part == "receiver in graph":
+        return f"agent {what[0] + 1}'s gain on all that it hears", what[0] + 1, None, what[1]
+    if part == "receiver":
+        return f"agent {what + 1}'s gain on all that it hears", what + 1, None, None
+    if part == "leader":
+        return f"agent {what + 1}'s gain as a leader", what + 1, None, None
+    if part == "sender":
+        return f"the gain of all others on agent {what + 1}", what + 1, None, None
+    if part == "graph":
+        return "every gain", None, None, what
+    return ("the gain of the leaders" if part == "leaders" else "every gain"), None, None, None
+
+
+def _noise_words(one: Selected, names: Sequence[str]) -> Cause:
+    part, what = one.part, one.what
+    agent = {"agent": what, "agent in graph": what[0] if part == "agent in graph" else None}.get(part)
+    graph = {"graph": what, "agent in graph": what[1] if part == "agent in graph" else None}.get(part)
+    name = None if graph is None else names[graph]
+    whose = "the noise variance of all agents" if agent is None else f"agent {agent + 1}'s noise variance"
+    where = "" if name is None else f" in graph {name}"
+    factor, interval = math.exp(one.estimate), (math.exp(one.interval[0]), math.exp(one.interval[1]))
+    words = f"{whose}{where} is {_numbers(factor, interval)} times what the file says"
+    number = None if agent is None else agent + 1
+    return Cause("noise", words, number, None, name, factor, interval, 1.0, math.exp(one.log_p))
+
+
+def _correlations(sums: InnovationSums, pardoned: Sequence[int], families: int, level: float) -> list[Cause]:
+    """Pairs of agents whose noise correlation differs from the expected one, by Fisher's z."""
+    m = sums.still.shape[1]
+    agents = [i for i in range(m) if i not in pardoned]
+    pairs = [(i, j) for place, i in enumerate(agents) for j in agents[:place]]
+    if not 0 < len(pairs) <= MAX_PAIRS:
+        return []
+    samples = int(sums.samples.sum())
+    should = np.tensordot(sums.samples, sums.noises, axes=1)
+    scatter = sums.scatter.sum(axis=0)
+    found = []
+    for j, i in sorted((j, i) for i, j in pairs):
+        size, expected_size = scatter[i, i] * scatter[j, j], should[i, i] * should[j, j]
+        if size <= 0.0 or expected_size <= 0.0 or samples < suspects.MIN_SAMPLES:
+            continue
+        seen, expected = scatter[i, j] / math.sqrt(size), should[i, j] / math.sqrt(expected_size)
+        if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
+            continue
+        z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
+        log_p = math.log(2.0 * len(pairs) * families) + float(stats.norm.logsf(abs(z)))
+        if log_p < math.log(level):
+            half = float(stats.norm.ppf(0.975)) / math.sqrt(samples - 3)
+            interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
+            words = (
+                f"the noise of the agents {j + 1} and {i + 1} has the correlation {_numbers(seen, interval)}, "
+                f"not {expected:.3g}"
+            )
+            link = (j + 1, i + 1)
+            found.append(Cause("correlation", words, None, link, None, seen, interval, expected, math.exp(log_p)))
+    return found
+
+
+def _switching(accused: Accused, families: int, level: float) -> list[Cause]:
+    """Switching rates, or in discrete time probabilities, that are wrong."""
+    names, counts = accused.names, accused.transitions.counts
+    transition = accused.chain.transition(accused.dt)
+    found = []
+    for g, h in np.argwhere((counts > 0) & (transition == 0.0)).tolist():
+        words = f"the graph went {counts[g, h]} times from {names[g]} to {names[h]}, which it never should"
+        found.append(Cause("switching", words, None, None, [names[g], names[h]], float(counts[g, h]), None, 0.0, 0.0))
+    if found:
+        return found
+    what = "rate" if accused.chain.time == "continuous" else "probability"
+    for rate in find_rates(counts, accused.chain, accused.dt, families, level):
+        low, high = rate.interval
+        if len(rate.jumps) == 1:
+            g, h = rate.jumps[0]
+            expected = float(accused.chain.matrix[g, h])
+            estimate, interval = rate.factor * expected, (low * expected, high * expected)
+            words = (
+                f"the {what} of switching from {names[g]} to {names[h]} is {_numbers(estimate, interval)}, "
+                f"not {expected:.3g}"
+            )
+            where: list[str] | None = [names[g], names[h]]
+        else:
+            expected, estimate, interval = 1.0, rate.factor, (low, high)
+            where = None if rate.origin is None else [names[rate.origin]]
+            whose = f"all {what}s" if where is None else f"the {what}s of switching away from {where[0]}"
+            whose = f"{whose} of switching" if where is None else whose
+            whose = whose.replace("probabilitys", "probabilities")
+            words = f"{whose} are {_numbers(estimate, interval)} times what the file says"
+        found.append(Cause("switching", words, None, None, where, estimate, interval, expected, math.exp(rate.log_p)))
+    return found
+
+
+def _loss_words(one: Selected, tally: LossTally) -> Cause:
+    part, what = one.part, one.what
+    receiver, sender = tally.pairs.T
+    chosen: Any = slice(None)
+    agent, link, whose = None, None, "all messages"
+    if part == "link":
+        chosen = (sender == what[0]) & (receiver == what[1])
+        link, whose = (what[0] + 1, what[1] + 1), f"the messages from agent {what[0] + 1} to agent {what[1] + 1}"
+    elif part in ("receiver", "sender"):
+        chosen = (receiver if part == "receiver" else sender) == what
+        agent, whose = what + 1, f"the messages {'to' if part == 'receiver' else 'of'} agent {what + 1}"
+    lost, messages = int(tally.lost[chosen].sum()), int(tally.messages[chosen].sum())
+    share, interval = lost / messages, _share_interval(lost, messages)
+    words = (
+        f"{percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %) of {whose} are lost, "
+        f"not {percent(tally.probability)}"
+    )
+    return Cause("loss", words, agent, link, None, share, interval, tally.probability, math.exp(one.log_p))
+
+
+def _broadcast_words(one: Selected) -> Cause:
+    part, what = one.part, one.what
+    factor, interval = math.exp(one.estimate), (math.exp(one.interval[0]), math.exp(one.interval[1]))
+    agent = what + 1 if part == "agent" else None
+    whose = "all agents publish" if agent is None else f"agent {agent} publishes"
+    words = f"the variance of the noise in what {whose} is {_numbers(factor, interval)} times what the file says"
+    return Cause("broadcast", words, agent, None, None, factor, interval, 1.0, math.exp(one.log_p))
+
+
+def _unknown(rejected: Sequence[str]) -> Cause:
+    names = ", ".join(rejected)
+    if list(rejected) == ["innovations: whiteness"]:
+        words = "the noise of successive steps, or of replicas, goes together: random numbers are used twice"
+    elif set(rejected) <= {"system error", "covariance"} or all(name.startswith("error of") for name in rejected):
+        words = (
+            f"nothing is wrong with the steps themselves: rare chance, or another start than the file says ({names})"
+        )
+    else:
+        words = f"no single gain, noise or rate explains it ({names})"
+    return Cause("unknown", words)
+
+
+def _numbers(value: float, interval: tuple[float, float]) -> str:
+    return f"{value:#.3g} ({interval[0]:#.3g} to {interval[1]:#.3g})"
+
+
+def _share_interval(count: int, total: int) -> tuple[float, float]:
+    """95 %, exact (Clopper and Pearson 1934)."""
+    low = float(stats.beta.ppf(0.025, count, total - count + 1)) if count else 0.0
+    return low, float(stats.beta.ppf(0.975, count + 1, total - count)) if count < total else 1.0

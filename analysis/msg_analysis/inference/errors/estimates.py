@@ -1,0 +1,138 @@
+"""Measured errors beside their expectations."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from msg_analysis.inference.errors.time_means import TimeMeans
+from msg_analysis.inference.hypothesis_tests.innovations import quadratic_form
+from msg_analysis.inference.statistics.holm import holm
+from msg_analysis.theory.system.jump_system import JumpSystem
+from msg_analysis.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A measured error beside its prediction; None where a number is not available.
+
+    Attributes
+    ----------
+    measured, predicted
+        time mean over the run, and its exact expectation
+    standard_error
+        of ``measured``, by the martingale method
+    z
+        (measured - predicted) / standard_error; None without noise
+    p
+        two-sided, of z
+    p_holm
+        adjusted over the nodes; None for the system error
+    """
+
+    measured: float | None = None
+    predicted: float | None = None
+    standard_error: float | None = None
+    z: float | None = None
+    p: float | None = None
+    p_holm: float | None = None
+
+    @property
+    def interval(self) -> tuple[float | None, float | None]:
+        """95 % confidence interval around the measured error."""
+        if self.measured is None or self.standard_error is None:
+            return None, None
+        half = float(stats.norm.ppf(0.975)) * self.standard_error
+        return self.measured - half, self.measured + half
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON document."""
+        return {**asdict(self), "interval": list(self.interval)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CovarianceTest:
+    """Test of all second moments together."""
+
+    measured: FloatArray | None = None  # (m, m) time mean
+    predicted: FloatArray | None = None  # (m, m) its expectation
+    chi2: float | None = None  # of the half-vectorised difference; None without a joint test
+    dof: int | None = None  # of ``chi2``
+    p: float | None = None
+    note: str | None = None  # why there is no test
+
+
+def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:
+    """The system error and the node errors; the latter without standard errors where only the system error has one."""
+    combinations = np.vstack([means.trace, means.nodes])
+    measured, predicted = combinations @ means.measured, combinations @ means.predicted
+    errors = np.sqrt(np.einsum("aq,qr,ar->a", combinations, means.covariance, combinations).clip(0.0))
+    found, nodes = beside(measured, predicted, errors)
+    if not len(means.nodes):
+        both = (np.diag(system.lifted(matrix)) for matrix in (means.second_moments, means.expected_moments))
+        return found, [Estimate(float(m), float(p)) for m, p in zip(*both, strict=True)]
+    return found, nodes
+
+
+def beside(measured: FloatArray, predicted: FloatArray, errors: FloatArray) -> tuple[Estimate, list[Estimate]]:
+    """Estimates of the system error and of the node errors from arrays (1 + nodes,), the system error first.
+
+    ``errors`` are standard errors. The p-values of the nodes are adjusted by Holm.
+    """
+    found = [estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
+    tested = [i for i, entry in enumerate(found) if i > 0 and entry.p is not None]
+    adjusted = dict(zip(tested, holm(np.array([found[i].p for i in tested], dtype=float)), strict=True))
+    nodes = [
+        Estimate(e.measured, e.predicted, e.standard_error, e.z, e.p, float(adjusted[i]) if i in adjusted else None)
+        for i, e in enumerate(found)
+        if i > 0
+    ]
+    return found[0], nodes
+
+
+def estimate(measured: float, predicted: float, error: float, scale: float) -> Estimate:
+    """A measured error beside its prediction; a standard error of rounding size, relative to ``scale``, gives no z."""
+    if error <= 1e-12 * scale or error == 0.0:  # without noise: rounding only
+        return Estimate(float(measured), float(predicted), float(error))
+    z = float((measured - predicted) / error)
+    return Estimate(float(measured), float(predicted), float(error), z, float(2 * stats.norm.sf(abs(z))))
+
+
+def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
+    """Test of all second moments together, by the quadratic form of measured - predicted.
+
+    Its law is chi-square where the covariance is known from the model. Where it is estimated from n squares (lost
+    messages), it is Hotelling's T^2: (n - dof) / (dof (n - 1)) T^2 has the law F(dof, n - dof).
+
+    Parameters
+    ----------
+    means
+        of the run, or of several
+    system
+        the reduced system whose moments they are
+
+    Returns
+    -------
+    CovarianceTest
+        without ``chi2`` where not all moments are estimated together; without ``p`` where dof = 0 or n <= dof
+    """
+    measured = system.lifted(means.second_moments)
+    predicted = system.lifted(means.expected_moments)
+    if not means.joint:
+        note = "too many agents for a joint test; the node errors are tested one by one"
+        if not len(means.nodes):
+            note = "too many agents for a joint test, and for tests of the node errors in a run of this length"
+        return CovarianceTest(measured, predicted, note=note)
+    chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
+    p: float | None = None
+    if dof and not means.squares:
+        p = float(stats.chi2.sf(chi2, dof))
+    elif dof and means.squares > dof:
+        # The covariance is itself estimated, from this many squares. Chi-square would reject too often; Hotelling's
+        # law, which assumes that all of it is estimated, rejects slightly too seldom.
+        rest = means.squares - dof
+        p = float(stats.f.sf(chi2 * rest / (dof * (means.squares - 1)), dof, rest))
+    return CovarianceTest(measured, predicted, chi2, dof, p)

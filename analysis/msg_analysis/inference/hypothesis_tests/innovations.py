@@ -1,0 +1,298 @@
+"""Tests of the innovations e(k) = x(k+1) - W_g(k) x(k) - offset_g(k): what a step adds to its mean.
+
+Under the model the e(k) are independent N(0, N_g(k)), for any path of the graphs; so these tests are exact or nearly
+so, and find what the time means hardly show. With noise or loss on the air, and in real time, the same holds given the
+values that the agents heard (see ``heard_values``), for any timing. See docs/statistics.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from msg_analysis.inference.hypothesis_tests.gain_regression import MAX_REGRESSORS, StateRegression
+from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
+from msg_analysis.inference.observed.heard_values import (
+    NO_NOISE,
+    Equalizer,
+    Reception,
+    full_reception_noise,
+)
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.statistics.covariance_test import covariance_statistic
+from msg_analysis.model.step.step_model import StepModel
+from msg_analysis.types import FloatArray, IntArray
+
+LAGS = 10
+ROUNDING = 1e-9  # relative size of what counts as rounding in directions without noise
+
+
+@dataclass(frozen=True, slots=True)
+class InnovationTests:
+    """p-values; None where there is nothing to test."""
+
+    p_covariance: float | None  # of their covariance being N_g; 0 if anything moves in a direction without noise
+    p_whiteness: float | None  # correlation in time (lags 1..10) and between replicas
+    p_gain: float | None  # regression on what the agents heard: wrong gains, references, offsets
+    p_common_gain: float | None = None  # the same for one factor of all gains: ignored messages
+    # (m,) measured over nominal variance; NaN where an agent has no noise in some graph
+    ratios: tuple[float, ...] | None = None
+    samples: int | None = None  # of each agent, replicas counted; samples * ratio is chi-square(samples)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Directions:
+    """Directions of the noise of one graph, N_g = (basis * variances) basis^T, largest variance first."""
+
+    whitener: FloatArray  # (r, m)
+    quiet: FloatArray  # (m, m - r) orthonormal basis of the directions without noise
+
+
+class InnovationSums:
+    """Sums over the innovations of runs of one experiment: enough for the tests and for the diagnosis (``blame``).
+
+    In real time, ``position`` is that of ``events.Order``, (N, m).
+    """
+
+    def __init__(self, observation: Observation, position: IntArray | None = None) -> None:
+        step, noise = observation.step, observation.prediction.experiment.noise
+        n, m = step.modes, step.agents
+        # (n, m, m) nominal covariances
+        self.noises: FloatArray = full_reception_noise(observation) if noise.on_air else step.noise
+        self.replicas = observation.replicas
+        # Number of innovations, replicas counted, and sum of e e^T, by graph.
+        self.samples, self.scatter = np.zeros(n, np.int64), np.zeros((n, m, m))
+        self.still = np.zeros((n, m), np.int64)  # steps in which no replica of an agent changed
+        self.quiet = self.largest = 0.0  # largest |e| in directions without noise; largest |x|
+        self._directions = [_directions(matrix) for matrix in self.noises]
+        # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
+        self._whiteness = Whiteness(min(len(d.whitener) for d in self._directions))
+        varies = step.loss > 0.0 and noise.link > 0.0
+        if observation.timers:
+            varies = bool((step.noise_gain != step.noise_gain[0]).any())
+        self._equalizer = Equalizer(step, self.noises) if varies else None
+        regression: StateRegression | HeardRegression = (
+            HeardRegression(observation, MAX_REGRESSORS, position if _correlated(step) else None)
+            if noise.on_air or observation.timers
+            else StateRegression(observation, MAX_REGRESSORS)
+        )
+        self._add(observation, regression)
+        self.terms = regression.terms
+        self.score, self.covariance = regression.statistic()  # (K,), (K, K)
+        self.gram = regression.gram()  # (K, K), see ``StateRegression.gram``; None where it is not available
+
+    @property
+    def steps(self) -> IntArray:
+        """(n,): steps of each graph."""
+        return self.samples // self.replicas
+
+    def merge(self, other: InnovationSums) -> None:
+        """Add the sums of another run of the same experiment, with another seed."""
+        self.samples += other.samples
+        self.scatter += other.scatter
+        self.still += other.still
+        self.quiet, self.largest = max(self.quiet, other.quiet), max(self.largest, other.largest)
+        self._whiteness.merge(other._whiteness)
+        if self._equalizer and other._equalizer:
+            self._equalizer.merge(other._equalizer)
+        self.score += other.score
+        self.covariance += other.covariance
+        self.gram = None if self.gram is None or other.gram is None else self.gram + other.gram
+
+    def tests(self) -> InnovationTests:
+        """All tests of the innovations."""
+        ratios: tuple[float, ...] | None = None
+        # Variances below NO_NOISE are allowed for: ten standard deviations.
+        hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
+        p_whiteness = self._whiteness.p_value()
+        if self._equalizer and not self._equalizer.possible:
+            p_covariance, p_whiteness = self._equalizer.p_size(), None
+        else:
+            p_covariance, ratios = self._covariance_p(), self._ratios()
+        if self.quiet > max(ROUNDING * self.largest, hidden):
+            p_covariance = 0.0
+        chi2, dof = quadratic_form(self.score, self.covariance)
+        p_gain = float(stats.chi2.sf(chi2, dof)) if dof else None
+        p_common_gain = self._common_gain_p() if dof else None
+        return InnovationTests(p_covariance, p_whiteness, p_gain, p_common_gain, ratios, int(self.samples.sum()))
+
+    def _ratios(self) -> tuple[float, ...]:
+        """(m,): see ``InnovationTests``."""
+        seen = self.samples > 0
+        noise = np.diagonal(self.noises, axis1=1, axis2=2)[seen]
+        scatter = np.diagonal(self.scatter, axis1=1, axis2=2)[seen]
+        noisy = noise > NO_NOISE * noise.max(initial=0.0)
+        parts = np.divide(scatter, noise, out=np.full_like(scatter, np.nan), where=noisy)
+        return tuple((parts.sum(axis=0) / max(int(self.samples.sum()), 1)).tolist())
+
+    def _common_gain_p(self) -> float | None:
+        """Score test of one direction of the regression: every message counts for less, or more, than it should."""
+        agents = np.array([term.agent for term in self.terms])
+        size = np.diagonal(self.noises, axis1=1, axis2=2).mean(axis=0)[agents]
+        weights = np.array([term.weight if term.kind in ("link", "pull") else 0.0 for term in self.terms])
+        weights = np.divide(weights, size, out=np.zeros_like(weights), where=size > NO_NOISE * size.max(initial=0.0))
+        variance = float(weights @ self.covariance @ weights)
+        if variance <= 0.0:
+            return None
+        return float(2.0 * stats.norm.sf(abs(float(weights @ self.score)) / np.sqrt(variance)))
+
+    def _add(self, observation: Observation, regression: StateRegression | HeardRegression) -> None:
+        """One pass over the run."""
+        m = observation.step.agents
+        for first, last in observation.blocks(max(observation.states[0].size, regression.numbers_per_step)):
+            modes = observation.modes[first:last]
+            if isinstance(regression, HeardRegression):
+                reception = Reception.of(observation, first, last)
+                e = innovations(observation, first, last, reception)
+                regression.add(reception, e, first)
+                if self._equalizer:
+                    e = self._equalizer.equalize(e, reception)
+                    self.quiet = max(self.quiet, self._equalizer.quiet)
+            else:
+                e = innovations(observation, first, last)
+                regression.add(modes, observation.states[first:last], e)
+            states = observation.states[first : last + 1]
+            self.largest = max(self.largest, float(np.abs(states[:-1]).max()))
+            unmoved = (states[1:] == states[:-1]).all(axis=2)
+            white = np.empty((last - first, self._whiteness.rank, observation.replicas))
+            for mode, direction in enumerate(self._directions):
+                at = np.flatnonzero(modes == mode)
+                if not at.size:
+                    continue
+                flat = e[at].transpose(1, 0, 2).reshape(m, -1)
+                self.samples[mode] += flat.shape[1]
+                self.scatter[mode] += flat @ flat.T
+                self.still[mode] += unmoved[at].sum(axis=0)
+                self.quiet = max(self.quiet, float(np.abs(direction.quiet.T @ flat).max(initial=0.0)))
+                white[at] = direction.whitener[: self._whiteness.rank] @ e[at]
+            self._whiteness.add(white)
+
+    def _covariance_p(self) -> float | None:
+        """Of all steps together when the noise is the same in every graph, else added up over the graphs."""
+        modes = range(len(self.noises))
+        groups = [list(modes)] if (self.noises == self.noises[0]).all() else [[g] for g in modes]
+        statistic, dof = 0.0, 0.0
+        for group in groups:
+            whitener = self._directions[group[0]].whitener
+            samples = int(self.samples[group].sum())
+            if len(whitener) and samples:
+                scatter = whitener @ self.scatter[group].sum(axis=0) @ whitener.T
+                part = covariance_statistic(scatter, samples)
+                statistic, dof = statistic + part[0], dof + part[1]
+        return float(stats.chi2.sf(statistic, dof)) if dof else None
+
+
+def innovation_tests(observation: Observation, position: IntArray | None = None) -> InnovationTests:
+    """Test the innovations of a run: covariance, whiteness and gains.
+
+    ``position`` is that of ``events.Order``, (N, m), in real time; see ``covariance_statistic``, ``Whiteness`` and
+    ``StateRegression`` for the tests.
+    """
+    return InnovationSums(observation, position).tests()
+
+
+def innovations(observation: Observation, first: int, last: int, reception: Reception | None = None) -> FloatArray:
+    """(last - first, m, R): innovations e(k) of the steps first..last-1, given what was heard.
+
+    Without a ``reception`` of these steps, all agents heard the states themselves.
+    """
+    step, now = observation.step, observation.states[first:last]
+    after = observation.states[first + 1 : last + 1].copy()
+    if reception is not None:
+        offsets = step.offsets[reception.graphs, np.arange(step.agents)]
+        return np.asarray(after - reception.mean() - offsets[:, :, None])
+    for mode in range(step.modes):
+        at = np.flatnonzero(observation.modes[first:last] == mode)
+        after[at] -= step.weights[mode] @ now[at] + step.offsets[mode][:, None]
+    return after
+
+
+def _correlated(step: StepModel) -> bool:
+    """Whether the process noise of two agents can be correlated, under any graphs that they use."""
+    together = np.einsum("gik,hjk->ij", np.abs(step.noise_gain), np.abs(step.noise_gain))
+    return bool((together - np.diag(np.diag(together))).any())
+
+
+def _directions(noise: FloatArray) -> _Directions:
+    values, vectors = np.linalg.eigh(noise)
+    values, vectors = values[::-1], vectors[:, ::-1]
+    rank = int((values > NO_NOISE * values[0]).sum()) if values[0] > 0.0 else 0
+    return _Directions((vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:])
+
+
+class Whiteness:
+    """Portmanteau test of iid N(0, I) vectors of length r: lags 1..LAGS, and lag 0 between replicas.
+
+    The sum of squared sample correlations, each over its variance under the null hypothesis, is chi-square with LAGS
+    r^2 degrees of freedom, and r more where there are replicas.
+    """
+
+    def __init__(self, rank: int) -> None:
+        self.rank = rank
+        self._tail: FloatArray | None = None
+        self._products = np.zeros((LAGS, rank, rank))
+        self._counts = np.zeros(LAGS)
+        self._squares = np.zeros(rank)
+        self._pairs = np.zeros(rank)
+        self._steps, self._replicas = 0, 1
+
+    def add(self, white: FloatArray) -> None:
+        """Add the next block (b, r, R), which is standard normal if the law holds."""
+        self._steps += len(white)
+        self._replicas = white.shape[2]
+        squares = (white**2).sum(axis=2)
+        self._squares += squares.sum(axis=0)
+        self._pairs += ((white.sum(axis=2) ** 2 - squares) / 2).sum(axis=0)
+        joined = white if self._tail is None else np.concatenate([self._tail, white])
+        old = len(joined) - len(white)
+        for lag in range(1, LAGS + 1):
+            begin = max(old, lag)
+            if begin >= len(joined):
+                continue
+            late, early = joined[begin:], joined[begin - lag : len(joined) - lag]
+            self._products[lag - 1] += np.tensordot(late, early, axes=([0, 2], [0, 2]))
+            self._counts[lag - 1] += len(late) * self._replicas
+        self._tail = joined[-LAGS:]
+
+    def merge(self, other: Whiteness) -> None:
+        """Add the sums of another run with another seed; no lags are counted across runs."""
+        self._products += other._products
+        self._counts += other._counts
+        self._squares += other._squares
+        self._pairs += other._pairs
+        self._steps += other._steps
+
+    def p_value(self) -> float | None:
+        """None without noise or with at most LAGS steps. Coordinates are scaled by their size, tested elsewhere."""
+        size = self._squares / (self._steps * self._replicas)
+        if not self.rank or self._steps <= LAGS or not (size > 0.0).all():
+            return None
+        correlations = self._products**2 / np.outer(size, size)
+        chi2 = float((correlations.sum(axis=(1, 2)) / self._counts).sum())
+        dof = LAGS * self.rank**2
+        if self._replicas > 1:
+            pairs = self._steps * self._replicas * (self._replicas - 1) / 2
+            chi2 += float((self._pairs**2 / size**2).sum() / pairs)
+            dof += self.rank
+        return float(stats.chi2.sf(chi2, dof))
+
+
+def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, int]:
+    """(v^T C^+ v, rank C), with the rank judged on the correlations (eigenvalues above 1e-10), whatever the units.
+
+    Parameters
+    ----------
+    vector
+        (q,)
+    covariance
+        (q, q)
+    """
+    variances = np.diag(covariance)
+    alive = np.flatnonzero(variances > 1e-24 * variances.max(initial=0.0))
+    deviation = np.sqrt(variances[alive])
+    values, vectors = np.linalg.eigh(covariance[np.ix_(alive, alive)] / np.outer(deviation, deviation))
+    keep = values > 1e-10
+    scores = vectors[:, keep].T @ (vector[alive] / deviation)
+    return float((scores**2 / values[keep]).sum()), int(keep.sum())

@@ -1,0 +1,196 @@
+"""What the agents heard in the steps of a run, with noise or loss on the air, and in real time.
+
+The log gives, for every step, what each agent used: which values of its neighbours, and in real time their steps and
+the graph. Given that, the innovations are normal and independent, with an exactly known covariance: process noise, by
+the graph that each agent used, plus the link noise of the received messages. Broadcast noise, losses and delays are
+part of what was used; they are tested, or reported, separately.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy import stats
+
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.model.step.neighbours import neighbour_tables
+from msg_analysis.model.step.step_model import StepModel, Wiring
+from msg_analysis.types import FloatArray, IntArray
+
+NO_NOISE = 1e-13  # directions with less variance than this, relative to the noisiest one, count as without noise
+
+
+@lru_cache(maxsize=4)
+def neighbour_weights(step: StepModel) -> FloatArray:
+    """(n, m, D): nominal weights of the neighbours' values; 0 beyond their number."""
+    tables = neighbour_tables(step)
+    there = np.arange(step.most_neighbours) < tables.count[:, :, None]
+    return np.where(there, np.take_along_axis(step.nominal, tables.senders, axis=2), 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reception:
+    """What was heard in a block of b steps."""
+
+    modes: IntArray  # (b,) graphs of the network
+    graphs: IntArray  # (b, m) graphs that the agents used; in lockstep those of the network
+    states: FloatArray  # (b, m, R) x
+    published: FloatArray  # (N + 1, m, R) what the agents published, of all steps
+    used: IntArray  # (b, m, D) step of the used value of the d-th neighbour; arbitrary where none arrived
+    senders: IntArray  # (b, m, D) that neighbour
+    weights: FloatArray  # (b, m, D) nominal weights of received values; 0 for others
+    own: FloatArray  # (b, m) weight of an agent's own state, which also replaces values that did not arrive
+    link_variance: FloatArray  # (b, m) of the link noise in what each agent heard
+
+    @classmethod
+    def of(cls, observation: Observation, first: int, last: int) -> Reception:
+        """Reception of the steps first..last-1."""
+        step, modes, timers = observation.step, observation.modes[first:last], observation.timers
+        tables, agents = neighbour_tables(step), np.arange(step.agents)
+        if timers is None:
+            graphs = np.repeat(modes[:, None], step.agents, axis=1)
+            used = np.broadcast_to(np.arange(first, last)[:, None, None], (*graphs.shape, step.most_neighbours))
+        else:
+            graphs, used = timers.graphs[first:last], timers.used[first:last]
+        weights = neighbour_weights(step)[graphs, agents]
+        if observation.lost is not None:
+            weights = np.where(observation.lost[first:last], 0.0, weights)
+        weights = np.where(used >= 0, weights, 0.0)
+        published = observation.states if observation.published is None else observation.published
+        return cls(
+            modes=modes,
+            graphs=graphs,
+            states=observation.states[first:last],
+            published=published,
+            used=used,
+            senders=tables.senders[graphs, agents],
+            weights=weights,
+            own=step.nominal.sum(axis=2)[graphs, agents] - weights.sum(axis=2),
+            link_variance=observation.prediction.experiment.noise.link**2 * (weights**2).sum(axis=2),
+        )
+
+    def heard(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
+        """(k, a, R): what ``agents`` (a,) used of their neighbours ``which`` (a,) in the steps ``at`` (k,) of the
+        block.
+        """
+        index = at[:, None], agents, which
+        return np.asarray(self.published[self.used[index], self.senders[index]])
+
+    def mean(self) -> FloatArray:
+        """(b, m, R): the next states without noise and without the term of the reference."""
+        total = self.own[:, :, None] * self.states
+        every, agents = np.arange(len(self.modes)), np.arange(self.states.shape[1])
+        for d in range(self.weights.shape[2]):
+            total += self.weights[:, :, d, None] * self.heard(every, agents, np.full(len(agents), d))
+        return np.asarray(total)
+
+    def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
+        """Groups of like steps of the block: graphs (m,) of the agents, their order (m,) or None, steps (a,).
+
+        ``order`` (b, m) has the agents of each step, first to last.
+        """
+        if order is None and (self.graphs == self.modes[:, None]).all():
+            for mode in np.unique(self.modes):
+                at = np.flatnonzero(self.modes == mode)
+                yield self.graphs[at[0]], None, at
+            return
+        keys = self.graphs if order is None else np.column_stack([self.graphs, order])
+        found, owner = np.unique(keys, axis=0, return_inverse=True)
+        owner = owner.reshape(-1)
+        steps = np.argsort(owner, kind="stable")
+        ends = np.searchsorted(owner[steps], np.arange(len(found) + 1))
+        m = self.graphs.shape[1]
+        for number, pattern in enumerate(found):
+            at = steps[ends[number] : ends[number + 1]]
+            yield pattern[:m], None if order is None else pattern[m:], at
+
+
+def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Receiver, sender, and place among the receiver's neighbours, (links,) each, of all links of a graph.
+
+    Sorted by receiver and then by sender.
+    """
+    tables = neighbour_tables(step)
+    receiver, which = np.nonzero(np.arange(step.most_neighbours) < tables.count[mode][:, None])
+    return receiver, tables.senders[mode, receiver, which], which
+
+
+def full_reception_noise(observation: Observation) -> FloatArray:
+    """(n, m, m): covariance of the innovations of a step in which nothing is lost."""
+    step = observation.step
+    link = observation.prediction.experiment.noise.link**2 * (neighbour_weights(step) ** 2).sum(axis=2)
+    process = step.noise_gain @ step.noise_gain.transpose(0, 2, 1)
+    return np.asarray(process + link[:, :, None] * np.eye(step.agents))
+
+
+def process_noise(step: StepModel, graphs: IntArray) -> FloatArray:
+    """(m, m): covariance of the process noise of a step in which the agents use these graphs (m,)."""
+    gain = step.noise_gain[graphs, np.arange(step.agents)]
+    return np.asarray(gain @ gain.T)
+
+
+class Equalizer:
+    """Transforms innovations of steps with different covariances to the covariance of a regular step.
+
+    With N the covariance of a step and M that of a step of the network's graph in which all messages arrived and all
+    agents knew the graph, M^1/2 N^-1/2 e has the covariance M. Where N and M differ in their number of noisy directions
+    (an agent without process noise received nothing), that is not possible: then only the total size of all innovations
+    can be tested. ``full`` are the M of all graphs, (n, m, m).
+    """
+
+    def __init__(self, step: StepModel, full: FloatArray) -> None:
+        self._step = step
+        self._roots = [_root(matrix, 0.5) for matrix in full]
+        self._ranks = [rank for _, rank in self._roots]
+        self.possible = True  # for every step so far
+        # Sum of e^T N^+ e, its degrees of freedom, and the largest innovation in directions without noise.
+        self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
+
+    def equalize(self, innovations: FloatArray, reception: Reception) -> FloatArray:
+        """(b, m, R): transformed innovations (b, m, R) of the steps of a block."""
+        m = innovations.shape[1]
+        keys = np.column_stack([reception.modes, reception.graphs, reception.link_variance])
+        patterns, owner = np.unique(keys, axis=0, return_inverse=True)
+        owner = owner.reshape(-1)
+        equal = np.empty_like(innovations)
+        order = np.argsort(owner, kind="stable")
+        ends = np.searchsorted(owner[order], np.arange(len(patterns) + 1))
+        for number, pattern in enumerate(patterns):
+            at = order[ends[number] : ends[number + 1]]
+            mode, graphs, e = int(pattern[0]), pattern[1 : m + 1].astype(np.int64), innovations[at]
+            inverse, rank = _root(process_noise(self._step, graphs) + np.diag(pattern[m + 1 :]), -0.5)
+            white = inverse @ e
+            self.possible &= rank == self._ranks[mode]
+            self.chi2 += float((white**2).sum())
+            self.dof += rank * e.shape[0] * e.shape[2]
+            if rank < len(inverse):
+                projector = inverse @ np.linalg.pinv(inverse, hermitian=True)
+                self.quiet = max(self.quiet, float(np.abs(e - projector @ e).max()))
+            equal[at] = self._roots[mode][0] @ white
+        return equal
+
+    def merge(self, other: Equalizer) -> None:
+        """Add the sums of another run of the same experiment, with another seed."""
+        self.possible &= other.possible
+        self.chi2, self.dof, self.quiet = self.chi2 + other.chi2, self.dof + other.dof, max(self.quiet, other.quiet)
+
+    def p_size(self) -> float | None:
+        """Two-sided p-value of the total size of all innovations; None without noise."""
+        if not self.dof:
+            return None
+        law = stats.chi2(self.dof)
+        return float(min(1.0, 2.0 * min(law.sf(self.chi2), law.cdf(self.chi2))))
+
+
+def _root(matrix: FloatArray, power: float) -> tuple[FloatArray, int]:
+    """Symmetric power of a covariance on its noisy directions, and their number."""
+    if not (matrix - np.diag(np.diag(matrix))).any():
+        variances = np.diag(matrix)
+        noisy = variances > NO_NOISE * variances.max()
+        return np.diag(np.where(noisy, variances, 1.0) ** power * noisy), int(noisy.sum())
+    values, vectors = np.linalg.eigh(matrix)
+    noisy = values > NO_NOISE * values[-1]
+    return (vectors[:, noisy] * values[noisy] ** power) @ vectors[:, noisy].T, int(noisy.sum())

@@ -1,0 +1,90 @@
+"""Measured errors of a run without a prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.inference.observed.observation import BLOCK_NUMBERS
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.step_model import Wiring
+from msg_analysis.types import BoolArray, FloatArray, IntArray
+
+BATCH = 5  # steps averaged when searching for the end of the transient
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """The complete beginning of a run, with errors after the transient at its start."""
+
+    first: int  # step at which the errors begin
+    step: Wiring
+    deviations: FloatArray  # (N - first, m, R) from the reference, or in consensus from the agents' mean
+    modes: IntArray  # (N,) g(0..N-1)
+    lost: BoolArray | None  # (N, m, D) see ``Trajectory.lost``
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Measurement:
+        """Everything before the first gap, of a run from a bag or from the twin."""
+        experiment, steps = trajectory.record.experiment, max(trajectory.prefix, 0)
+        values = trajectory.values[:steps]
+        consensus = experiment.problem == "consensus"
+        deviations = values - (values.mean(axis=1, keepdims=True) if consensus else experiment.reference)
+        first = transient_length(_system_errors(deviations))
+        lost = trajectory.lost
+        return cls(
+            first=first,
+            step=trajectory.record.model,
+            deviations=deviations[first:],
+            modes=trajectory.modes[:steps],
+            lost=None if lost is None else lost[:steps],
+        )
+
+    @property
+    def steps(self) -> int:
+        """N."""
+        return len(self.modes)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(m, m): mean over steps and replicas of the products of the agents' deviations."""
+        flat = self.deviations.transpose(1, 0, 2).reshape(self.deviations.shape[1], -1)
+        return np.asarray(flat @ flat.T / flat.shape[1])
+
+    @property
+    def system_series(self) -> FloatArray:
+        """(N - first,): system error of every step, replicas averaged."""
+        return _system_errors(self.deviations)
+
+    def blocks(self, numbers_per_step: int) -> Iterator[tuple[int, int]]:
+        """See ``Observation.blocks``."""
+        length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
+        for first in range(0, self.steps, length):
+            yield first, min(first + length, self.steps)
+
+
+def transient_length(series: FloatArray) -> int:
+    """Steps at the start of a series without which its mean is more precise, by MSER-5 (White 1997).
+
+    Of the means of 5 steps, the number left out minimises the variance of the mean of the others, as if these were
+    independent. At most half are left out; 0 for series shorter than 20.
+
+    Parameters
+    ----------
+    series
+        (N,) in the order of time
+    """
+    count = len(series) // BATCH
+    if count < 4:
+        return 0
+    means = series[: count * BATCH].reshape(count, BATCH).mean(axis=1)
+    left = np.arange(count, 0, -1)
+    tails = np.cumsum(means[::-1])[::-1], np.cumsum(means[::-1] ** 2)[::-1]
+    scores = (tails[1] - tails[0] ** 2 / left) / left.astype(float) ** 2
+    return BATCH * int(np.argmin(scores[: count // 2 + 1]))
+
+
+def _system_errors(deviations: FloatArray) -> FloatArray:
+    return np.asarray((deviations**2).sum(axis=1).mean(axis=1))

@@ -1,0 +1,116 @@
+"""A run beside its prediction: the input of every test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.errors import InputError
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.step_model import StepModel
+from msg_analysis.theory.prediction import Prediction
+from msg_analysis.types import BoolArray, FloatArray, IntArray
+
+# States are clipped to this: fourth powers of much larger numbers overflow, and no test could be computed
+LARGEST = 1e60
+BLOCK_NUMBERS = 2_000_000  # numbers in temporary arrays per block of steps: 16 MB each, for runs of any length
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timers:
+    """What the agents of a run in real time log about each of their steps."""
+
+    graphs: IntArray  # (N, m) index of the graph that the agent used
+    used: IntArray  # (N, m, D) see ``Trajectory.used``
+    made: IntArray  # (N + 1, m) [ns of simulated time] see ``Trajectory.made``
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """The complete beginning of a run, and its prediction."""
+
+    prediction: Prediction  # of the experiment in the record
+    states: FloatArray  # (N + 1, m, R) x(0..N), clipped by ``bounded``
+    modes: IntArray  # (N,) g(0..N-1)
+    start: FloatArray  # (m, R) x(0) of the record
+    published: FloatArray | None = None  # (N + 1, m, R) what others heard of x(0..N); None where that is x
+    lost: BoolArray | None = None  # (N, m, D) see ``Trajectory.lost``
+    timers: Timers | None = None  # None in lockstep
+
+    @classmethod
+    def of(cls, trajectory: Trajectory, prediction: Prediction) -> Observation:
+        """Everything before the first gap.
+
+        InputError if the log of a run in real time does not say what the agents used.
+        """
+        real_time = trajectory.record.experiment.run.pace == "realtime"
+        steps = _known_steps(trajectory) if real_time else trajectory.prefix
+        published, lost = trajectory.published, trajectory.lost
+        timers = None
+        if real_time:
+            assert trajectory.agent_modes is not None
+            assert trajectory.used is not None
+            assert trajectory.made is not None
+            timers = Timers(
+                trajectory.agent_modes[1 : steps + 1], trajectory.used[:steps], trajectory.made[: steps + 1]
+            )
+        return cls(
+            prediction,
+            bounded(trajectory.states[: steps + 1]),
+            trajectory.modes[:steps],
+            bounded(trajectory.record.start),
+            None if published is None else bounded(published[: steps + 1]),
+            None if lost is None else lost[:steps],
+            timers,
+        )
+
+    @property
+    def step(self) -> StepModel:
+        """The law of one step."""
+        return self.prediction.step
+
+    @property
+    def steps(self) -> int:
+        """N."""
+        return len(self.modes)
+
+    @property
+    def replicas(self) -> int:
+        """R."""
+        return int(self.states.shape[2])
+
+    def blocks(self, numbers_per_step: int) -> Iterator[tuple[int, int]]:
+        """(first, last + 1) of blocks of steps that keep temporary arrays of so many numbers per step small."""
+        length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
+        for first in range(0, self.steps, length):
+            yield first, min(first + length, self.steps)
+
+
+def bounded(states: FloatArray) -> FloatArray:
+    """The array, of any shape, clipped to ``LARGEST`` either way: such states are wrong, but can be computed with."""
+    if not states.size or (states.max() <= LARGEST and states.min() >= -LARGEST):
+        return states
+    return np.clip(states, -LARGEST, LARGEST)
+
+
+def _known_steps(trajectory: Trajectory) -> int:
+    """Steps of the longest complete beginning in which no agent uses a value from after its end."""
+    steps = trajectory.prefix
+    if trajectory.agent_modes is None or trajectory.used is None or trajectory.made is None:
+        raise InputError(
+            "the log of a run in real time: expected that every state says the graph and the values that it was made "
+            "from, and when: record it again with this version"
+        )
+    unknown = np.argwhere((trajectory.agent_modes[1 : steps + 1] < 0) | (trajectory.made[1 : steps + 1] < 0))
+    if len(unknown):
+        step, agent = unknown[0].tolist()
+        raise InputError(
+            f"agent {agent + 1}: does not say which graph it used in step {step}, or when: expected in the log of a "
+            "run in real time"
+        )
+    newest = trajectory.used[:steps].max(axis=(1, 2), initial=-1)
+    while (beyond := newest[:steps] > steps).any():  # only where the run is not complete
+        steps = int(np.argmax(beyond))
+    return steps

@@ -1,0 +1,281 @@
+"""Errors of a network beside their prediction while it runs: the numbers of a comparison, one step at a time.
+
+Measured are time means with the standard errors of ``errors.time_means``: of a complete run of up to ``EVERY_STEP``
+agents, both give the same. Only sums are kept. Per step, the system error takes O(m^2), and so do the node errors: with
+more agents, the standard errors of the nodes are estimated from some of the steps only. While the effect of a start
+that is not stationary lasts, the expectation is stepped along: O(n m^3). Incomplete steps are left out of both means.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from msg_analysis.inference.errors.estimates import Estimate, beside
+from msg_analysis.inference.errors.time_means import Value, forms_of, packed_moments, values_of
+from msg_analysis.inference.observed.observation import BLOCK_NUMBERS, bounded
+from msg_analysis.inference.online.step_collector import StepCollector
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.types import FloatArray, IntArray
+
+EVERY_STEP = 20  # agents up to which every step is used for the standard errors of the nodes; beyond, one in m / 20
+MOST_BYTES = 256 * 2**20  # memory for the standard errors of the nodes; where that is too little, they are left out
+
+
+@dataclass(frozen=True, slots=True)
+class LiveReport:
+    """Progress of a network, and its errors so far."""
+
+    first: int  # first step in the errors; -1: none
+    last: int  # last step in the errors; -1: none
+    steps: int  # number of steps in the errors
+    newest: int  # largest step with any state; -1: none
+    system: Estimate
+    nodes: list[Estimate]
+    note: str | None  # why there is no prediction, or no standard error; None where there are both
+    refused: dict[str, int] = field(default_factory=dict)  # states or steps that do not count, by reason
+    # Newest whole step: number, graph from 0 (in real time: 0), first replica (m,)
+    latest: tuple[int, int, FloatArray] | None = None
+
+    @property
+    def missing(self) -> int:
+        """Incomplete steps between first and last."""
+        return self.last - self.first + 1 - self.steps if self.steps else 0
+
+
+class LiveEstimate:
+    """The errors of a run beside their prediction, from the states as they arrive.
+
+    In real time agents are at different steps at the same moment, and the expected errors depend on their timing: then
+    there is no standard error, and the prediction is that of agents that are never late. ``nodes`` asks for standard
+    errors of the nodes. InputError where there is no prediction (too large, unbounded).
+    """
+
+    def __init__(self, record: RunRecord, *, nodes: bool = True) -> None:
+        experiment = record.experiment
+        lockstep = experiment.run.pace == "lockstep"
+        self.record = record
+        self.steps = StepCollector(experiment.agents, len(experiment.graph_list), experiment.steps, lockstep=lockstep)
+        reason = experiment.protocol.unpredictable() if experiment.protocol else None
+        prediction = None if reason else predict(experiment)
+        self._errors = RunningErrors(record, prediction, nodes=nodes)
+        self._latest: tuple[int, int, FloatArray] | None = None
+        self._newest = -1
+        self._note = reason
+        if prediction is not None and not lockstep:
+            self._note = "in real time, what is expected depends on how late agents are: compare the bag"
+        elif prediction is not None and not self._errors.nodes_judged:
+            self._note = "too many agents for standard errors of each"
+
+    def add(self, agent: int, step: int, mode: int, payload: bytes) -> None:
+        """Add x(step) of an agent (from 0), see ``StepCollector.add``; ``mode`` is from 1, 0 at step 0."""
+        self.steps.add(agent, step, mode, payload)
+
+    def add_whole(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
+        """Add whole steps k (b,), each only once: graphs of k -> k+1 from 0 (b,), x(k) and x(k+1) (b, m, width)."""
+        if not len(steps):
+            return
+        self._errors.add(steps, modes, states, after)
+        newest = int(np.argmax(steps))
+        self._newest = max(self._newest, int(steps[newest]))
+        if self._latest is None or steps[newest] > self._latest[0]:
+            self._latest = int(steps[newest]), int(modes[newest]), states[newest, :, 0].copy()
+
+    def report(self) -> LiveReport:
+        """The numbers so far."""
+        self.add_whole(*self.steps.take())
+        errors = self._errors
+        system, nodes = errors.estimates()
+        return LiveReport(
+            first=errors.first,
+            last=errors.last,
+            steps=errors.count,
+            newest=max(self.steps.newest, self._newest),
+            system=system,
+            nodes=nodes,
+            note=self._note,
+            refused={reason: count for reason, count in sorted(self.steps.refused.items()) if count},
+            latest=self._latest,
+        )
+
+
+class RunningErrors:
+    """Sums over steps that give errors and standard errors at any time; without a prediction, errors only."""
+
+    def __init__(self, record: RunRecord, prediction: Prediction | None, *, nodes: bool = True) -> None:
+        experiment = record.experiment
+        self._record, self._prediction = record, prediction
+        self._agents, self._replicas = experiment.agents, experiment.run.replicas
+        self.first = self.last = -1  # first and last step that was added; -1: none
+        self.count = 0  # steps that were added
+        self.nodes_judged = False  # whether the nodes have standard errors, too
+        self._squares = np.zeros(self._agents)  # sums of the agents' errors
+        self._judge: _Judge | None = None
+        self._expected: _Expected | None = None
+        if prediction is not None:
+            self._expected = _Expected(prediction)
+            if experiment.run.pace == "lockstep":
+                self._judge = _Judge(prediction, self._replicas, nodes=nodes)
+                self.nodes_judged = self._judge.nodes
+
+    def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
+        """Add steps, arrays as in ``LiveEstimate.add_whole``."""
+        if not len(steps):
+            return
+        self.first = int(steps.min()) if self.first < 0 else min(self.first, int(steps.min()))
+        self.last = max(self.last, int(steps.max()))
+        self.count += len(steps)
+        if self._expected is not None:
+            known = np.flatnonzero(steps == 0)
+            self._expected.add(steps, self._record, int(modes[known[0]]) if len(known) else None)
+        deviations, later = self._deviations(states), self._deviations(after)
+        self._squares += (deviations**2).mean(axis=2).sum(axis=0)
+        if self._judge is not None:
+            self._judge.add(steps, modes, deviations, later)
+
+    def estimates(self) -> tuple[Estimate, list[Estimate]]:
+        """System error and node errors so far."""
+        if not self.count:
+            return Estimate(), [Estimate()] * self._agents
+        measured = np.concatenate([[self._squares.sum()], self._squares]) / self.count
+        if self._expected is None:
+            return Estimate(float(measured[0])), [Estimate(float(error)) for error in measured[1:]]
+        nodes = self._expected.total / self.count
+        predicted = np.concatenate([[nodes.sum()], nodes])
+        if self._judge is None:
+            found = [Estimate(float(m), float(p)) for m, p in zip(measured, predicted, strict=True)]
+            return found[0], found[1:]
+        errors = np.sqrt(self._judge.variances().clip(0.0)) / self.count
+        judged = len(errors)
+        system, judged_nodes = beside(measured[:judged], predicted[:judged], errors)
+        pairs = zip(measured[judged:], predicted[judged:], strict=True)
+        return system, judged_nodes + [Estimate(float(m), float(p)) for m, p in pairs]
+
+    def _deviations(self, states: FloatArray) -> FloatArray:
+        """(b, m, R): deviations of the agents from the reference, or in consensus from their mean."""
+        values = bounded(states[:, :, : self._replicas])
+        if self._record.experiment.problem == "consensus":
+            return np.asarray(values - values.mean(axis=1, keepdims=True))
+        return np.asarray(values - self._record.experiment.reference)
+
+
+class _Judge:
+    """Sums that give the variances of the time means, as in ``martingale.time_means``."""
+
+    def __init__(self, prediction: Prediction, replicas: int, *, nodes: bool = True) -> None:
+        system = prediction.system
+        p = packed_symmetric.size(system.dimension)
+        agents = len(system.output)
+        # Whether the node errors are judged, too, and not only the system error.
+        self.nodes = nodes and 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
+        forms, _, trace = forms_of(system, "nodes" if self.nodes else "system")
+        self._system, self._replicas = system, replicas
+        self._values = values_of(prediction, forms)
+        self._each = np.eye(len(forms)) if self.nodes else np.empty((0, len(forms)))
+        self._trace = trace
+        self._stride = -(-agents // EVERY_STEP)
+        self._totals = np.zeros((system.modes, p + 1))
+        self._known = [
+            np.array([value.spread_variance(row) for row in (trace, *self._each)]) if isinstance(value, Value) else None
+            for value in self._values
+        ]
+        self._squares = np.zeros(1 + len(self._each))
+        self._looked = self._count = 0  # steps used for the nodes, and all
+        self._length = max(1, BLOCK_NUMBERS // max(p, agents * replicas))
+
+    def add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
+        """Arrays as in ``RunningErrors.add``, with deviations in place of states."""
+        for first in range(0, len(steps), self._length):
+            at = slice(first, first + self._length)
+            self._add(steps[at], modes[at], deviations[at], later[at])
+
+    def _add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
+        a = self._packed(deviations)
+        shared = self._system.loss_variance is not None
+        b = self._packed(later) if shared else a
+        looked = steps % self._stride == 0
+        self._looked += int(looked.sum())
+        self._count += len(steps)
+        for mode in np.unique(modes).tolist():
+            here = modes == mode
+            self._totals[mode] += a[here].sum(axis=0)
+            self._squares[0] += self._sum_squares(mode, self._trace[None], a[here], b[here])[0]
+            if self.nodes:
+                some = here & looked
+                self._squares[1:] += self._sum_squares(mode, self._each, a[some], b[some])
+
+    def _packed(self, deviations: FloatArray) -> FloatArray:
+        """(b, p + 1): (s, 1) of every step."""
+        packed = packed_moments(deviations, self._system)
+        return np.concatenate([packed, np.ones((len(packed), 1))], axis=1)
+
+    def _sum_squares(self, mode: int, rows: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+        """(len(rows),): the part that is not linear in a, for some combinations of the forms."""
+        value = self._values[mode]
+        total = np.zeros(len(rows))
+        if isinstance(value, Value):
+            seen = a
+        else:
+            seen = b
+            total += ((value.increments(a, b) @ rows.T) ** 2).sum(axis=0)
+        for probability, surprise in zip(value.probability, value.surprises, strict=True):
+            total += probability * ((seen @ (rows @ surprise).T) ** 2).sum(axis=0)
+        return total
+
+    def variances(self) -> FloatArray:
+        """(1,) or (1 + m,): of the sums over all steps, of the system error and of the node errors."""
+        found = self._squares.copy()
+        if self._looked:
+            found[1:] *= self._count / self._looked
+        for known, total in zip(self._known, self._totals, strict=True):
+            if known is not None:
+                found += known @ total / self._replicas
+        return found
+
+
+class _Expected:
+    """Exact expectation of the node errors, summed over steps."""
+
+    def __init__(self, prediction: Prediction) -> None:
+        self._prediction = prediction
+        steady = prediction.steady
+        self._steady = np.diag(prediction.system.lifted(steady.sum(axis=0)))
+        self._away: FloatArray | None = None  # (n, d, d) from the steady state, of the next step
+        self._law = np.empty(0)
+        self._scale = 0.0
+        self._series: list[FloatArray] = []  # distance from the steady errors, of every step before that
+        self.total = np.zeros(len(self._steady))  # (m,)
+
+    def add(self, steps: IntArray, record: RunRecord, first_mode: int | None) -> None:
+        """Add steps; ``first_mode`` is g(0), which counts if it is known in the first call."""
+        if self._away is None:
+            self._begin(record, first_mode)
+        assert self._away is not None
+        system, last = self._prediction.system, int(steps.max())
+        while len(self._series) <= last and not self._arrived():
+            self._series.append(np.diag(system.lifted(self._away.sum(axis=0))))
+            self._away, self._law = system.advance(self._away, self._law)
+        self.total += len(steps) * self._steady
+        early = steps[steps < len(self._series)]
+        if len(early):
+            self.total += np.sum([self._series[step] for step in early.tolist()], axis=0)
+
+    def _begin(self, record: RunRecord, first_mode: int | None) -> None:
+        step, system, steady = self._prediction.step, self._prediction.system, self._prediction.steady
+        law = step.initial
+        if record.experiment.run.start == "stationary":
+            initial = (law / step.stationary)[:, None, None] * steady
+        else:
+            if first_mode is not None:
+                law = np.eye(step.modes)[first_mode]
+            y = system.reduced((record.start - step.reference).T)
+            initial = law[:, None, None] * (y.T @ y / len(y))
+        self._away, self._law = initial - steady, law - system.stationary
+        self._scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
+
+    def _arrived(self) -> bool:
+        assert self._away is not None
+        return bool(np.abs(self._away).max(initial=0.0) <= 1e-17 * self._scale and np.abs(self._law).max() <= 1e-17)

@@ -1,0 +1,166 @@
+"""The logged-pattern law: the errors of a run in real time, given which values and graphs its log says were used.
+
+Timing does not depend on the states. So given the log the states are linear in independent normal numbers, and replicas
+are independent. With z(K) the stack of ``pattern_events``,
+
+    z(K) = A_K z(K-1) + noise N_K,     M(K) = E[z z^T] = A_K M(K-1) A_K^T + N_K,     Y(K-1) = H + A_K^T Y(K) A_K.
+
+M gives the exact expectation of the time mean. For quadratic forms H the dual Y gives E[sum of what is still to come |
+z], with martingale increments D: E[Cov(D_a, D_b)] = tr( Y_a N Y_b (4 M(K) - 2 N) ) / R. M is computed forwards, Y
+backwards, in blocks: going backwards, the M of a block are computed again from its beginning.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from msg_analysis.inference.errors.time_means import TimeMeans, forms_of, moments
+from msg_analysis.inference.observed.observation import Observation, Timers
+from msg_analysis.inference.realtime.event_order import Order, order_events, sampled
+from msg_analysis.inference.realtime.pattern_events import Periods
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.twin.ideal_timers import IdealTimers
+from msg_analysis.types import FloatArray
+
+MAX_WORK = 6e10  # multiplications, at most (about a minute); the joint test is left out first, then the node errors
+
+MAX_ENTRIES = 400  # entries of a stack, at most
+
+
+class PatternUnavailableError(Exception):
+    """The log does not allow the pattern law, or it would take too long; the message says why."""
+
+
+def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
+    """Effect of a run's timing on its system error: expectation given the log over that with ideal timers, less 1.
+
+    Both are exact, for the same start and graphs of the network, so that hardly anything is left to chance.
+
+    Parameters
+    ----------
+    observation
+        of a run in real time
+    means
+        of ``pattern_means``
+
+    Returns
+    -------
+    float | None
+        None where the expected error is 0
+    """
+    experiment = observation.prediction.experiment
+    graphs, used, made = IdealTimers(experiment, observation.step).log(observation.modes)
+    ideal = replace(observation, timers=Timers(graphs[1:], used, made))
+    total = _forward(Periods(ideal, order_events(ideal).position), _start(observation))[0]
+    lift = observation.prediction.system.lift
+    expected = float(np.trace(lift.T @ total @ lift)) / observation.steps
+    return float(means.trace @ means.predicted) / expected - 1.0 if expected > 0.0 else None
+
+
+def pattern_means(observation: Observation, order: Order) -> TimeMeans:
+    """Time means of the sampled states, with expectation and standard errors given the log.
+
+    Raises
+    ------
+    PatternUnavailableError
+        contradictory times, too many values to be known at the same time, or a run that is too long
+    """
+    if order.contradiction:
+        raise PatternUnavailableError(order.contradiction)
+    system, steps = observation.prediction.system, observation.steps
+    periods = Periods(observation, order.position)
+    entries = periods.largest
+    if entries > MAX_ENTRIES:
+        raise PatternUnavailableError(
+            f"up to {entries} values have to be known at the same time, {MAX_ENTRIES} are allowed: some were used long "
+            "after they were made"
+        )
+    p = packed_symmetric.size(system.dimension)
+    for kind in ("joint", "nodes", "system"):
+        forms, nodes, trace = forms_of(system, kind)
+        q = len(forms)
+        work = steps * entries**2 * (q**2 + (3 * q + 4) * entries)
+        if work <= MAX_WORK:
+            break
+    else:
+        raise PatternUnavailableError(f"{steps} steps of {entries} values are too many to follow one by one")
+    lifted = packed_symmetric.unpack(forms, system.dimension)
+    lifted = system.lift @ lifted @ system.lift.T
+
+    x = sampled(observation)
+    seen = np.zeros(p)
+    series = np.empty(steps)
+    for first, last in observation.blocks(max(p, observation.states[0].size)):
+        found = moments(observation, first, last, x)
+        seen += found.sum(axis=0)
+        series[first:last] = found @ (trace @ forms)
+    total, covariance, variances = _follow(periods, _start(observation), lifted, trace)
+    expected = system.lift.T @ (total / steps) @ system.lift
+    return TimeMeans(
+        second_moments=packed_symmetric.unpack(seen / steps, system.dimension),
+        expected_moments=expected,
+        joint=kind == "joint",
+        measured=forms @ (seen / steps),
+        predicted=forms @ packed_symmetric.pack(expected),
+        covariance=covariance / (observation.replicas * steps**2),
+        squares=0,
+        nodes=nodes,
+        trace=trace,
+        system_series=series,
+        system_variances=variances / observation.replicas,
+    )
+
+
+def _follow(
+    periods: Periods, start: FloatArray, forms: FloatArray, trace: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sum of E[X X^T] (m, m), sum of Cov(D) (q, q), and Var of the system error's D by period (N,); one replica."""
+    steps, m, q = periods.steps, len(start), len(forms)
+    total, beginnings, length = _forward(periods, start)
+    covariance, variances = np.zeros((q, q)), np.zeros(steps)
+    dual = np.zeros((q, periods.entries(steps - 1), periods.entries(steps - 1)))
+    dual[:, :m, :m] = forms
+    for block in reversed(range(len(beginnings))):
+        first, last = block * length, min((block + 1) * length, steps)
+        moments_of = [beginnings[block]]
+        for number in range(first + 1, last):
+            moments_of.append(_next(periods, number, moments_of[-1]))
+        for number in range(last - 1, max(first, 1) - 1, -1):
+            period, moment = periods[number], moments_of[number - first]
+            left = (dual @ period.noise).reshape(q, -1)
+            right = ((4.0 * moment - 2.0 * period.noise) @ dual).reshape(q, -1)
+            here = left @ right.T
+            covariance += here
+            variances[number] = trace @ here @ trace
+            dual = period.matrix.T @ dual @ period.matrix
+            dual[:, :m, :m] += forms
+    return total, covariance, variances
+
+
+def _start(observation: Observation) -> FloatArray:
+    """(m, m): mean of x x^T over the replicas at the known start."""
+    start = observation.start - observation.step.reference
+    if observation.prediction.experiment.problem == "consensus":
+        start = start - start.mean(axis=0)  # the common part does not count, and can be large
+    return np.asarray(start @ start.T / observation.replicas)
+
+
+def _forward(periods: Periods, start: FloatArray) -> tuple[FloatArray, list[FloatArray], int]:
+    """Sum of E[X X^T] (m, m), M at the beginning of every block, and the number of periods in a block."""
+    m, length = len(start), max(1, math.isqrt(periods.steps))
+    total, beginnings, moment = np.zeros((m, m)), [], start
+    for number in range(periods.steps):
+        if number:
+            moment = _next(periods, number, moment)
+        if number % length == 0:
+            beginnings.append(moment)
+        total += moment[:m, :m]
+    return total, beginnings, length
+
+
+def _next(periods: Periods, number: int, moment: FloatArray) -> FloatArray:
+    period = periods[number]
+    return np.asarray(period.matrix @ moment @ period.matrix.T + period.noise)

@@ -1,0 +1,210 @@
+"""The periods of a run in real time as linear maps between the states known at its sampling times.
+
+The state of the network at the sampling time K dt is a stack: the newest state of every agent; older ones that a later
+step still uses, because a message was slow or its reader late; and, if noise is correlated between agents, the noise of
+a step that some agents have made and others not yet. A period maps one stack to the next by a matrix and noise, which
+depend on the log alone. Nearly all periods of a run are alike: matrices are computed once for each pattern.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.inference.observed.heard_values import neighbour_weights
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.realtime.event_order import newest_steps, sampling_times
+from msg_analysis.model.step.neighbours import neighbour_tables
+from msg_analysis.model.step.step_model import StepModel
+from msg_analysis.types import BoolArray, FloatArray, IntArray
+
+CACHED_NUMBERS = 20_000_000  # numbers in cached matrices: 160 MB
+
+_OWN = np.iinfo(np.int64).min  # stands for a value that was never heard; the agent's own value takes its place
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Period:
+    """z(K) = matrix @ z(K-1) + noise, in deviations from the reference; the size S of the stack may change to S'."""
+
+    matrix: FloatArray  # (S', S)
+    noise: FloatArray  # (S', S') covariance
+
+
+class Periods:
+    """The periods K = 1..N-1 of a run in real time, from sampling time K-1 to K.
+
+    A stack begins with the m newest states. ``position`` (N, m) is the order in which the states were made.
+    """
+
+    def __init__(self, observation: Observation, position: IntArray) -> None:
+        assert observation.timers is not None
+        self._step = step = observation.step
+        self._shared = _shared_sources(step)
+        graphs, used, made = observation.timers.graphs, observation.timers.used, observation.timers.made
+        steps, m = graphs.shape
+        newest = newest_steps(observation)[:steps]
+        period = np.searchsorted(sampling_times(observation)[:steps], made[1:], side="left")  # N: not seen
+        agents = np.arange(m)
+        senders = neighbour_tables(step).senders[graphs, agents]
+        known = np.minimum(period, steps - 1) - 1
+        offsets = np.where(used >= 0, used - newest[known[:, :, None], senders], _OWN)
+        seen = period < steps
+        self._extras(period, newest, np.where(seen[:, :, None], used, -1), senders, offsets)
+        own = np.arange(steps)[:, None] - newest[known, agents]
+        lag = np.arange(steps)[:, None] - period if self._shared.any() else np.zeros_like(period)
+        columns = [np.broadcast_to(agents, period.shape), graphs, lag, own]
+        table = np.concatenate([np.stack(columns, axis=2), offsets], axis=2).reshape(steps * m, -1)
+        order = np.lexsort((position.ravel(), period.ravel()))[: int(seen.sum())]
+        self._table = np.ascontiguousarray(table[order])
+        self._ends = np.searchsorted(period.ravel()[order], np.arange(steps + 1))
+        self._cache: dict[bytes, Period] = {}
+        self._cached = 0
+        self.steps = steps
+
+    def _extras(self, period: IntArray, newest: IntArray, used: IntArray, senders: IntArray, offsets: IntArray) -> None:
+        """What is stacked after the newest states: rows (entry, its step from the newest one, or from K), by K."""
+        steps, m = period.shape
+        k, i, d = np.nonzero((used >= 0) & (offsets < 0))
+        sender, step, last = senders[k, i, d], used[k, i, d], period[k, i] - 1
+        # First sampling time at which that agent has a newer state.
+        first = period[step, sender]
+        values, owner = np.unique(np.column_stack([sender, step, first]), axis=0, return_inverse=True)
+        end = np.full(len(values), -1)
+        np.maximum.at(end, owner.reshape(-1), last)
+        sender, step, first = values.reshape(-1, 3).T
+        at, which = _spread(first, end)
+        rows = [np.column_stack([at, sender[which], step[which] - newest[at, sender[which]]])]
+        if self._shared.any():
+            first, end = period.min(axis=1), np.minimum(period.max(axis=1), steps) - 1
+            at, which = _spread(first, end)
+            for source in np.flatnonzero(self._shared).tolist():
+                rows.append(np.column_stack([at, np.full(len(at), m + source), which - at]))
+        found = np.concatenate(rows)
+        found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0]))]
+        self._extra = np.ascontiguousarray(found[:, 1:])
+        self._extra_ends = np.searchsorted(found[:, 0], np.arange(steps + 1))
+        self.largest = m + int(np.diff(self._extra_ends).max(initial=0))  # entries of the largest stack
+
+    def entries(self, number: int) -> int:
+        """Entries of the stack at sampling time ``number``, from 0."""
+        return self._step.agents + int(self._extra_ends[number + 1] - self._extra_ends[number])
+
+    def __getitem__(self, number: int) -> Period:
+        """The period that ends at sampling time ``number`` (1..N-1)."""
+        events = self._table[self._ends[number] : self._ends[number + 1]]
+        before, after = (self._extra[self._extra_ends[k] : self._extra_ends[k + 1]] for k in (number - 1, number))
+        key = b"|".join((events.tobytes(), before.tobytes(), after.tobytes()))
+        if key not in self._cache:
+            found = self._compile(events, before, after)
+            if self._cached > CACHED_NUMBERS:
+                self._cache.clear()
+                self._cached = 0
+            self._cached += found.matrix.size + found.noise.size
+            self._cache[key] = found
+        return self._cache[key]
+
+    def _compile(self, events: IntArray, before: IntArray, after: IntArray) -> Period:
+        """Event by event; values are kept as long as they are used."""
+        step, m = self._step, self._step.agents
+        tables, weights = neighbour_tables(step), neighbour_weights(step)
+        live = _Live(m + len(before), m)
+        # Values by agent and step from the newest one at the beginning; noise by source and step from the end.
+        for j in range(m):
+            live.start((j, 0))
+        for entry, offset in before.tolist():
+            live.start((entry, offset if entry < m else offset - 1))
+        made = [0] * m
+        rows: list[tuple[_Key, dict[_Key, float], float]] = []
+        for agent, graph, lag, own, *heard in events.tolist():
+            mine = agent, own
+            terms = {mine: float(step.nominal[graph, agent, agent])}
+            for d in range(int(tables.count[graph, agent])):
+                key = mine if heard[d] == _OWN else (int(tables.senders[graph, agent, d]), heard[d])
+                terms[key] = terms.get(key, 0.0) + float(weights[graph, agent, d])
+            gain = step.noise_gain[graph, agent]
+            for which in np.flatnonzero(self._shared & (gain != 0.0)).tolist():
+                terms[m + which, lag] = float(gain[which])
+            made[agent] = own + 1
+            rows.append(((agent, own + 1), terms, float((gain[~self._shared] ** 2).sum())))
+        stacked = [(j, made[j]) for j in range(m)]
+        stacked += [(entry, made[entry] + offset if entry < m else offset) for entry, offset in after.tolist()]
+        last_use = {key: number for number, (_, terms, _) in enumerate(rows) for key in terms}
+        last_use |= dict.fromkeys(stacked, len(rows))
+        for number, (key, terms, variance) in enumerate(rows):
+            live.add(key, terms, variance)
+            live.drop([used for used in (*terms, key) if last_use.get(used, -1) <= number])
+        return live.take(stacked)
+
+
+_Key = tuple[int, int]
+
+
+class _Live:
+    """Values as combinations of the stack at the beginning of a period, and the covariance of the noise added since.
+
+    Keys are (agent or m + source, step); noise sources are numbers of variance 1, new where not known yet.
+    """
+
+    def __init__(self, entries: int, agents: int) -> None:
+        self._agents = agents
+        self._matrix = np.zeros((2 * entries, entries))
+        self._noise = np.zeros((2 * entries, 2 * entries))
+        self._place: dict[_Key, int] = {}
+        self._free = list(range(2 * entries))[::-1]
+
+    def start(self, key: _Key) -> None:
+        """Add the next entry of the stack."""
+        place = self._new(key)
+        self._matrix[place, len(self._place) - 1] = 1.0
+
+    def add(self, key: _Key, terms: dict[_Key, float], variance: float) -> None:
+        """Add a combination of others, plus noise of its own."""
+        rows, weights = [self._find(used) for used in terms], np.array(list(terms.values()))
+        matrix, noise = weights @ self._matrix[rows], weights @ self._noise[rows]
+        own = float(noise[rows] @ weights) + variance
+        place = self._new(key)  # may make the arrays larger
+        self._matrix[place] = matrix
+        self._noise[place, : len(noise)] = self._noise[: len(noise), place] = noise
+        self._noise[place, place] = own
+
+    def drop(self, keys: list[_Key]) -> None:
+        """Drop values that are no longer used."""
+        for key in keys:
+            if key in self._place:
+                self._free.append(self._place.pop(key))
+
+    def take(self, keys: list[_Key]) -> Period:
+        """The period that ends with this stack."""
+        rows = [self._find(key) for key in keys]
+        return Period(self._matrix[rows], self._noise[np.ix_(rows, rows)])
+
+    def _find(self, key: _Key) -> int:
+        if key not in self._place and key[0] >= self._agents:
+            place = self._new(key)
+            self._matrix[place] = self._noise[place] = self._noise[:, place] = 0.0
+            self._noise[place, place] = 1.0
+        return self._place[key]
+
+    def _new(self, key: _Key) -> int:
+        if not self._free:
+            size = len(self._matrix)
+            self._matrix = np.pad(self._matrix, ((0, size), (0, 0)))
+            self._noise = np.pad(self._noise, ((0, size), (0, size)))
+            self._free = list(range(2 * size))[: size - 1 : -1]
+        self._place[key] = self._free.pop()
+        return self._place[key]
+
+
+def _shared_sources(step: StepModel) -> BoolArray:
+    """(m,): whether more than one agent feels a source of noise, in any graph."""
+    return np.asarray((step.noise_gain != 0.0).any(axis=0).sum(axis=0) > 1)
+
+
+def _spread(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
+    """All integers first..last of many ranges, and the index of each one's range."""
+    lengths = np.maximum(last - first + 1, 0)
+    which = np.repeat(np.arange(len(first)), lengths)
+    starts = np.cumsum(lengths) - lengths
+    return first[which] + np.arange(len(which)) - starts[which], which

@@ -1,0 +1,141 @@
+"""Timing of a run in real time: lateness, missed deadlines, jitter, and the age of the values used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.model.arithmetic.step_clock import StepClock
+from msg_analysis.model.step.neighbours import neighbour_tables
+from msg_analysis.model.step.phases import phases
+from msg_analysis.model.step.sequential_law import ideal_uses
+from msg_analysis.types import AnyArray, FloatArray
+
+BINS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Quantiles:
+    """Quantiles of a measure; None where there was nothing to measure."""
+
+    p50: float | None
+    p95: float | None
+    p99: float | None
+    max: float | None
+
+    @classmethod
+    def of(cls, values: AnyArray) -> Quantiles:
+        """Of all entries of an array of any shape."""
+        if not values.size:
+            return cls(None, None, None, None)
+        return cls(*(float(value) for value in (*np.quantile(values, (0.5, 0.95, 0.99)), values.max())))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timing:
+    """Timing of a run in real time.
+
+    Times in ms are those of the agents' clock: simulated time over the speed of the run.
+    """
+
+    period_ms: float  # nominal time between two steps of an agent
+    lateness_ms: Quantiles  # of a step after it was due
+    steps: int  # of all agents
+    missed: int  # steps made more than a period after they were due
+    jitter_ms: Quantiles  # |time between two successive steps of an agent - period|
+    staleness_ms: Quantiles  # age of the values at the time of use
+    staleness_steps: Quantiles  # step of the new state - step of the value; 0 or 1 with ideal timers
+    uses: int  # neighbours' values that steps needed, those never heard included
+    ideal_uses: int  # uses of the value that ideal timers would have used
+    never_heard: int  # uses in which nothing had been heard yet of the neighbour
+    outdated_graphs: int  # steps made with another graph than the network's at that time
+    histogram: tuple[FloatArray, AnyArray]  # of lateness: edges [ms] (BINS + 1,) and counts (BINS,); covers all values
+    ages: tuple[FloatArray, AnyArray]  # the same of ``staleness_ms``
+
+    @property
+    def missed_share(self) -> float:
+        """Of all steps."""
+        return self.missed / max(self.steps, 1)
+
+    @property
+    def ideal_share(self) -> float:
+        """Of all uses, those that ideal timers would have made; 1 where no agent hears another."""
+        return self.ideal_uses / self.uses if self.uses else 1.0
+
+    @property
+    def outdated_share(self) -> float:
+        """Of all steps, those with another graph than the network's."""
+        return self.outdated_graphs / max(self.steps, 1)
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON document."""
+        (edges, counts), (age_edges, age_counts) = self.histogram, self.ages
+        return {
+            "period_ms": self.period_ms,
+            "lateness_ms": _document(self.lateness_ms),
+            "deadlines": {"steps": self.steps, "missed": self.missed, "share": self.missed_share},
+            "jitter_ms": _document(self.jitter_ms),
+            "staleness_ms": _document(self.staleness_ms),
+            "staleness_steps": _document(self.staleness_steps),
+            "ideal_uses": {"uses": self.uses, "ideal": self.ideal_uses, "share": self.ideal_share},
+            "never_heard": self.never_heard,
+            "outdated_graph": {"steps": self.outdated_graphs, "share": self.outdated_share},
+            "histogram": {
+                "lateness_ms": edges.tolist(),
+                "steps": counts.tolist(),
+                "staleness_ms": age_edges.tolist(),
+                "uses": age_counts.tolist(),
+            },
+        }
+
+
+def measure_timing(observation: Observation) -> Timing:
+    """Measure the timing of a run in real time."""
+    timers, step = observation.timers, observation.step
+    assert timers is not None
+    experiment = observation.prediction.experiment
+    steps, m = timers.graphs.shape
+    agents = np.arange(m)
+    milliseconds = 1e-6 / experiment.run.speed  # of the agents' clock, in a nanosecond of simulated time
+    phase = phases(experiment)
+    due = np.stack([StepClock(step.dt, phi).times(np.arange(steps)) for phi in phase.tolist()], axis=1)
+    period = step.dt * 1e9
+    lateness = timers.made[1:] - due
+    late_ms = lateness * milliseconds
+
+    tables = neighbour_tables(step)
+    there = np.arange(step.most_neighbours) < tables.count[timers.graphs, agents][:, :, None]
+    heard = there & (timers.used >= 0)
+    made = timers.made[timers.used, tables.senders[timers.graphs, agents]]
+    age = (timers.made[1:, :, None] - made)[heard] * milliseconds
+    behind = (np.arange(1, steps + 1)[:, None, None] - timers.used)[heard]
+    ideal = ideal_uses(step, phase)[timers.graphs, agents] + np.arange(steps)[:, None, None]
+    jitter = np.abs(np.diff(timers.made[1:], axis=0) - period) * milliseconds
+    return Timing(
+        period_ms=period * milliseconds,
+        lateness_ms=Quantiles.of(late_ms),
+        steps=steps * m,
+        missed=int((lateness > period).sum()),
+        jitter_ms=Quantiles.of(jitter),
+        staleness_ms=Quantiles.of(age),
+        staleness_steps=Quantiles.of(behind),
+        uses=int(there.sum()),
+        ideal_uses=int((heard & (timers.used == ideal)).sum()),
+        never_heard=int((there & ~heard).sum()),
+        outdated_graphs=int((timers.graphs != observation.modes[:, None]).sum()),
+        histogram=_histogram(late_ms),
+        ages=_histogram(age),
+    )
+
+
+def _histogram(values: AnyArray) -> tuple[FloatArray, AnyArray]:
+    low, high = min(0.0, float(values.min(initial=0.0))), max(float(values.max(initial=0.0)), 1e-3)
+    counts, edges = np.histogram(values, bins=BINS, range=(low, high))
+    return edges, counts
+
+
+def _document(quantiles: Quantiles) -> dict[str, float | None]:
+    return {"p50": quantiles.p50, "p95": quantiles.p95, "p99": quantiles.p99, "max": quantiles.max}

@@ -1,0 +1,205 @@
+"""Comparison of a run with its prediction, and the verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from msg_analysis.inference.blame.causes import Accused, Cause, find_causes
+from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate, covariance_test, estimates
+from msg_analysis.inference.errors.ranking import order_of_nodes
+from msg_analysis.inference.errors.time_means import TimeMeans
+from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
+from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import loss_test
+from msg_analysis.inference.hypothesis_tests.switching import switching_test
+from msg_analysis.inference.observed.measurement import Measurement
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.statistics.batch_means import batch_interval
+from msg_analysis.inference.statistics.holm import holm
+from msg_analysis.inference.verdict.comparison import Comparison, Test
+from msg_analysis.inference.verdict.evidence import Evidence
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.types import FloatArray, IntArray
+
+MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
+RUNNING_POINTS = 400
+
+
+def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
+    """Compare a run, or its complete beginning, with what theory predicts for it; see ``api.compare``.
+
+    Every test assumes exactly the law that the record says was run; the probability of any false rejection in the
+    family is at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In real
+    time, the family has only tests that are exact whatever the timing was. Where the law has no prediction (a protocol
+    that is not linear, or is not installed), only graphs and losses are tested.
+
+    Raises
+    ------
+    InputError
+        no prediction (too large, unbounded), or a log without what is needed
+    """
+    protocol = trajectory.record.experiment.protocol
+    unpredicted = protocol.unpredictable() if protocol else None
+    if unpredicted:
+        return _measured(trajectory, level, unpredicted)
+    prediction = predict(trajectory.record.experiment)
+    if trajectory.prefix < MIN_STEPS and not trajectory.completeness.complete:
+        return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
+    observation = Observation.of(trajectory, prediction)
+    if observation.steps < MIN_STEPS and not trajectory.completeness.complete:
+        return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
+    return judge(trajectory, prediction, Evidence.of(observation, level), level)
+
+
+def judge(
+    trajectory: Trajectory,
+    prediction: Prediction,
+    evidence: Evidence,
+    level: float,
+    more: Sequence[tuple[str, float | None]] = (),
+) -> Comparison:
+    """The verdict on the evidence of one run, or of several; ``more`` has names and p-values of further tests.
+
+    Of several runs, ``trajectory`` is one with the completeness of all.
+    """
+    means = evidence.means
+    system_error, node_errors = estimates(means, prediction.system)
+    covariance = covariance_test(means, prediction.system)
+    innovations = evidence.innovations.tests()
+    switching = evidence.transitions.test(prediction.step.transition)
+    loss = evidence.loss.test() if evidence.loss else None
+    p_broadcast = evidence.broadcast.p_value() if evidence.broadcast else None
+    errors = [("system error", system_error.p)]
+    errors += [(f"error of agent {i}", node.p) for i, node in enumerate(node_errors, start=1)]
+    errors += [("covariance", covariance.p)]
+    family = errors if evidence.decisive else []
+    family += [
+        ("innovations: covariance", innovations.p_covariance),
+        ("innovations: whiteness", innovations.p_whiteness),
+        ("innovations: gains", innovations.p_gain),
+        ("innovations: common gain", innovations.p_common_gain),
+        ("switching", switching.p),
+        ("loss", loss.p if loss else None),
+        ("broadcast", p_broadcast),
+        *more,
+    ]
+    tests = _judge(family, level)
+    rejected = [test.name for test in tests if test.rejected]
+    blame: list[Cause] = []
+    if rejected and trajectory.completeness.complete:
+        blame = find_causes(_accused(prediction, evidence), level, rejected)
+    return Comparison(
+        trajectory=trajectory,
+        level=level,
+        steps=evidence.steps,
+        system_error=system_error,
+        node_errors=node_errors,
+        covariance=covariance,
+        innovations=innovations,
+        switching=switching,
+        continuous_error=prediction.continuous.system_error if prediction.continuous else None,
+        batch=batch_interval(means.system_series),
+        tests=tests,
+        running=_running(means, prediction.step.dt),
+        loss=loss,
+        p_broadcast=p_broadcast,
+        timing=evidence.timing,
+        laws=evidence.laws,
+        given=evidence.given,
+        order=order_of_nodes(means, level),
+        blame=blame,
+    )
+
+
+def _accused(prediction: Prediction, evidence: Evidence) -> Accused:
+    experiment = prediction.experiment
+    return Accused(
+        names=[graph.name for graph in experiment.graph_list],
+        chain=experiment.chain,
+        dt=experiment.step_length,
+        reference=experiment.reference,
+        innovations=evidence.innovations,
+        transitions=evidence.transitions,
+        loss=evidence.loss,
+        broadcast=evidence.broadcast,
+    )
+
+
+def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Comparison:
+    """Comparison without a prediction."""
+    measurement = Measurement.of(trajectory)
+    agents, enough = measurement.step.agents, True
+    if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
+        enough = False
+    series, covariance = measurement.system_series, measurement.covariance if enough else None
+    switching = switching_test(measurement.modes, measurement.step.transition) if enough else None
+    loss = loss_test(measurement) if enough else None
+    family = [("switching", switching.p if switching else None), ("loss", loss.p if loss else None)]
+    nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]
+    counts = _spaced(len(series)) if enough else np.empty(0, np.int64)
+    return Comparison(
+        trajectory=trajectory,
+        level=level,
+        steps=measurement.steps,
+        system_error=Estimate() if covariance is None else Estimate(float(np.trace(covariance))),
+        node_errors=nodes,
+        covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
+        innovations=InnovationTests(None, None, None),
+        switching=switching,
+        continuous_error=None,
+        batch=batch_interval(series) if enough else None,
+        tests=_judge(family, level),
+        running={
+            "time": np.asarray((measurement.first + counts) * measurement.step.dt, dtype=float),
+            "system_error": np.cumsum(series)[counts - 1] / counts if enough else np.empty(0),
+            "standard_error": np.zeros(len(counts)),
+        },
+        loss=loss,
+        unpredicted=unpredicted,
+        transient=measurement.first if enough else None,
+    )
+
+
+def without_numbers(trajectory: Trajectory, level: float, prediction: Prediction, steps: int) -> Comparison:
+    """Comparison with too few steps: only what was expected."""
+    predicted = prediction.emulated
+    return Comparison(
+        trajectory=trajectory,
+        level=level,
+        steps=steps,
+        system_error=Estimate(predicted=predicted.system_error),
+        node_errors=[Estimate(predicted=float(error)) for error in predicted.node_errors],
+        covariance=CovarianceTest(predicted=predicted.covariance),
+        innovations=InnovationTests(None, None, None),
+        switching=None,
+        continuous_error=prediction.continuous.system_error if prediction.continuous else None,
+        batch=None,
+        tests=[],
+        running={key: np.empty(0) for key in ("time", "system_error", "standard_error")},
+    )
+
+
+def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
+    # A NaN statistic (a log with numbers too large to compute with) counts as p = 0: the law never gives one.
+    tested = [(name, 0.0 if math.isnan(p) else p) for name, p in family if p is not None]
+    adjusted = holm(np.array([p for _, p in tested], dtype=float))
+    return [Test(name, p, float(a), bool(a < level)) for (name, p), a in zip(tested, adjusted, strict=True)]
+
+
+def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:
+    """Mean of the system error up to some steps, denser at the beginning, and its standard error."""
+    counts = _spaced(len(means.system_series))
+    return {
+        "time": np.asarray(counts * dt, dtype=float),
+        "system_error": np.cumsum(means.system_series)[counts - 1] / counts,
+        "standard_error": np.sqrt(np.cumsum(means.system_variances)[counts - 1]) / counts,
+    }
+
+
+def _spaced(steps: int) -> IntArray:
+    """Numbers of steps up to all of them, denser at the beginning."""
+    spaced = np.concatenate([np.geomspace(1, steps, RUNNING_POINTS // 2), np.linspace(1, steps, RUNNING_POINTS // 2)])
+    return np.unique(np.rint(spaced).astype(np.int64))

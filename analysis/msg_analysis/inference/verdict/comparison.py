@@ -1,0 +1,262 @@
+"""The result of a comparison of a run with its prediction: numbers, tests, verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from msg_analysis.common.markdown import markdown_table, number_text
+from msg_analysis.inference.blame.causes import Cause
+from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate
+from msg_analysis.inference.errors.given_path import GivenPath
+from msg_analysis.inference.errors.ranking import Order
+from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
+from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import LossTest
+from msg_analysis.inference.hypothesis_tests.switching import SwitchingTest
+from msg_analysis.inference.realtime.laws import Laws
+from msg_analysis.inference.realtime.timing import Timing
+from msg_analysis.inference.verdict.law_identity import law_identity
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Completeness, Trajectory
+from msg_analysis.model.step.sequential_law import step_law
+from msg_analysis.theory.prediction import SHOWN_AGENTS
+from msg_analysis.types import FloatArray
+
+Verdict = Literal["agrees", "disagrees", "incomplete", "unpredicted"]
+
+EXIT_CODES: dict[Verdict, int] = {"agrees": 0, "disagrees": 1, "incomplete": 3, "unpredicted": 0}
+
+
+@dataclass(frozen=True, slots=True)
+class Test:
+    """One member of the family of tests that the verdict is about."""
+
+    name: str
+    p: float  # of this test alone
+    p_adjusted: float  # Holm's, over the family
+    rejected: bool  # whether ``p_adjusted`` is below the level
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Member:
+    """One of the runs."""
+
+    name: str  # of its bag
+    record: RunRecord
+    steps: int  # used: all, or those before the first gap; 0 where these are too few
+    completeness: Completeness
+    system_error: Estimate
+    verdict: str  # on this run alone
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of one row."""
+        count = self.completeness
+        return {
+            "bag": self.name,
+            "run": str(self.record.run),
+            "seed": self.record.experiment.run.seed,
+            "steps": self.steps,
+            "simulated_time": self.steps * self.record.experiment.step_length,
+            "complete": count.complete,
+            "missing": count.missing,
+            "missing_modes": count.missing_modes,
+            "verdict": self.verdict,
+            "system_error": self.system_error.to_json(),
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pool:
+    """The runs of a comparison, and Cochran's Q test of whether their system errors differ; None without."""
+
+    members: tuple[Member, ...]
+    chi2: float | None = None
+    dof: int | None = None
+    p: float | None = None
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """The rows."""
+        return [member.to_json() for member in self.members]
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Comparison:
+    """The result of ``msg-analysis compare``.
+
+    Attributes
+    ----------
+    trajectory
+        what was compared; of several runs it has no data, but the completeness of all
+    level
+        probability of a false "disagrees", at most
+    steps
+        steps used: all, or those before the first gap
+    system_error, node_errors, covariance, innovations, switching
+        estimates and tests; ``switching`` is None where too few steps arrived
+    continuous_error
+        the paper's continuous-time system error; None where it has none
+    batch
+        (low, high), the 95 % interval of batch means for the system error; None for short runs
+    tests
+        the family, in the order of the report
+    running
+        "time" [units of simulated time], and the mean of the system error up to then with its standard error (0 without
+        a prediction): "system_error", "standard_error"; arrays of the same length, at most 400
+    loss
+        test of the lost messages; None where none can be lost
+    p_broadcast
+        of the noise in published values; None without
+    unpredicted
+        why there is no prediction; None where there is one
+    transient
+        steps at the start that are left out of the measured errors; None with a prediction, which includes them
+    timing, laws
+        in real time: how time was kept, and which laws the log supports; None in lockstep. The errors and the
+        covariance are compared with the logged-pattern law where it is available, else with the sequential law
+    given
+        errors given the path of the graphs; None where they are not computed
+    order
+        which agents have smaller errors than which; None where that is not known
+    blame
+        what is wrong, where the verdict is "disagrees"
+    pool
+        the runs, where there are several
+    """
+
+    trajectory: Trajectory
+    level: float
+    steps: int
+    system_error: Estimate
+    node_errors: list[Estimate]
+    covariance: CovarianceTest
+    innovations: InnovationTests
+    switching: SwitchingTest | None
+    continuous_error: float | None
+    batch: tuple[float, float] | None
+    tests: list[Test]
+    running: dict[str, FloatArray]
+    loss: LossTest | None = None
+    p_broadcast: float | None = None
+    unpredicted: str | None = None
+    transient: int | None = None
+    timing: Timing | None = None
+    laws: Laws | None = None
+    given: GivenPath | None = None
+    order: Order | None = None
+    blame: Sequence[Cause] = ()
+    pool: Pool | None = None
+
+    def __repr__(self) -> str:
+        total, runs = self.system_error, f"{len(self.pool.members)} runs" if self.pool else "run"
+        numbers = f"measured {number_text(total.measured)} +- {number_text(total.standard_error)}"
+        numbers += f", predicted {number_text(total.predicted)}"
+        name = self.trajectory.record.experiment.name
+        return f"<Comparison, {runs} of {name!r}: {self.verdict}; system error {numbers}>"
+
+    def _repr_markdown_(self) -> str:
+        rows = [
+            (
+                name,
+                *map(number_text, (error.measured, error.standard_error, error.predicted)),
+                "-" if error.z is None else f"{error.z:+.2f}",
+            )
+            for name, error in [
+                ("**system**", self.system_error),
+                *((f"agent {i}", node) for i, node in enumerate(self.node_errors[:SHOWN_AGENTS], start=1)),
+            ]
+        ]
+        rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
+        table = markdown_table(("mean-square error", "measured", "standard error", "predicted", "z"), rows)
+        blame = "".join(f"- {cause.words}\n" for cause in self.blame)
+        return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict: "incomplete" if data are missing, else "disagrees" if a test of the family is rejected.
+
+        Without a prediction the remaining tests cannot show that a run agrees: "unpredicted".
+        """
+        if not self.trajectory.completeness.complete:
+            return "incomplete"
+        if any(test.rejected for test in self.tests):
+            return "disagrees"
+        return "unpredicted" if self.unpredicted else "agrees"
+
+    @property
+    def exit_code(self) -> int:
+        """0 agrees or unpredicted, 1 disagrees, 3 incomplete."""
+        return EXIT_CODES[self.verdict]
+
+    @property
+    def _law(self) -> str:
+        """The law that the errors are compared with."""
+        if self.laws:
+            return self.laws.measured_against
+        tested = any(test.name == "system error" for test in self.tests)
+        real_time = self.trajectory.record.experiment.run.pace == "realtime"
+        return "pattern" if self.pool and real_time and tested else step_law(self.trajectory.record.experiment)
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of ``msg-analysis compare --json``; every number is finite or None."""
+        record, covariance, switching = self.trajectory.record, self.covariance, self.switching
+        document = {
+            "verdict": self.verdict,
+            "unpredicted": self.unpredicted,
+            "transient": self.transient,
+            "run": None if self.pool else str(record.run),
+            "experiment": record.experiment.name,
+            "experiment_identity": law_identity(record.experiment),
+            "leaders": (np.flatnonzero(record.experiment.leader_gains) + 1).tolist(),
+            "seed": None if self.pool else record.experiment.run.seed,
+            "level": self.level,
+            "completeness": asdict(self.trajectory.completeness) | {"stretch": self.trajectory.stretch},
+            "steps": self.steps,
+            "simulated_time": self.steps * record.experiment.step_length,
+            "law": self._law,
+            "bags": self.pool.to_json() if self.pool else None,
+            "homogeneity": {key: getattr(self.pool, key, None) for key in ("chi2", "dof", "p")},
+            "system_error": self.system_error.to_json(),
+            "node_errors": [estimate.to_json() for estimate in self.node_errors],
+            "covariance": {
+                "measured": covariance.measured,
+                "predicted": covariance.predicted,
+                "chi2": covariance.chi2,
+                "dof": covariance.dof,
+                "p": covariance.p,
+                "note": covariance.note,
+            },
+            "innovations": asdict(self.innovations),
+            "switching": {
+                "counts": switching.counts if switching else None,
+                "expected": switching.expected if switching else None,
+                "p": switching.p if switching else None,
+            },
+            "loss": asdict(self.loss) if self.loss else dict.fromkeys(("lost", "expected", "p")),
+            "broadcast": {"p": self.p_broadcast},
+            "timing": self.timing.to_json() if self.timing else None,
+            "laws": self.laws.to_json() if self.laws else None,
+            "given_path": self.given.to_json() if self.given else None,
+            "order": self.order.to_json() if self.order else None,
+            "blame": [cause.to_json() for cause in self.blame],
+            "continuous": {"system_error": self.continuous_error},
+            "batch_means": {"interval": self.batch or (None, None)},
+            "tests": [asdict(test) for test in self.tests],
+        }
+        return {key: _plain(value) for key, value in document.items()}
+
+
+def _plain(value: Any) -> Any:
+    """JSON-able: arrays become lists, numbers that are not finite become None."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

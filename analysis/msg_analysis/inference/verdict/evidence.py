@@ -1,0 +1,125 @@
+"""Sums over one run, or over several of one experiment: all that the verdict needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from msg_analysis.inference.errors.given_path import GivenPath, given_path
+from msg_analysis.inference.errors.time_means import TimeMeans, time_means
+from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
+from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import BroadcastSums, LossTally
+from msg_analysis.inference.hypothesis_tests.switching import Transitions
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.realtime.event_order import order_events
+from msg_analysis.inference.realtime.laws import Laws, measure_laws
+from msg_analysis.inference.realtime.timing import Timing, measure_timing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Sums over the steps of runs; those of several runs of one experiment are added up."""
+
+    steps: int
+    means: TimeMeans  # time means, and their expectation
+    decisive: bool  # whether the law that the means are compared with is exact
+    given: GivenPath | None  # None where it is not computed
+    innovations: InnovationSums
+    transitions: Transitions
+    loss: LossTally | None  # None without loss
+    broadcast: BroadcastSums | None  # None without broadcast noise
+    timing: Timing | None = None  # of one run in real time
+    laws: Laws | None = None  # of one run in real time
+
+    @classmethod
+    def of(cls, observation: Observation, level: float) -> Evidence:
+        """Evidence of one run; laws of a run in real time are tested at ``level``."""
+        laws, timing, position, given = None, None, None, None
+        if observation.timers:
+            timing, order = measure_timing(observation), order_events(observation)
+            position = order.position
+            means, laws = measure_laws(observation, order, timing, level)
+        else:
+            means = time_means(observation)
+            given = given_path(observation, means)
+        return cls(
+            steps=observation.steps,
+            means=means,
+            decisive=laws is None or laws.measured_against == "pattern",
+            given=given,
+            innovations=InnovationSums(observation, position),
+            transitions=Transitions.of(observation.modes, observation.step.modes),
+            loss=LossTally.of(observation),
+            broadcast=BroadcastSums.of(observation),
+            timing=timing,
+            laws=laws,
+        )
+
+    def merged(self, other: Evidence) -> Evidence:
+        """The evidence of these and other runs of the same experiment; the sums of ``self`` are changed in place.
+
+        Time means are weighted with the numbers of steps, so that every step, and every martingale increment, counts
+        the same.
+        """
+        self.innovations.merge(other.innovations)
+        if self.loss and other.loss:
+            self.loss.merge(other.loss)
+        if self.broadcast and other.broadcast:
+            self.broadcast.merge(other.broadcast)
+        given = None
+        if self.given and other.given:
+            given = _merged_given(self.given, self.steps, other.given, other.steps)
+        return replace(
+            self,
+            steps=self.steps + other.steps,
+            means=_merged_means(self.means, self.steps, other.means, other.steps),
+            decisive=self.decisive and other.decisive,
+            given=given,
+            transitions=self.transitions.merged(other.transitions),
+            timing=None,
+            laws=None,
+        )
+
+
+def _merged_means(one: TimeMeans, steps: int, other: TimeMeans, more: int) -> TimeMeans:
+    a, b = steps / (steps + more), more / (steps + more)
+    if one.joint != other.joint or len(one.nodes) != len(other.nodes):
+        one, other = _coarser(one, other), _coarser(other, one)
+    return replace(
+        one,
+        second_moments=a * one.second_moments + b * other.second_moments,
+        expected_moments=a * one.expected_moments + b * other.expected_moments,
+        measured=a * one.measured + b * other.measured,
+        predicted=a * one.predicted + b * other.predicted,
+        covariance=a**2 * one.covariance + b**2 * other.covariance,
+        squares=one.squares + other.squares,
+        system_series=np.concatenate([one.system_series, other.system_series]),
+        system_variances=np.concatenate([one.system_variances, other.system_variances]),
+    )
+
+
+def _coarser(means: TimeMeans, other: TimeMeans) -> TimeMeans:
+    """Reduced to what both have: the node errors, or only the system error."""
+    combinations = means.nodes if len(means.nodes) and len(other.nodes) else means.trace[None]
+    count = len(combinations)
+    return replace(
+        means,
+        joint=False,
+        measured=combinations @ means.measured,
+        predicted=combinations @ means.predicted,
+        covariance=combinations @ means.covariance @ combinations.T,
+        nodes=np.eye(count) if count > 1 else np.empty((0, 1)),
+        trace=np.ones(count),
+    )
+
+
+def _merged_given(one: GivenPath, steps: int, other: GivenPath, more: int) -> GivenPath:
+    a, b = steps / (steps + more), more / (steps + more)
+    return GivenPath(
+        measured=a * one.measured + b * other.measured,
+        expected=a * one.expected + b * other.expected,
+        predicted=a * one.predicted + b * other.predicted,
+        covariance=a**2 * one.covariance + b**2 * other.covariance,
+        unconditional=a**2 * one.unconditional + b**2 * other.unconditional,
+    )

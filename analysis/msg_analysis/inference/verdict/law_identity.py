@@ -1,0 +1,48 @@
+"""Whether runs are of one experiment: which keys of an experiment file define its law."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from msg_analysis.model.experiment.experiment import Experiment
+
+# Keys of an experiment that do not change its law
+MAY_DIFFER = {"name", "run.seed", "run.duration", "run.processes", "run.speed"}
+
+
+def law_keys(experiment: Experiment) -> dict[str, Any]:
+    """Every key (nested ones with dots) that defines the law of a run, and its value."""
+    found = _flat(experiment.to_document())
+    # The order of the graphs is that of the modes.
+    found["graphs"] = [graph.name for graph in experiment.graph_list]
+    if experiment.protocol:
+        found["protocol.version"] = experiment.protocol.info.version
+    return {key: value for key, value in found.items() if key not in MAY_DIFFER}
+
+
+def law_identity(experiment: Experiment) -> str:
+    """A text of 16 hexadecimal digits, the same for runs of the same law."""
+    text = json.dumps(law_keys(experiment), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def first_difference(one: Experiment, other: Experiment) -> tuple[str, Any, Any] | None:
+    """Key and both values of the first difference, by name; None where the law is the same."""
+    a, b = law_keys(one), law_keys(other)
+    for key in sorted(a.keys() | b.keys()):
+        if a.get(key) != b.get(key):
+            return key, a.get(key), b.get(key)
+    return None
+
+
+def _flat(document: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in document.items():
+        if isinstance(value, Mapping):
+            found |= _flat(value, f"{prefix}{key}.")
+        else:
+            found[f"{prefix}{key}"] = value
+    return found

@@ -1,0 +1,148 @@
+"""Several runs of one experiment, compared with its prediction together."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from msg_analysis.errors import InputError
+from msg_analysis.inference.errors.estimates import Estimate
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.verdict.comparison import Comparison, Member, Pool
+from msg_analysis.inference.verdict.evidence import Evidence
+from msg_analysis.inference.verdict.law_identity import first_difference
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Completeness, Trajectory
+from msg_analysis.theory.prediction import Prediction, predict
+
+
+def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.01) -> Comparison:
+    """Compare several runs of one experiment, (name, trajectory) each, with its prediction, to one verdict.
+
+    Sums are added up over the runs, so that every step counts the same. A further test of the family asks whether the
+    runs are alike (Cochran's Q). No trajectory is kept.
+
+    Raises
+    ------
+    InputError
+        no run, different experiments, a run or seed that is there twice, or no prediction
+    """
+    total: Evidence | None = None
+    prediction: Prediction | None = None
+    trajectory: Trajectory | None = None
+    members: list[Member] = []
+    for name, run in runs:
+        _require_another(members, name, run.record)
+        if prediction is None:
+            _require_prediction(name, run.record.experiment)
+            prediction, trajectory = predict(run.record.experiment), _without_data(run)
+        member, evidence = _examine(name, run, prediction, level)
+        members.append(member)
+        if evidence:
+            total = total.merged(evidence) if total else evidence
+    if prediction is None or trajectory is None:
+        raise InputError("no bag: give at least one")
+    account = _sum([member.completeness for member in members])
+    trajectory = dataclasses.replace(trajectory, completeness=account)
+    pool = _pool(members) if total and total.decisive else Pool(tuple(members))
+    if total is None:
+        comparison = compare.without_numbers(trajectory, level, prediction, 0)
+    else:
+        comparison = compare.judge(trajectory, prediction, total, level, [("runs alike", pool.p)])
+    return dataclasses.replace(comparison, pool=pool)
+
+
+def _examine(name: str, run: Trajectory, prediction: Prediction, level: float) -> tuple[Member, Evidence | None]:
+    """One run by itself; no evidence where too little of it arrived."""
+    own = dataclasses.replace(prediction, experiment=run.record.experiment)
+    observation = Observation.of(run, own)
+    if observation.steps < compare.MIN_STEPS and not run.completeness.complete:
+        missing = Estimate(predicted=prediction.emulated.system_error)
+        return Member(name, run.record, 0, run.completeness, missing, "incomplete"), None
+    evidence = Evidence.of(observation, level)
+    alone = compare.judge(run, own, evidence, level)
+    return Member(name, run.record, evidence.steps, run.completeness, alone.system_error, alone.verdict), evidence
+
+
+def _require_prediction(name: str, experiment: Experiment) -> None:
+    reason = experiment.protocol.unpredictable() if experiment.protocol else None
+    if reason:
+        raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
+
+
+def _require_another(members: list[Member], name: str, record: RunRecord) -> None:
+    """InputError unless it is another run of the same experiment, independent of the others."""
+    for other in members:
+        if record.run == other.record.run:
+            raise InputError(f"{name}: the same run as in {other.name} ({record.run}): give each run once")
+        if record.experiment.run.seed == other.record.experiment.run.seed:
+            raise InputError(
+                f"{name}: run.seed: {record.experiment.run.seed} as in {other.name}, so both have the same random "
+                "numbers: pool runs with different seeds"
+            )
+    if not members:
+        return
+    differs = first_difference(record.experiment, members[0].record.experiment)
+    if differs:
+        key, mine, others = differs
+        raise InputError(
+            f"{name}: {key}: {_shown(mine)}, but {_shown(others)} in {members[0].name}: pool runs of one experiment "
+            "(seed and duration may differ), and put others beside each other with `msg-analysis tabulate`"
+        )
+
+
+def _shown(value: Any) -> str:
+    text = "nothing" if value is None else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _without_data(run: Trajectory) -> Trajectory:
+    """Only the record and the completeness."""
+    return dataclasses.replace(
+        run,
+        states=run.states[:0],
+        modes=run.modes[:0],
+        agent_modes=None,
+        published=None,
+        lost=None,
+        used=None,
+        made=None,
+    )
+
+
+def _sum(counts: list[Completeness]) -> Completeness:
+    refused: dict[str, int] = {}
+    for count in counts:
+        for reason, number in count.refused.items():
+            refused[reason] = refused.get(reason, 0) + number
+    return Completeness(
+        expected=sum(count.expected for count in counts),
+        received=sum(count.received for count in counts),
+        missing=sum(count.missing for count in counts),
+        duplicates=sum(count.duplicates for count in counts),
+        out_of_order=sum(count.out_of_order for count in counts),
+        refused=refused,
+        missing_modes=sum(count.missing_modes for count in counts),
+    )
+
+
+def _pool(members: list[Member]) -> Pool:
+    """Test whether measured - expected is the same in all runs: Cochran's Q."""
+    z, errors = [], []
+    for member in members:
+        error = member.system_error
+        if error.z is not None and error.standard_error:
+            z.append(error.z)
+            errors.append(error.standard_error)
+    if len(z) < 2:
+        return Pool(tuple(members))
+    deviation, precision = np.array(z) * np.array(errors), 1.0 / np.array(errors) ** 2
+    mean = float(precision @ deviation / precision.sum())
+    chi2 = float(precision @ (deviation - mean) ** 2)
+    return Pool(tuple(members), chi2, len(z) - 1, float(stats.chi2.sf(chi2, len(z) - 1)))

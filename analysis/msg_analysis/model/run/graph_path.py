@@ -1,0 +1,114 @@
+"""The graph path of a run: which graph each step uses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msg_analysis.model.arithmetic.random_streams import Stream, generator
+from msg_analysis.model.network.markov_chain import MarkovChain
+from msg_analysis.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from msg_analysis.model.experiment.experiment import Experiment
+
+
+@dataclass(frozen=True, slots=True)
+class Sojourn:
+    """A stretch of steps with one graph.
+
+    Attributes
+    ----------
+    sequence
+        number of the sojourn from 0
+    mode
+        index of the graph from 0
+    first_step, last_step
+        the steps k -> k+1 with first_step <= k <= last_step use it
+    """
+
+    sequence: int
+    mode: int
+    first_step: int
+    last_step: int
+
+
+def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
+    """The graph path of a run of N steps, drawn from the experiment's seed.
+
+    Step k uses the graph that the chain is in at time k dt, so the graphs of successive steps are a Markov chain with
+    P = expm(Gamma dt), exactly. A sojourn between two sampling times, which no step sees, is left out.
+
+    Parameters
+    ----------
+    experiment
+        whose chain, seed and duration
+    initial
+        (n,) law of g(0)
+    """
+    random = generator(experiment.run.seed, Stream.SWITCHING)
+    return _sampled(experiment.chain, initial, random, experiment.steps, experiment.step_length)
+
+
+def _sampled(
+    chain: MarkovChain, initial: FloatArray, random: np.random.Generator, steps: int, dt: float
+) -> Iterator[Sojourn]:
+    """The chain at the times 0, dt, ..., (steps - 1) dt."""
+    time = 0.0
+    first = 0
+    sequence = 0
+    for mode, held in chain.sojourns(initial, random):
+        time += held
+        end = steps if math.isinf(time) else min(steps, math.ceil(time / dt))
+        if end > first:
+            yield Sojourn(sequence, mode, first, end - 1)
+            sequence += 1
+            first = end
+        if end >= steps:
+            return
+
+
+def mode_path(experiment: Experiment, initial: FloatArray) -> IntArray:
+    """(N,) index of the graph of each step k -> k+1.
+
+    Parameters
+    ----------
+    experiment
+        whose chain, seed and duration
+    initial
+        (n,) law of g(0)
+    """
+    return _modes(sojourns(experiment, initial), experiment.steps)
+
+
+def past_modes(experiment: Experiment, first_mode: int, steps: int) -> IntArray:
+    """(steps,) g(-steps), ..., g(-1): the graphs before a run, given that it begins with g(0).
+
+    Drawn backwards from g(0) by the reversed chain, so that the graphs before and after time 0 are one stationary path.
+    A longer past ends with the same graphs as a shorter one.
+
+    Parameters
+    ----------
+    experiment
+        whose chain and seed
+    first_mode
+        index of g(0) from 0
+    steps
+        how far back [steps]
+    """
+    chain = experiment.chain.reversed
+    start = np.eye(chain.modes)[first_mode]
+    random = generator(experiment.run.seed, Stream.PAST)
+    backwards = _modes(_sampled(chain, start, random, steps + 1, experiment.step_length), steps + 1)
+    return backwards[:0:-1]
+
+
+def _modes(path: Iterator[Sojourn], steps: int) -> IntArray:
+    modes = np.empty(steps, dtype=np.int64)
+    for sojourn in path:
+        modes[sojourn.first_step : sojourn.last_step + 1] = sojourn.mode
+    return modes

@@ -1,0 +1,179 @@
+"""The run record: everything that a run was started from, as one JSON document.
+
+It is what every node of a run is given, what the latched ``experiment`` topic carries, and so what any bag of the
+network holds, whoever recorded it.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import uuid
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from msg_analysis.common.version import __version__
+from msg_analysis.errors import InputError
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.protocol_binding import info_of
+from msg_analysis.model.step.step_model import (
+    StepMatrices,
+    StepModel,
+    Wiring,
+    build_model,
+    build_step_model,
+    built_in_noise_gain,
+    step_matrices,
+)
+from msg_analysis.types import FloatArray
+
+FORMAT = 1
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of what computes a run's numbers, and where that is."""
+    import scipy  # here, since the processes of a run only read their record
+
+    return {
+        "msg_analysis": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "machine": platform.machine(),
+        "system": f"{platform.system()} {platform.release()}",
+        "host": platform.node(),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """One run of an experiment.
+
+    Start and matrices are computed once, when the record is made: every process, the twin and the check use the same
+    numbers, whatever their machines.
+
+    Attributes
+    ----------
+    run
+        run id
+    experiment
+        what is run
+    start
+        (m, width) x(0)
+    versions
+        versions of the software that started the run, and the machine that it was started on
+    matrices
+        of a step, in discrete time or of a linear protocol; else None: they follow from the experiment
+    """
+
+    run: uuid.UUID
+    experiment: Experiment
+    start: FloatArray
+    versions: dict[str, str] = field(default_factory=software_versions)
+    matrices: StepMatrices | None = None
+
+    @cached_property
+    def model(self) -> Wiring:
+        """What a step of this run does: a ``StepModel`` where the law is linear, else its wiring alone."""
+        return build_model(self.experiment, self.matrices)
+
+    @property
+    def step_model(self) -> StepModel:
+        """What a step of this run does, if its law is linear.
+
+        Raises
+        ------
+        InputError
+            the experiment has a protocol that is not linear, or not here
+        """
+        return self.model if isinstance(self.model, StepModel) else build_step_model(self.experiment)
+
+    def to_json(self) -> str:
+        """The document; numbers survive the round trip to the last bit."""
+        document: dict[str, Any] = {
+            "format": FORMAT,
+            "run": str(self.run),
+            "experiment": self.experiment.to_document(),
+            "start": self.start.tolist(),
+            "versions": self.versions,
+        }
+        if self.experiment.protocol:
+            document["protocol"] = self.experiment.protocol.info.to_json()
+        if self.matrices:
+            document["step"] = {"weights": [_entries(matrix) for matrix in self.matrices.weights]}
+            if self.experiment.protocol:
+                document["step"]["noise_gain"] = [_entries(matrix) for matrix in self.matrices.noise_gain]
+        return json.dumps(document)
+
+    @classmethod
+    def from_json(cls, text: str, source: str) -> RunRecord:
+        """Read a run record.
+
+        Parameters
+        ----------
+        text
+            what ``to_json`` wrote
+        source
+            where it came from, for messages
+
+        Raises
+        ------
+        InputError
+            not a run record, of another format, or with an invalid experiment in it
+        """
+        try:
+            document: Any = json.loads(text)
+            if document["format"] != FORMAT:
+                raise InputError(
+                    f"{source}: run record of format {document['format']}, expected {FORMAT}: "
+                    "read it with the version of msg_analysis that wrote it"
+                )
+            experiment = Experiment.parse(document["experiment"], source=source, recorded=info_of(document))
+            start = np.array(document["start"], dtype=float)
+            step = document.get("step")
+            matrices = _without_matrices(experiment) if step is None else _matrices(step, experiment, source)
+            record = cls(uuid.UUID(document["run"]), experiment, start, dict(document["versions"]), matrices)
+        except InputError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+            raise InputError(f"{source}: not a run record ({type(error).__name__}: {error})") from error
+        expected = (experiment.agents, experiment.width)
+        if start.shape != expected or not np.isfinite(start).all():
+            raise InputError(f"{source}: start has shape {start.shape}, expected finite numbers of shape {expected}")
+        return record
+
+
+def _entries(matrix: FloatArray) -> list[list[float]]:
+    """[i, j, value] of all that is not 0, agents from 1."""
+    return [[int(i) + 1, int(j) + 1, float(matrix[i, j])] for i, j in np.argwhere(matrix)]
+
+
+def _matrices(document: Any, experiment: Experiment, source: str) -> StepMatrices:
+    stacks = {"noise_gain": built_in_noise_gain(experiment)}
+    for key in ("weights", "noise_gain")[: 2 if experiment.protocol else 1]:
+        stack = np.zeros((len(experiment.graph_list), experiment.agents, experiment.agents))
+        for mode, listed in enumerate(document[key]):
+            entries = np.array(listed, dtype=float).reshape(-1, 3)
+            agents = entries[:, :2].astype(np.int64) - 1
+            if (agents < 0).any() or (agents >= experiment.agents).any() or not np.isfinite(entries).all():
+                wanted = f"[agent, agent, finite number], agents from 1 to {experiment.agents}"
+                raise InputError(f"{source}: step.{key} of graph {mode + 1}: expected entries {wanted}")
+            stack[mode, agents[:, 0], agents[:, 1]] = entries[:, 2]
+        if len(document[key]) != len(stack):
+            raise InputError(f"{source}: step.{key} has {len(document[key])} graphs, expected {len(stack)}")
+        stacks[key] = stack
+    return StepMatrices(**stacks)
+
+
+def _without_matrices(experiment: Experiment) -> StepMatrices | None:
+    """For records of the first edition, which carry no matrices: in discrete time they used scipy's exponential."""
+    if experiment.time == "continuous" or experiment.protocol:
+        return None
+    import scipy.linalg  # here, since the processes of a run would wait for it
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1):
+        return step_matrices(experiment, scipy.linalg.expm)

@@ -1,0 +1,62 @@
+"""Process noise of the agents, block after block of steps."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
+from msg_analysis.model.arithmetic.update_law import weighted_sum
+from msg_analysis.types import FloatArray
+
+
+class ProcessNoise:
+    """The process noise of any agent at any step: row i of B_g v(k).
+
+    Correlated noise needs no communication: an agent draws the sources v_j that its rows use by itself.
+
+    Parameters
+    ----------
+    seed
+        the experiment's seed
+    noise_gain
+        (n, m, m) B_g of the step model
+    replicas
+        entries of each state
+    """
+
+    def __init__(self, seed: int, noise_gain: FloatArray, replicas: int) -> None:
+        self._shape = (STEPS_PER_BLOCK, replicas)
+        self._gain = noise_gain
+        agents = noise_gain.shape[1]
+        sources = int(np.count_nonzero(noise_gain.any(axis=0), axis=1).max(initial=1))
+
+        # An agent asks for its own row only, the twin for every row of a block: keep one block of every source.
+        @lru_cache(maxsize=agents if sources > 1 else 1)
+        def source(agent: int, block: int) -> FloatArray:
+            return normals(seed, Stream.PROCESS, agent, block, self._shape)
+
+        self._source = source
+
+    def block(self, agent: int, block: int) -> list[FloatArray]:
+        """For each mode, the noise of one agent in the steps of one block, (STEPS_PER_BLOCK, replicas).
+
+        Modes with the same noise share one array.
+
+        Parameters
+        ----------
+        agent
+            index from 0
+        block
+            number of the block of steps, from 0
+        """
+        rows = self._gain[:, agent]
+        drawn = {key: self._combined(row, block) for key, row in {row.tobytes(): row for row in rows}.items()}
+        return [drawn[row.tobytes()] for row in rows]
+
+    def _combined(self, row: FloatArray, block: int) -> FloatArray:
+        used = np.flatnonzero(row)
+        if not used.size:
+            return np.zeros(self._shape)
+        return weighted_sum([float(row[j]) for j in used], [self._source(int(j), block) for j in used])

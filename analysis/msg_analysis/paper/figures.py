@@ -1,0 +1,377 @@
+"""The three examples of the paper as figures for print, with their numbers as CSV."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib import transforms as mtransforms
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import NullLocator
+
+from msg_analysis.common.files import write_whole
+from msg_analysis.errors import InputError
+from msg_analysis.model.network.graphs import Graph
+from msg_analysis.paper import emulation, examples
+from msg_analysis.paper.emulation import Measured
+from msg_analysis.paper.examples import CENTRALITY, NODE, SYSTEM, Curve, Example
+from msg_analysis.report.figures.matplotlib_style import STYLE, draw_graph
+from msg_analysis.report.figures.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILLION
+
+FORMATS = ("png", "svg", "pdf")
+WIDTH = 7.16  # inches: two columns of a journal
+_DPI = 300
+_STYLE = STYLE | {
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "axes.labelcolor": BLACK,
+    "axes.edgecolor": "#4b5563",
+    "axes.linewidth": 0.6,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "xtick.color": BLACK,
+    "ytick.color": BLACK,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "grid.linewidth": 0.5,
+    "legend.fontsize": 7.5,
+    "legend.handlelength": 2.6,
+    "legend.borderaxespad": 0.2,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 3.6,
+    "mathtext.fontset": "dejavusans",
+    "pdf.fonttype": 42,  # TrueType: text stays text
+    "svg.fonttype": "path",  # looks the same where the font is missing
+}
+# Colour, dashes and marker of the first, second ... curve of a panel; each of the three alone is distinctive.
+_LOOKS = (
+    (BLUE, "-", "o"),
+    (VERMILLION, (0, (5, 1.5)), "s"),
+    (GREEN, (0, (5, 1.5, 1, 1.5)), "^"),
+    (ORANGE, (0, (1, 1)), "D"),
+    (PURPLE, (0, (8, 2)), "v"),
+)
+_MARKERS = 5  # on a curve
+_GREY = "#4b5563"
+_LINE = 0.125  # inches between labels
+_SIDE = 0.05  # inches between points at the same rate
+_NOTE = (
+    "Curves: continuous time.  Points: networks of ROS 2 processes, 95 % intervals.  "
+    f"Dashes: exact for their steps (dt = {emulation.DT:g})."
+)
+
+
+def write_figures(
+    numbers: Sequence[int],
+    directory: str | Path,
+    formats: Sequence[str] = FORMATS,
+    measured: Sequence[Measured] = (),
+) -> list[Path]:
+    """Write ``example_<number>`` in every format and as CSV; with measured points, ``example_<number>_emulated``.
+
+    Each file is whole or not written (InputError). The same versions of the packages write the same bytes.
+    """
+    directory = Path(directory)
+    written = []
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for number in numbers:
+            example = examples.EXAMPLES[number]()
+            stem = f"example_{number}{'_emulated' if measured else ''}"
+            with mpl.rc_context(_STYLE):
+                figure = draw(example, measured)
+                for name in formats:
+                    written.append(write_whole(directory / f"{stem}.{name}", _rendered(figure, name)))
+            text = emulation.csv_text(number, measured) if measured else csv_text(example)
+            written.append(write_whole(directory / f"{stem}.csv", text.encode()))
+    except OSError as error:
+        place = error.filename or directory
+        raise InputError(f"{place}: cannot be written ({error.strerror}): choose another place with --out") from error
+    return written
+
+
+def csv_text(example: Example) -> str:
+    """The curves as CSV: comment lines that begin with ``#``, a header with units, a row per point."""
+    text = io.StringIO()
+    for line in (f"Example {example.number}: {example.title}", "agent 0 is the system", *example.remarks):
+        text.write(f"# {line}\n")
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow(examples.COLUMNS)
+    rows.writerows(examples.table(example))
+    return text.getvalue()
+
+
+def draw(example: Example, measured: Sequence[Measured] = ()) -> Figure:
+    """The figure of an example, with measured points on its curves; the caller sets the style."""
+    figure = {1: _draw_1, 2: _draw_2, 3: _draw_3}[example.number](example, measured)
+    if measured:
+        figure.supxlabel(_NOTE, size=7.5, color=_GREY)
+    _settle(figure)
+    return figure
+
+
+def _draw_1(example: Example, measured: Sequence[Measured]) -> Figure:
+    figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
+    grid = figure.add_gridspec(2, 3, width_ratios=(0.6, 1, 1))
+    for row, graph in enumerate(example.networks["line_ring"]):
+        _draw_network(figure.add_subplot(grid[row, 0]), graph, f"({'ab'[row]}) $G_{row + 1}$: {graph.name}")
+    for row, (swept, held) in enumerate((("r12", "r21"), ("r21", "r12"))):
+        system, node = figure.add_subplot(grid[row, 1]), figure.add_subplot(grid[row, 2])
+        for value, name, side in ((0.5, "$G_1$ held", "top"), (1.0, "$G_2$ held", "bottom")):
+            system.axhline(value, color=_GREY, lw=0.7, zorder=1)
+            system.text(2.5, value + (0.012 if side == "bottom" else -0.012), name, color=_GREY, va=side, ha="center")
+        system.set(ylabel="system certainty $1/E$", ylim=(0.43, 1.07), xlim=(0, 5), xlabel=_rate(swept))
+        node.set(ylabel="node certainty $1/E_i$", ylim=(1.3, 5.4), xlim=(0, 5), xlabel=_rate(swept))
+        curves = [c for c in example.select("line_ring", SYSTEM) if np.ptp(getattr(c, swept)) > 0]
+        named = [(f"{getattr(curve, held)[0]:g}", curve) for curve in curves]
+        _plot(system, swept, named, heading=_rate(held), height=1.45, measured=measured)
+        nodes = _coinciding([c for c in example.select("line_ring", NODE) if np.ptp(getattr(c, swept)) > 0])
+        _plot(node, swept, nodes, heading="agents", height=1.45, measured=measured)
+        system.set_title(rf"({'cd'[row]}) $\epsilon$ = {curves[0].epsilon[0]:g}", loc="left")
+        node.set_title(f"({'ef'[row]}) {_rate(held)} = 1", loc="left")
+    return figure
+
+
+def _draw_2(example: Example, measured: Sequence[Measured]) -> Figure:
+    figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
+    grid = figure.add_gridspec(1, 3, width_ratios=(0.5, 1, 1))
+    places = grid[0].subgridspec(3, 1)
+    for row, graph in enumerate(example.networks["three_lines"]):
+        panel = figure.add_subplot(places[row])
+        _draw_network(panel, graph, f"({'abc'[row]}) $G_{row + 1}$")
+    _note_reconstruction(panel)
+    rates = "$r_{12} = r_{32}$    ($r_{21} = r_{23} = 0.05$)"
+    system = figure.add_subplot(grid[1])
+    system.set(ylabel="system certainty $1/E$", xlabel=rates, xlim=(0, 1), ylim=(0.495, 0.645))
+    curves = example.select("three_lines", SYSTEM)
+    _plot(
+        system, "r12", [(f"{c.epsilon[0]:g}", c) for c in curves], heading=r"$\epsilon$", height=3.1, measured=measured
+    )
+    for (colour, _, _), curve in zip(_LOOKS, curves, strict=False):
+        peak = (curve.r12[curve.peak], curve.value[curve.peak])
+        system.plot(*peak, "*", ms=9, color=colour, mec="white", mew=0.6, zorder=4)
+        text = "" if measured else f"{peak[1]:.4f}"
+        system.annotate(text, peak, (0, 6), textcoords="offset points", ha="center", color=colour, size=7.5)
+    system.set_title("(d) largest values: stars", loc="left")
+    halves = grid[2].subgridspec(2, 1)
+    panels = [figure.add_subplot(halves[row]) for row in range(2)]
+    for letter, panel, scale in zip("ef", panels, examples.NODE_SCALES, strict=True):
+        panel.set(ylabel="node certainty $1/E_i$", xlabel=rates, xlim=(0, 1), ylim=(1.5, 5.2))
+        nodes = _coinciding([c for c in example.select("three_lines", NODE) if c.epsilon[0] == scale])
+        _plot(panel, "r12", nodes, heading="agents", height=1.4, measured=measured)
+        panel.set_title(rf"({letter}) $\epsilon$ = {scale:g}", loc="left")
+    return figure
+
+
+def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
+    figure = Figure(figsize=(WIDTH, 5.4), layout=ConstrainedLayoutEngine(hspace=0.04))
+    letters = iter("abcdefghij")
+    names = {"knife_edge": "Knife-edge pair", "smallest": "Smallest pair"}
+    rows = figure.add_gridspec(2, 1)
+    for row, network in enumerate(example.networks):
+        grid = rows[row].subgridspec(2, 4, width_ratios=(0.62, 1, 1, 1))
+        for mode, graph in enumerate(example.networks[network]):
+            name = f"{names[network]}\n" if mode == 0 else ""
+            panel = figure.add_subplot(grid[mode, 0])
+            _draw_network(panel, graph, f"{name}({next(letters)}) $G_{mode + 1}$")
+        _note_reconstruction(panel)
+        centrality, certainty, lead = (figure.add_subplot(grid[:, column]) for column in (1, 2, 3))
+        central, certain = example.select(network, CENTRALITY), example.select(network, NODE)
+        for axes in (centrality, certainty, lead):
+            axes.set(xscale="log", xlim=(1e-2, 1e2), xlabel=r"$\epsilon = q_{12} = q_{21}$ [1/time]")
+            axes.set_title(f"({next(letters)})", loc="left")
+        centrality.set(ylabel="robustness centrality $1/E$")
+        certainty.set(ylabel="node certainty $1/E_i$")
+        for axes, curves in ((centrality, central), (certainty, certain)):
+            found = [point for c in curves for point in _on_curve(_agent(c), c, "epsilon", measured)]
+            low = min([c.value.min() for c in curves] + [point.low for point in found])
+            high = max([c.value.max() for c in curves] + [point.high for point in found])
+            axes.set_ylim(low - 0.06 * (high - low), high + 0.36 * (high - low))
+            _plot(axes, "epsilon", [(_agent(c), c) for c in curves], heading="agent", height=1.8, measured=measured)
+            axes.text(0.03, 0.985, _orders(curves), transform=axes.transAxes, va="top", size=7, color=_GREY)
+        lead.set(ylabel="agent 1 above agent 3 [%]", ylim=(-2, 2))
+        lead.set_yscale("symlog", linthresh=0.01, linscale=0.6)
+        lead.set_yticks([-1, -0.1, -0.01, 0, 0.01, 0.1, 1], ["−1", "−0.1", "−0.01", "0", "0.01", "0.1", "1"])
+        lead.yaxis.set_minor_locator(NullLocator())
+        lead.axhline(0, color=_GREY, lw=0.7, zorder=1)
+        ahead = [
+            (name, dataclasses.replace(curves[0], value=100 * (curves[0].value / curves[2].value - 1)))
+            for name, curves in (("centrality", central), ("certainty", certain))
+        ]
+        _plot(lead, "epsilon", ahead, heading="in", height=1.8)
+    return figure
+
+
+def _orders(curves: Sequence[Curve]) -> str:
+    """Order of the agents at epsilon = 0.1, 1 and 10."""
+    lines = []
+    for epsilon in (0.1, 1.0, 10.0):
+        point = int(np.abs(curves[0].epsilon - epsilon).argmin())
+        order = "-".join(str(agent + 1) for agent in examples.order(curves, point))
+        lines.append(rf"{order} at $\epsilon$ = {epsilon:g}")
+    return "\n".join(lines)
+
+
+def _plot(
+    axes: Axes,
+    swept: str,
+    curves: Sequence[tuple[str, Curve]],
+    *,
+    heading: str,
+    height: float,
+    measured: Sequence[Measured] = (),
+) -> None:
+    """Curves over one of their rates, with labels at the right end under a heading; set the limits before.
+
+    Measured points, if any, have the markers instead of the curves. ``height`` of the axes [inches] is approximate: the
+    layout is not known yet.
+    """
+    logarithmic = axes.get_xscale() == "log"
+    points = [_on_curve(label, curve, swept, measured) for label, curve in curves]
+    ends = [end for found in points for point in found for end in (point.low, point.high)]
+    axes.set_ylim(min([axes.get_ylim()[0], *ends]), max([axes.get_ylim()[1], *ends]))
+    if ends and not logarithmic:  # room for points at the end of the curves
+        axes.set_xlim(right=1.03 * max(curve_x.max() for curve_x in (getattr(curve, swept) for _, curve in curves)))
+    for look, (_, curve) in enumerate(curves):
+        colour, dashes, marker = _LOOKS[look]
+        x = getattr(curve, swept)
+        place = np.log(x) if logarithmic else x
+        places = (np.arange(_MARKERS) + (look + 0.2) / len(_LOOKS)) / _MARKERS  # markers do not overlap
+        marked = sorted({int(np.abs(place - target).argmin()) for target in place[0] + places * np.ptp(place)})
+        axes.plot(
+            x,
+            curve.value,
+            color=colour,
+            ls=dashes,
+            marker="" if measured else marker,
+            markevery=marked,
+            mec="white",
+            mew=0.4,
+        )
+        beside = 0.4 * _SIDE * (look - (len(curves) - 1) / 2) if logarithmic else 0.0
+        _plot_points(axes, swept, points[look], colour, marker, beside)
+    ends = [*axes.get_ylim(), *(curve.value[-1] for _, curve in curves)]
+    low, high, *ends = axes.transScale.transform([(1.0, end) for end in ends])[:, 1]
+    heights = _apart([(end - low) / (high - low) for end in ends], _LINE / height)
+    for (label, _), share, (colour, _, _) in zip(curves, heights, _LOOKS, strict=False):
+        _beside(axes, label, share, 0, colour, "center_baseline")
+    _beside(axes, heading, 1.0, 5, BLACK, "bottom")
+
+
+def _on_curve(label: str, curve: Curve, swept: str, measured: Sequence[Measured]) -> list[Measured]:
+    """The measured points on a curve, which may stand for several agents: ``label`` has their numbers."""
+    held = [name for name in ("epsilon", "r12", "r21") if name != swept]
+    agents = {None} if curve.agent is None else {int(number) - 1 for number in label.split(", ") if number.isdigit()}
+    return [
+        point
+        for point in measured
+        if (point.run.network, point.quantity) == (curve.network, curve.quantity)
+        and point.agent in agents
+        and all(np.isclose(getattr(curve, name), getattr(point.run, name)).all() for name in held)
+    ]
+
+
+def _plot_points(axes: Axes, swept: str, points: Sequence[Measured], colour: str, marker: str, beside: float) -> None:
+    """Measured points with their intervals, and dashes for their predictions; shifted by ``beside`` [inches]."""
+    for point in points:
+        x = getattr(point.run, swept)
+        # Side by side where several agents share a curve.
+        here = [other for other in points if getattr(other.run, swept) == x]
+        shift = beside + _SIDE * (here.index(point) - (len(here) - 1) / 2)
+        place = axes.transData + mtransforms.ScaledTranslation(shift, 0, axes.figure.dpi_scale_trans)
+        bars = axes.vlines(x, point.low, point.high, color=colour, lw=0.9, zorder=3)
+        bars.set_transform(place)
+        axes.plot(x, point.value, marker, color=colour, ms=3.8, mec="white", mew=0.4, zorder=4, transform=place)
+        axes.plot(x, point.predicted, "_", color=BLACK, ms=4.5, mew=0.8, zorder=5, transform=place)
+
+
+def _beside(axes: Axes, text: str, height: float, raised: float, colour: str, align: str) -> None:
+    """A text to the right of the axes, at a share of their height, ``raised`` by some points."""
+    axes.annotate(
+        text, (1, height), (4, raised), xycoords="axes fraction", textcoords="offset points", color=colour, va=align
+    )
+
+
+def _apart(heights: Sequence[float], gap: float) -> list[float]:
+    """Heights moved as little as possible to be ``gap`` apart: neighbours that are too close keep their mean."""
+    order = sorted(range(len(heights)), key=lambda i: heights[i])
+    blocks: list[tuple[float, list[int]]] = []  # (middle, members)
+    for i in order:
+        middle, members = heights[i], [i]
+        while blocks and middle - blocks[-1][0] < gap * (len(members) + len(blocks[-1][1])) / 2:
+            other, more = blocks.pop()
+            middle = (middle * len(members) + other * len(more)) / (len(members) + len(more))
+            members = more + members
+        blocks.append((middle, members))
+    moved = list(heights)
+    for middle, members in blocks:
+        for rank, i in enumerate(members):
+            moved[i] = middle + gap * (rank - (len(members) - 1) / 2)
+    return moved
+
+
+def _note_reconstruction(axes: Axes) -> None:
+    """Write below the axes that the graphs are reconstructed."""
+    axes.annotate(
+        "reconstructed", (0.5, 0.0), (0, -5), xycoords="axes fraction", textcoords="offset points", size=7,
+        color=_GREY, style="italic", ha="center", va="top",
+    )  # fmt: skip
+
+
+def _settle(figure: Figure) -> None:
+    """Make the layout, and round it: its last digits depend on the iteration order of a set."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        axes.set_position(np.round(axes.get_position(original=True).bounds, 5).tolist())
+
+
+def _draw_network(axes: Axes, graph: Graph, title: str) -> None:
+    angles = np.pi / 2 - 2 * np.pi * np.arange(graph.agents) / graph.agents
+    places = {agent: np.array([np.cos(angle), np.sin(angle)]) for agent, angle in enumerate(angles)}
+    draw_graph(axes, graph, places, "#374151", size=110)
+    for artist in axes.collections:
+        artist.set_clip_on(False)
+    axes.set_title("")
+    axes.set_title(title, loc="left")
+    axes.set_axis_off()
+
+
+def _coinciding(curves: Sequence[Curve]) -> list[tuple[str, Curve]]:
+    """Curves that are equal by symmetry, once, under the numbers of all their agents."""
+    groups: list[tuple[list[str], Curve]] = []
+    for curve in curves:
+        for agents, other in groups:
+            if np.allclose(curve.value, other.value, rtol=1e-9):
+                agents.append(_agent(curve))
+                break
+        else:
+            groups.append(([_agent(curve)], curve))
+    return [(", ".join(agents), curve) for agents, curve in groups]
+
+
+def _agent(curve: Curve) -> str:
+    """Number of a curve's agent, from 1."""
+    assert curve.agent is not None
+    return str(curve.agent + 1)
+
+
+def _rate(name: str) -> str:
+    return f"$r_{{{name[1:]}}}$"
+
+
+def _rendered(figure: Figure, name: str) -> bytes:
+    stream = io.BytesIO()
+    metadata: dict[str, None] = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}.get(
+        name, {"CreationDate": None, "Creator": None, "Producer": None}
+    )
+    figure.savefig(stream, format=name, metadata=metadata, dpi=_DPI)
+    return stream.getvalue()

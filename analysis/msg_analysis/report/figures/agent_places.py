@@ -1,0 +1,22 @@
+"""Positions of the agents in drawings: the same in every graph of an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import networkx as nx
+
+from msg_analysis.model.network.graphs import Graph
+from msg_analysis.types import FloatArray
+
+
+def places(graph_list: Sequence[Graph]) -> Mapping[int, FloatArray]:
+    """Position (2,) of every agent, from 0, within about -1 to 1; laid out by the union of all graphs."""
+    union = nx.from_numpy_array(sum((g.adjacency + g.adjacency.T > 0) for g in graph_list) > 0)
+    if max(degree for _, degree in union.degree) > max(4, len(union) / 2):
+        found: Mapping[int, FloatArray] = nx.circular_layout(union)  # for example stars and complete graphs
+    elif nx.is_connected(union) and len(union) <= 120:
+        found = nx.kamada_kawai_layout(union)
+    else:
+        found = nx.spring_layout(union, seed=1, iterations=200)
+    return found

@@ -1,0 +1,311 @@
+"""Interactive figures of the report: Bokeh models. Hover shows values; drag zooms; the page's script chooses agents."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from bokeh.layouts import gridplot
+from bokeh.models import (
+    BasicTicker,
+    ColorBar,
+    ColumnDataSource,
+    FixedTicker,
+    HoverTool,
+    Legend,
+    LegendItem,
+    LinearColorMapper,
+    Range1d,
+    Span,
+    UIElement,
+    Whisker,
+)
+from bokeh.palettes import PuOr, interp_palette
+
+from msg_analysis.report.figures.palette import (
+    BLACK,
+    BLUE,
+    GREY,
+    INK,
+    SKY,
+    VERMILLION,
+)
+from msg_analysis.report.html.plot_style import SANS, new_figure, place_legend, plain_legend
+from msg_analysis.types import FloatArray
+
+HALF = 1.959963984540054  # standard errors on each side of a 95 % interval
+MOST_LINES = 8
+"""Most agents whose convergence is drawn at once."""
+_NUMBERED = 8  # most agents with which heat maps show numbers
+_POINTS = 200  # at most, on the line of an agent
+
+
+def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> UIElement:
+    """The running system error, of ``Comparison.running`` with (points,) each, beside the predicted one."""
+    time, mean, error = running["time"], running["system_error"], running["standard_error"]
+    centre = predicted if predicted is not None else mean[-1]
+    low, high = centre - HALF * error, centre + HALF * error
+    plot = new_figure(270, x_axis_label="simulated time", y_axis_label="system error", x_range=(0.0, float(time[-1])))
+    data = {"time": time, "mean": mean, "low": low, "high": high, "z": (mean - centre) / np.where(error > 0, error, 1)}
+    source = ColumnDataSource(data)
+    rows = [("time", "@time{0.[00]}"), ("measured up to then", "@mean{0.0000}")]
+    if predicted is not None:
+        plot.varea("time", "low", "high", source=source, color=SKY, alpha=0.3, legend_label="95 % band")
+        plot.line(time, np.full(len(time), predicted), color=BLACK, line_dash="dashed", legend_label="predicted")
+        rows += [("predicted", f"{predicted:.4g}"), ("95 % band", "@low{0.0000} … @high{0.0000}"), ("z", "@z{+0.00}")]
+    line = plot.line("time", "mean", source=source, color=BLUE, line_width=2, legend_label="mean up to this time")
+    plot.add_tools(HoverTool(renderers=[line], mode="vline", tooltips=rows, line_policy="nearest"))
+    # The earliest values are mostly noise, and would flatten the rest.
+    late = time >= time[-1] / 50
+    bottom, top = min(mean[late].min(), low[late].min()), max(mean[late].max(), high[late].max())
+    margin = 0.08 * (top - bottom) or 1.0
+    plot.y_range = Range1d(max(bottom - margin, 0.0), top + margin)  # an error is never negative
+    place_legend(plot)
+    return plot
+
+
+def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
+    """Node errors with 95 % intervals beside the predicted ones; marked if p < ``level``; agents can be chosen."""
+    agents = np.arange(1, len(nodes) + 1)
+    measured, predicted, error = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
+    apart = np.nan_to_num(_column(nodes, "p_holm"), nan=1.0) < level
+    half = HALF * error
+    data = {
+        "agent": agents,
+        "measured": measured,
+        "predicted": predicted,
+        "left": agents - 0.32,
+        "right": agents + 0.32,
+        "low": measured - half,
+        "high": measured + half,
+        "z": _column(nodes, "z"),
+        "p": _column(nodes, "p_holm"),
+        "colour": np.where(apart, VERMILLION, BLUE),
+        "marker": np.where(apart, "square", "circle"),
+    }
+    source = ColumnDataSource(data, name="nodes")
+    plot = new_figure(
+        270,
+        "box_zoom,tap,box_select,pan,wheel_zoom,reset,save",
+        x_axis_label="agent",
+        y_axis_label="mean-square error",
+        x_range=(0.3, len(nodes) + 0.7),
+    )
+    plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
+    plot.xgrid.grid_line_color = None
+    rows = [("agent", "@agent"), ("measured", "@measured{0.0000}")]
+    size = float(np.clip(220 / len(nodes), 5, 11))
+    if not np.isnan(predicted).all():
+        plot.segment(
+            "left", "predicted", "right", "predicted", source=source, color=BLACK, line_width=2,
+            legend_label="predicted", nonselection_alpha=0.4,
+        )  # fmt: skip
+        rows.append(("predicted", "@predicted{0.0000}"))
+    if not np.isnan(error).all():
+        whisker = Whisker(source=source, base="agent", lower="low", upper="high", line_color="colour", level="glyph")
+        whisker.upper_head.size = whisker.lower_head.size = size * 0.7
+        whisker.upper_head.line_color = whisker.lower_head.line_color = GREY
+        plot.add_layout(whisker)
+        rows += [("95 % interval", "@low{0.0000} … @high{0.0000}"), ("z", "@z{+0.00}"), ("p, adjusted", "@p{0.0000}")]
+    points = plot.scatter(
+        "agent", "measured", source=source, marker="marker", size=size, color="colour", nonselection_alpha=0.25
+    )
+    plot.add_tools(HoverTool(renderers=[points], tooltips=rows))
+    ends = np.concatenate([measured, predicted, data["low"], data["high"]])
+    if not np.isnan(ends).all():
+        margin = 0.08 * float(np.nanmax(ends) - np.nanmin(ends)) or 1.0
+        plot.y_range = Range1d(max(float(np.nanmin(ends)) - margin, 0.0), float(np.nanmax(ends)) + margin)
+    legend = plot.legend[0] if plot.legend else Legend()
+    name = "measured" if np.isnan(error).all() else "measured, 95 % interval"
+    for chosen, label in ((~apart, name), (apart, "measured, disagrees")):
+        there = np.flatnonzero(chosen & ~np.isnan(measured))
+        if len(there):  # takes shape and colour of one such point
+            legend.items.append(LegendItem(label=label, renderers=[points], index=int(there[0])))
+    if not plot.legend:
+        plot.add_layout(legend)
+    place_legend(plot)
+    return plot
+
+
+def agent_convergence(
+    states: FloatArray,  # (steps, m, replicas), without gaps
+    reference: float | None,
+    dt: float,  # [units of simulated time]
+    nodes: Sequence[Mapping[str, Any]],
+) -> UIElement | None:
+    """Measured node errors of the chosen agents over time, relative to the predicted ones.
+
+    None where nothing is predicted or measured. A reference of None stands for the mean of the agents.
+    """
+    predicted, error = _column(nodes, "predicted"), _column(nodes, "standard_error")
+    if len(states) < 2 or not (np.nan_to_num(predicted) > 0).any():
+        return None
+    ends = np.unique(np.rint(np.geomspace(1, len(states), _POINTS)).astype(np.int64))
+    sums, total, done = np.empty((len(ends), states.shape[1])), np.zeros(states.shape[1]), 0
+    for place, end in enumerate(ends.tolist()):  # in pieces: a run may be long
+        piece = states[done:end]
+        middle = piece.mean(axis=1, keepdims=True) if reference is None else reference
+        total = total + np.square(piece - middle).mean(axis=2).sum(axis=0)
+        sums[place], done = total, end
+    scale = np.where(np.nan_to_num(predicted) > 0, predicted, np.nan)
+    parts = (sums / ends[:, None] / scale).T
+    everything = ColumnDataSource({"part": parts.ravel().astype(np.float32)}, name="all_agents")
+    times = ColumnDataSource({"time": (ends * dt).astype(np.float32)}, name="all_times")
+    widths = ColumnDataSource({"width": HALF * error / scale}, name="all_widths")
+    lines = ColumnDataSource({key: [] for key in ("xs", "ys", "agent", "colour", "dash")}, name="lines")
+    bands = ColumnDataSource({key: [] for key in ("xs", "ys", "colour")}, name="bands")
+    plot = new_figure(270, x_axis_label="simulated time", y_axis_label="measured / predicted")
+    plot.x_range = Range1d(0.0, float(len(states) * dt))
+    settled = parts[:, ends >= len(states) / 20]
+    reach = min(1.2 * float(np.nanmax(np.abs(settled - 1))), 1.0)
+    plot.y_range = Range1d(1 - reach, 1 + reach)
+    plot.add_layout(Span(location=1.0, dimension="width", line_color=BLACK, line_width=1.2, line_dash="dashed"))
+    plot.patches("xs", "ys", source=bands, color="colour", alpha=0.1, line_alpha=0)
+    drawn = plot.multi_line("xs", "ys", source=lines, color="colour", line_dash="dash", line_width=2)
+    plot.add_layout(
+        Legend(items=[LegendItem(label={"field": "agent"}, renderers=[drawn])], orientation="horizontal"), "above"
+    )
+    plain_legend(plot.legend[0])
+    rows = [("", "@agent"), ("time", "$data_x{0.[00]}"), ("measured / predicted", "$data_y{0.000}")]
+    plot.add_tools(HoverTool(renderers=[drawn], tooltips=rows, line_policy="nearest"))
+    # Sources that no glyph uses reach the page as tags.
+    plot.tags = [everything, times, widths]
+    return plot
+
+
+def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> UIElement | None:
+    """Heat maps of the matrices (m, m) that exist and of their difference, of one scale; None without any."""
+    known = {key: value for key, value in (("measured", measured), ("predicted", predicted)) if value is not None}
+    if measured is not None and predicted is not None:
+        known["difference"] = measured - predicted
+    if not known:
+        return None
+    agents = len(next(iter(known.values())))
+    limit = max(float(np.abs(matrix).max()) for matrix in known.values()) or 1.0
+    mapper = LinearColorMapper(palette=interp_palette(PuOr[11], 255), low=-limit, high=limit)
+    source = ColumnDataSource({key: [matrix] for key, matrix in known.items()})
+    titles = {"measured": "measured", "predicted": "predicted", "difference": "measured − predicted"}
+    rows = [("agents", "$y{0}, $x{0}"), *((titles[key], f"@{key}{{0.0000}}") for key in known)]
+    across, down = Range1d(0.5, agents + 0.5), Range1d(agents + 0.5, 0.5)
+    panels = []
+    for key, matrix in known.items():
+        panel = new_figure(
+            290,
+            "box_zoom,wheel_zoom,pan,reset,save",
+            title=titles[key],
+            x_range=across,
+            y_range=down,
+            toolbar_location=None,
+            min_border_right=8,
+        )
+        panel.grid.grid_line_color = None
+        panel.title.text_font, panel.title.text_color = SANS, INK
+        panel.axis.ticker = BasicTicker(desired_num_ticks=8, min_interval=1, num_minor_ticks=0)
+        image = panel.image(key, x=0.5, y=0.5, dw=agents, dh=agents, color_mapper=mapper, source=source)
+        panel.add_tools(HoverTool(renderers=[image], tooltips=rows))
+        if agents <= _NUMBERED:
+            _write_numbers(panel, matrix, limit)
+        panels.append(panel)
+    panels[0].yaxis.axis_label = "agent"
+    bar = ColorBar(color_mapper=mapper, width=10, label_standoff=6, border_line_color=None, padding=4)
+    bar.major_label_text_font = SANS
+    panels[-1].add_layout(bar, "right")
+    return gridplot([panels], sizing_mode="stretch_width", toolbar_options={"logo": None, "autohide": True})
+
+
+def _write_numbers(panel: Any, matrix: FloatArray, limit: float) -> None:
+    digits = max(0, 2 - int(np.floor(np.log10(limit))))
+    i, j = np.indices(matrix.shape)
+    panel.text(
+        x=(j + 1).ravel(),
+        y=(i + 1).ravel(),
+        text=[f"{value:.{digits}f}" for value in matrix.ravel()],
+        text_color=np.where(np.abs(matrix.ravel()) > 0.6 * limit, "white", BLACK).tolist(),
+        text_align="center",
+        text_baseline="middle",
+        text_font={"value": SANS},
+        text_font_size=f"{int(np.clip(60 / len(matrix), 7, 11))}px",
+    )
+
+
+def innovation_sizes(
+    ratios: FloatArray,  # (m,); NaN for an agent without noise
+    samples: int,  # innovations per agent
+) -> UIElement:
+    """Variance of each agent's innovations relative to the predicted one, and where 95 % of such ratios lie."""
+    agents = np.arange(1, len(ratios) + 1)
+    half = HALF * np.sqrt(2.0 / max(samples, 1))
+    inside = np.abs(ratios - 1.0) <= half
+    data = {
+        "agent": agents,
+        "ratio": ratios,
+        "colour": np.where(inside, BLUE, VERMILLION),
+        "marker": np.where(inside, "circle", "square"),
+    }
+    plot = new_figure(200, x_axis_label="agent", y_axis_label="variance / predicted", x_range=(0.3, len(ratios) + 0.7))
+    plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
+    plot.xgrid.grid_line_color = None
+    ends = np.array([0.3, len(ratios) + 0.7])
+    plot.varea(
+        ends, np.full(2, 1 - half), np.full(2, 1 + half), color=SKY, alpha=0.3, legend_label="95 of 100 lie here"
+    )
+    plot.line(ends, np.ones(2), color=BLACK, line_dash="dashed", legend_label="predicted")
+    points = plot.scatter(
+        "agent", "ratio", source=data, marker="marker", size=float(np.clip(220 / len(ratios), 5, 10)), color="colour"
+    )
+    plot.add_tools(
+        HoverTool(renderers=[points], tooltips=[("agent", "@agent"), ("variance / predicted", "@ratio{0.0000}")])
+    )
+    reach = 1.25 * max(float(np.nanmax(np.abs(ratios - 1.0), initial=0.0)), half)
+    plot.y_range = Range1d(max(1 - reach, 0.0), 1 + reach)
+    place_legend(plot)
+    return plot
+
+
+def lateness(timing: Mapping[str, Any]) -> UIElement:
+    """Histogram of how late the steps of a run in real time were; ``timing`` of a comparison."""
+    histogram = timing["histogram"]
+    return _histogram(histogram["lateness_ms"], histogram["steps"], "late by [ms]", "steps", timing["period_ms"])
+
+
+def staleness(timing: Mapping[str, Any]) -> UIElement:
+    """Histogram of the age of the neighbours' values that a run in real time used; ``timing`` of a comparison."""
+    histogram, label = timing["histogram"], "age of the values used [ms]"
+    return _histogram(histogram["staleness_ms"], histogram["uses"], label, "values used", timing["period_ms"])
+
+
+def _histogram(
+    edges: Sequence[float], counts: Sequence[int], label: str, what: Literal["steps", "values used"], period: float
+) -> Any:
+    left, right, count = np.array(edges[:-1]), np.array(edges[1:]), np.array(counts)
+    beyond = (left >= period) & (what == "steps")
+    plot = new_figure(250, x_axis_label=label, y_axis_label=what, min_border_right=12)
+    # log10(count + 1): an empty bar has height 0.
+    data = {
+        "left": left,
+        "right": right,
+        "count": count,
+        "height": np.log10(count + 1.0),
+        "colour": np.where(beyond, VERMILLION, BLUE),
+    }
+    bars = plot.quad("left", "right", "height", 0, source=data, color="colour", line_color="white", line_width=0.5)
+    plot.add_tools(HoverTool(renderers=[bars], tooltips=[("ms", "@left{0.00} to @right{0.00}"), (what, "@count")]))
+    most = max(int(count.max(initial=0)), 1)
+    ticks = [0, *(10**power for power in range(len(str(most))))]
+    plot.yaxis.ticker = FixedTicker(ticks=[float(np.log10(tick + 1.0)) for tick in ticks])
+    plot.yaxis.major_label_overrides = {float(np.log10(tick + 1.0)): f"{tick}" for tick in ticks}
+    plot.y_range.start = 0.0
+    far = right[-1] > period / 2
+    plot.x_range = Range1d(left[0] - period / 100, 1.02 * max(right[-1], period if far else period / 20))
+    plot.xgrid.grid_line_color = None
+    if far:
+        name = "deadline" if what == "steps" else "one period"
+        top = float(np.log10(most + 1.0))
+        plot.line([period] * 2, [0.0, top], color=BLACK, line_width=1.5, line_dash="dashed", legend_label=name)
+        place_legend(plot)
+    return plot
+
+
+def _column(rows: Sequence[Mapping[str, Any]], key: str) -> FloatArray:
+    return np.array([np.nan if entry.get(key) is None else entry[key] for entry in rows], dtype=float)

@@ -1,0 +1,50 @@
+"""Style of the report's Bokeh figures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bokeh.plotting import figure
+
+from msg_analysis.report.figures.palette import (
+    GREY,
+    INK,
+    PALE,
+)
+
+SANS = "system-ui, -apple-system, 'Segoe UI', 'Noto Sans', 'DejaVu Sans', sans-serif"
+
+
+def new_figure(height: int, tools: str = "box_zoom,pan,wheel_zoom,reset,save", **options: Any) -> Any:
+    """An empty figure in the report's style, ``height`` in pixels; the wheel scrolls the page unless zoom is chosen."""
+    settings = {"sizing_mode": "stretch_width", "active_scroll": None} | options
+    plot = figure(height=height, tools=tools, **settings)
+    plot.toolbar.logo = None
+    plot.toolbar.autohide = True
+    plot.outline_line_color = None
+    plot.grid.grid_line_color = PALE
+    plot.background_fill_color = plot.border_fill_color = "white"
+    for axis in plot.axis:
+        axis.axis_label_text_font = axis.major_label_text_font = SANS
+        axis.axis_label_text_font_style = "normal"
+        axis.axis_label_text_color = INK
+        axis.axis_line_color = axis.major_tick_line_color = GREY
+        axis.minor_tick_line_color = None
+    return plot
+
+
+def place_legend(plot: Any) -> None:
+    """Move the legend, if any, above the figure, into one row."""
+    if plot.legend:
+        legend = plot.legend[0]
+        plot.add_layout(legend, "above")
+        legend.orientation = "horizontal"
+        plain_legend(legend)
+
+
+def plain_legend(legend: Any) -> None:
+    """Give a legend the report's style."""
+    legend.border_line_color = legend.background_fill_color = None
+    legend.label_text_font, legend.label_text_font_size, legend.label_text_color = SANS, "12px", INK
+    legend.margin = legend.padding = 0
+    legend.spacing = 16

@@ -1,0 +1,225 @@
+"""The HTML report: one file that loads nothing else."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import yaml
+from bokeh.embed import components
+from bokeh.models import UIElement
+from bokeh.resources import Resources
+from markupsafe import Markup
+
+from msg_analysis.common.files import write_whole
+from msg_analysis.errors import InputError
+from msg_analysis.inference.observed.observation import bounded
+from msg_analysis.inference.verdict.comparison import Comparison
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.report.documents.explanation import explain, graph_facts
+from msg_analysis.report.html import error_plots, network_drawings, switching_plots
+from msg_analysis.report.terminal.result_text import LAWS, QUANTILES, SUPPORT, TIMES, timing_facts, verdict_line
+from msg_analysis.report.terminal.verdict_text import order_statements, sentence
+
+_HEADLINES = {
+    "agrees": "The run agrees with the prediction.",
+    "disagrees": "The run disagrees with the prediction.",
+    "incomplete": "No verdict: the data are incomplete.",
+    "unpredicted": "No verdict: there is no prediction.",
+}
+_OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
+_SMALL_CHAIN = 8  # most graphs whose transitions are listed
+_FIRST_LINES = 5
+_NODE_TEST = "error of agent "  # beginning of the names of the tests of the nodes
+
+
+def write_report(
+    comparison: Comparison,
+    trajectory: Trajectory,
+    path: str | Path,
+    *,
+    restarts: Sequence[str] = (),
+    strangers: Sequence[Mapping[str, Any]] = (),
+) -> None:
+    """Write the report of a comparison, whole or not at all; InputError if that fails. Arguments as in ``render``."""
+    path = Path(path)
+    html = render(comparison, trajectory, restarts=restarts, strangers=strangers)
+    try:
+        write_whole(path, html.encode())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
+
+
+def render(
+    comparison: Comparison,
+    trajectory: Trajectory,
+    *,
+    restarts: Sequence[str] = (),  # one line per process that was restarted
+    strangers: Sequence[Mapping[str, Any]] = (),  # refused messages: node, topic, reason, count
+) -> str:
+    """The report as HTML text."""
+    document = comparison.to_json()
+    experiment = trajectory.record.experiment
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("msg_analysis.report.html"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": _number, "p": _p_value, "z": _distance}
+    names = [graph.name for graph in experiment.graph_list]
+    models, sojourns = _models(document, comparison, trajectory)
+    script, divs = components(models)
+    timing = document["timing"]
+    return environment.get_template("report.html.j2").render(
+        document=document,
+        restarts=restarts,
+        strangers=strangers,
+        headline=verdict_line(_HEADLINES[document["verdict"]], document),
+        timing_facts=timing_facts(timing) if timing else [],
+        times=TIMES,
+        quantiles=QUANTILES,
+        laws=LAWS,
+        support=SUPPORT,
+        explanation=_explanation(document),
+        blame=[sentence(cause["words"]) for cause in document["blame"]],
+        order=_order(document),
+        experiment=experiment,
+        versions=trajectory.record.versions,
+        plots={name: Markup(div) for name, div in divs.items()},
+        script=Markup(script),
+        library=Markup(Resources(mode="inline", components=["bokeh"]).js_raw[0]),
+        first_agents=_furthest(document),
+        sojourns=sojourns[1],
+        shown_sojourns=sojourns[0],
+        at_once=switching_plots.FIRST_SOJOURNS,
+        explained=explain(experiment),
+        drawings=network_drawings.graph_drawings(experiment),
+        graph_facts=graph_facts(experiment),
+        chain=network_drawings.chain_drawing(experiment),
+        yaml=yaml.safe_dump(experiment.to_document(), sort_keys=False, allow_unicode=True, default_flow_style=None),
+        host=platform.node() or "a host without a name",
+        tests=[test for test in document["tests"] if not test["name"].startswith(_NODE_TEST)],
+        node_tests=_node_tests(document),
+        nodes_open=experiment.agents <= _OPEN_TABLE,
+        names=names,
+        transitions=document["switching"]["counts"] is not None and 1 < len(names) <= _SMALL_CHAIN,
+        command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        written=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    )
+
+
+def _models(
+    document: dict[str, Any], comparison: Comparison, trajectory: Trajectory
+) -> tuple[dict[str, UIElement], tuple[int, int]]:
+    """The figures that exist, by name; sojourns in the figure of the active graph, and in the run."""
+    experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
+    covariance, ratios = document["covariance"], document["innovations"]["ratios"]
+    models: dict[str, UIElement | None] = {
+        "nodes": error_plots.node_errors(document["node_errors"], document["level"]),
+        "covariance": error_plots.covariances(_matrix(covariance["measured"]), _matrix(covariance["predicted"])),
+    }
+    if len(comparison.running["time"]) > 1:
+        models["running"] = error_plots.convergence(comparison.running, document["system_error"]["predicted"])
+    known, sojourns = trajectory.modes[:steps], (0, 0)
+    if len(known):
+        names = [graph.name for graph in experiment.graph_list]
+        models["modes"], *counts = switching_plots.active_graph(known, names, experiment.step_length)
+        sojourns = counts[0], counts[1]
+        models["occupancy"] = switching_plots.occupancy(known, names, experiment.chain.stationary)
+        if not document["unpredicted"]:
+            reference = None if experiment.problem == "consensus" else experiment.reference
+            states = bounded(trajectory.values[:steps])
+            models["agents"] = error_plots.agent_convergence(
+                states, reference, experiment.step_length, document["node_errors"]
+            )
+    if ratios is not None and any(ratio is not None for ratio in ratios):
+        sizes = np.array([np.nan if ratio is None else ratio for ratio in ratios])
+        models["innovations"] = error_plots.innovation_sizes(sizes, document["innovations"]["samples"])
+    if document["timing"]:
+        models["lateness"] = error_plots.lateness(document["timing"])
+        models["staleness"] = error_plots.staleness(document["timing"])
+    return {name: model for name, model in models.items() if model is not None}, sojourns
+
+
+def _furthest(document: dict[str, Any]) -> list[int]:
+    """The agents (from 1, ascending) whose convergence is drawn at first: those with the largest abs(z)."""
+    distances = [abs(node["z"] or 0.0) for node in document["node_errors"]]
+    most = min(len(distances), _FIRST_LINES)
+    return sorted(sorted(range(1, len(distances) + 1), key=lambda agent: -distances[agent - 1])[:most])
+
+
+def _explanation(document: dict[str, Any]) -> str:
+    """The verdict in a few sentences."""
+    tests, completeness, level = document["tests"], document["completeness"], document["level"]
+    if document["verdict"] == "incomplete":
+        lost = [
+            f"{completeness['missing']} of {completeness['expected']} states" if completeness["missing"] else "",
+            f"the graph of {completeness['missing_modes']} steps" if completeness["missing_modes"] else "",
+        ]
+        numbers = (
+            f"The numbers below are those of the first {document['steps']} steps, up to the first gap."
+            if document["system_error"]["measured"] is not None
+            else "Too little came before the first gap for any number."
+        )
+        return f"Missing: {' and '.join(filter(None, lost))}. {numbers}"
+    if document["unpredicted"]:
+        rejected = [test["name"] for test in tests if test["rejected"]]
+        tested = " and ".join(test["name"] for test in tests) or "nothing"
+        outcome = f"{' and '.join(rejected)}: rejected." if rejected else f"Tested, and not rejected: {tested}."
+        cut = f" Errors are measured from step {document['transient']} on." if document["transient"] else ""
+        return f"Unpredicted: {document['unpredicted']}. {outcome}{cut}"
+    chance = f"a run that follows the predicted law would be called a disagreement with a chance of {level:.2g}"
+    rejected = [test for test in tests if test["rejected"]]
+    if not rejected:
+        return f"None of {len(tests)} tests rejects the predicted law ({chance}, all tests together)."
+    named = ", ".join(f"{test['name']} (p {_p_value(test['p_adjusted'], '= ')})" for test in rejected[:6])
+    more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
+    verb = "rejects" if len(rejected) == 1 else "reject"
+    return f"{len(rejected)} of {len(tests)} tests {verb} the predicted law: {named}{more}; {chance}."
+
+
+def _order(document: dict[str, Any]) -> list[str]:
+    """Which agents are more certain than which, in sentences."""
+    if document["order"] is None:
+        return []
+    names = [f"agent {i}" for i in range(1, len(document["node_errors"]) + 1)]
+    return order_statements(document["order"], names, "is more certain than")
+
+
+def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
+    """The tests of all nodes as one row; None where there are none."""
+    tests = [test for test in document["tests"] if test["name"].startswith(_NODE_TEST)]
+    if not tests:
+        return None
+    smallest = min(tests, key=lambda test: float(test["p"]))
+    return {"count": len(tests), "rejected": sum(test["rejected"] for test in tests), "smallest": smallest}
+
+
+def _number(value: float | None, digits: int = 4) -> str:
+    if value is None:
+        return "–"
+    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
+
+
+def _distance(z: float | None) -> str:
+    """A distance in standard errors."""
+    return "–" if z is None else f"{z:+.2f}".replace("-", "−")
+
+
+def _p_value(p: float | None, equals: str = "") -> str:
+    if p is None:
+        return "not tested"
+    return "< 0.0001" if p < 1e-4 else f"{equals}{p:.{4 if p < 0.01 else 3}f}"
+
+
+def _matrix(rows: list[list[float]] | None) -> Any:
+    return None if rows is None else np.array(rows, dtype=float)

@@ -1,0 +1,241 @@
+"""Saved results side by side, and which of their system errors differ significantly."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+from scipy import stats
+
+from msg_analysis.common.markdown import markdown_table, number_text
+from msg_analysis.errors import InputError
+from msg_analysis.inference.errors.ranking import Order, order_of
+from msg_analysis.report.terminal.tables import number_table
+from msg_analysis.report.terminal.verdict_text import order_statements
+
+RESULT_FILE = "result.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A row: one saved comparison; None where it has no such number."""
+
+    file: str
+    experiment: str
+    seeds: str  # of all runs: "1 2"
+    bags: int  # number of runs
+    leaders: str  # numbers from 1: "3" or "1 4"; empty without
+    verdict: str
+    simulated_time: float  # of all runs [units of simulated time]
+    measured: float | None  # system error, like the next five
+    standard_error: float | None
+    low: float | None  # to high: the 95 % interval
+    high: float | None
+    predicted: float | None
+    z: float | None
+    least_p: float | None  # least adjusted p of the tests
+    blame: str  # causes, separated by "; "; empty where nothing is wrong
+    identity: str | None  # equal for runs of the same law
+
+
+def read_result(path: Path) -> Result:
+    """Read a saved result, from a file or the directory of a run; InputError if it is not there or not a result."""
+    file = path / RESULT_FILE if path.is_dir() else path
+    wanted = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror}: {wanted}") from error
+    except ValueError as error:
+        raise InputError(f"{file}: not JSON ({error}): {wanted}") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{file}: no JSON object: {wanted}")
+    total = _part(document, "system_error", dict, file)
+    interval = total.get("interval")
+    if not isinstance(interval, list) or len(interval) != 2:
+        raise InputError(f"{file}: system_error.interval: {interval!r}: {wanted}")
+    seeds = [run.get("seed") for run in document.get("bags") or [document] if isinstance(run, dict)]
+    tests = [_number(test, "p_adjusted", file) for test in document.get("tests") or []]
+    blame = [str(cause.get("words")) for cause in document.get("blame") or []]
+    return Result(
+        file=str(path),
+        experiment=_part(document, "experiment", str, file),
+        seeds=" ".join(str(seed) for seed in seeds if seed is not None),
+        bags=len(document.get("bags") or [None]),
+        leaders=" ".join(str(leader) for leader in document.get("leaders") or []),
+        verdict=_part(document, "verdict", str, file),
+        simulated_time=_number(document, "simulated_time", file) or 0.0,
+        measured=_number(total, "measured", file),
+        standard_error=_number(total, "standard_error", file),
+        low=_number({"interval": interval[0]}, "interval", file),
+        high=_number({"interval": interval[1]}, "interval", file),
+        predicted=_number(total, "predicted", file),
+        z=_number(total, "z", file),
+        least_p=min((p for p in tests if p is not None), default=None),
+        blame="; ".join(blame),
+        identity=document.get("experiment_identity"),
+    )
+
+
+def _part(document: dict[str, Any], key: str, kind: type, file: Path) -> Any:
+    value = document.get(key)
+    if not isinstance(value, kind):
+        raise InputError(f"{file}: {key}: {value!r}: expected that of a result of `msg-analysis compare --json`")
+    return value
+
+
+def _number(document: Any, key: str, file: Path) -> float | None:
+    value = document.get(key) if isinstance(document, dict) else document
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{file}: {key}: {value!r}: expected a number")
+    return float(value)
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """Results of the same law as one; every unit of simulated time has the same weight."""
+
+    experiment: str  # name in the first
+    files: tuple[str, ...]
+    simulated_time: float  # of all [units of simulated time]
+    measured: float  # system error, like the next four
+    standard_error: float
+    predicted: float
+    z: float
+    p: float
+
+
+def merge_results(rows: Sequence[Result]) -> list[Merged]:
+    """Results of the same law as one, where there are two or more.
+
+    Left out: those without a number, and those with the seed of an earlier row.
+    """
+    groups: dict[str, list[Result]] = {}
+    for row in rows:
+        if row.identity is None or row.measured is None or row.predicted is None or not row.standard_error:
+            continue
+        group = groups.setdefault(row.identity, [])
+        if not any(set(row.seeds.split()) & set(other.seeds.split()) for other in group):
+            group.append(row)
+    found = []
+    for group in groups.values():
+        if len(group) < 2:
+            continue
+        time = np.array([row.simulated_time for row in group])
+        share = time / time.sum()
+        measured = float(share @ [row.measured for row in group])
+        predicted = float(share @ [row.predicted for row in group])
+        error = float(np.linalg.norm(share * [row.standard_error for row in group]))
+        z = (measured - predicted) / error
+        files = tuple(row.file for row in group)
+        p = float(2.0 * stats.norm.sf(abs(z)))
+        found.append(Merged(group[0].experiment, files, float(time.sum()), measured, error, predicted, z, p))
+    return found
+
+
+def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
+    """Which system errors of independent runs are smaller than which; numbers are places in ``rows``, from 1.
+
+    With leaders of infinite gain in every row, that is the order of their joint robustness centrality. None unless
+    every row has a measured error with a standard error, and where ``order_of`` has no order.
+    """
+    errors = [(row.measured, row.standard_error) for row in rows]
+    known = [(measured, error) for measured, error in errors if measured is not None and error is not None]
+    if len(known) < len(rows):
+        return None
+    measured, deviations = np.array(known).T
+    predicted = [row.predicted for row in rows if row.predicted is not None]
+    return order_of(
+        measured, np.diag(deviations**2), np.array(predicted) if len(predicted) == len(rows) else None, level
+    )
+
+
+def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
+    """The document: ``results``, ``merged``, and ``order``, whose numbers are places among the results, from 1."""
+    order = order_of_results(rows, level)
+    return {
+        "results": [asdict(row) for row in rows],
+        "merged": [asdict(one) for one in merge_results(rows)],
+        "order": order.to_json() if order else None,
+    }
+
+
+def to_csv(rows: Sequence[Result]) -> str:
+    """A line per result under the names of the columns, with all digits."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([field.name for field in fields(Result)])
+    for row in rows:
+        writer.writerow(["" if value is None else value for value in asdict(row).values()])
+    return stream.getvalue()
+
+
+def to_markdown(rows: Sequence[Result]) -> str:
+    """The results as a Markdown table."""
+    heads, body = _shown(rows)
+    return markdown_table(heads, body, names=4)
+
+
+def print_results(rows: Sequence[Result], level: float, console: Console) -> None:
+    """Print the results as a table, and which system errors differ at ``level`` (all pairs together)."""
+    heads, body = _shown(rows)
+    kept = [
+        place for place, head in enumerate(heads) if head not in ("experiment", "seed", "time", "least p")
+    ]  # 80 columns
+    table = number_table(console, "Results", *(heads[place] for place in kept))
+    for line in body:
+        table.add_row(*(Text(line[place]) for place in kept))
+    console.print(table)
+    for row in rows:
+        if row.blame:
+            console.print(Text(f"{row.file}: {row.blame}."))
+    for one in merge_results(rows):
+        console.print(
+            Text(
+                f"{one.experiment}, {len(one.files)} results merged ({number_text(one.simulated_time)} units of time): "
+                f"{number_text(one.measured)} ± {number_text(one.standard_error)}, predicted "
+                f"{number_text(one.predicted)}, z {one.z:+.2f}, p {one.p:.3g}."
+            )
+        )
+    order = order_of_results(rows, level)
+    if order:
+        for sentence in order_statements(
+            order.to_json(), [row.file for row in rows], "has a smaller system error than"
+        ):
+            console.print(Text(sentence))
+
+
+def _shown(rows: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
+    heads = [
+        "result",
+        "experiment",
+        "leaders",
+        "verdict",
+        "seed",
+        "time",
+        "system error",
+        "±",
+        "predicted",
+        "z",
+        "least p",
+    ]
+    body = []
+    for row in rows:
+        seed = f"{row.bags} runs" if row.bags > 1 else row.seeds or "-"
+        numbers = [row.simulated_time, row.measured, row.standard_error, row.predicted]
+        shown = [number_text(value) for value in numbers]
+        z = "-" if row.z is None else f"{row.z:+.2f}"
+        least = "-" if row.least_p is None else f"{row.least_p:.3g}"
+        body.append([row.file, row.experiment, row.leaders or "-", row.verdict, seed, *shown, z, least])
+    return heads, body

@@ -1,0 +1,79 @@
+"""A sweep as a terminal table, and as a document."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from msg_analysis.report.terminal.tables import ROWS, note_cut, number_table, number_text
+from msg_analysis.sweep.conduct import Conducted, Judgement
+from msg_analysis.sweep.figure_series import Picture, value_text
+from msg_analysis.sweep.jobs.job import FAILED
+from msg_analysis.sweep.plan import Sweep
+from msg_analysis.sweep.table import Row
+
+
+def describe_sweep(sweep: Sweep, done: Conducted, judgement: Judgement, rows: Sequence[Row]) -> dict[str, Any]:
+    """The document of ``msg-analysis sweep --json``, without the names of the files; ``rows`` of ``rows_of``."""
+    failed = sum(outcome.status == FAILED for outcome in done.outcomes)
+    return {
+        "sweep": sweep.name,
+        "experiment": sweep.experiment,
+        "kind": sweep.kind,
+        "keys": list(sweep.keys),
+        "level": sweep.spec.level,
+        "verdict": judgement.verdict,
+        "done": len(rows) - failed,
+        "failed": failed,
+        "kept": done.kept,
+        "points": list(rows),
+    }
+
+
+def print_sweep(sweep: Sweep, document: dict[str, Any], picture: Picture, console: Console) -> None:
+    """Print a table of what the figure shows, what failed, and the verdict; ``document`` of ``describe_sweep``."""
+    heads = ["measured", "± (95 %)", "predicted"] if picture.measured else [picture.y, "in continuous time"]
+    several = len(picture.series) > 1
+    first = [picture.x] if several else []
+    table = number_table(console, f"{sweep.name}: {picture.y}", "" if several else picture.x, *first, *heads)
+    shown = 0
+    for series in picture.series:
+        for place in series.places:
+            if shown < ROWS:
+                x = value_text(place.x)
+                cells = [Text(series.label), Text(x)] if several else [Text(x)]
+                numbers = [number_text(place.value)]
+                if picture.measured:
+                    half = None if place.high is None or place.low is None else (place.high - place.low) / 2
+                    numbers += ["-" if half is None else f"{half:.3g}", number_text(place.predicted)]
+                else:
+                    numbers += [number_text(place.reference)]
+                table.add_row(*cells, *numbers)
+            shown += 1
+    note_cut(table, shown, "places")
+    console.print(table)
+    for row in [row for row in document["points"] if row["status"] == FAILED][:10]:
+        console.print(Text(f"point {row['point']}: no result: {row['reason']}"))
+    for row in [row for row in document["points"] if row.get("verdict") == "disagrees"][:10]:
+        why = row.get("blame") or row.get("least")
+        console.print(Text(f"point {row['point']} disagrees with its prediction: p {row['p_holm']:.3g}: {why}"))
+    console.print(Text(_summary(document)))
+
+
+def _summary(document: dict[str, Any]) -> str:
+    count = len(document["points"])
+    what = {"predict": "predictions", "simulate": "runs simulated", "network": "networks run"}[document["kind"]]
+    text = f"{count} {what}"
+    if document["kept"]:
+        text += f", {document['kept']} of them before"
+    if document["failed"]:
+        text += f"; {document['failed']} without a result"
+    tested = [row["p_holm"] for row in document["points"] if row.get("p_holm") is not None]
+    if tested:
+        apart = sum(row.get("verdict") == "disagrees" for row in document["points"])
+        text += f". {apart or 'None'} of {len(tested)} {'disagree' if apart > 1 else 'disagrees'} with its prediction"
+        text += f" (Holm over all of them, level {document['level']:g}; least p {min(tested):.3g})"
+    return text + "."

@@ -1,0 +1,145 @@
+"""Indices of single graphs, for comparison, and bounds of the system error that hold for all switching rates.
+
+The errors and certainties themselves are properties of ``prediction.Moments``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import networkx as nx
+import numpy as np
+import scipy.linalg
+
+from msg_analysis.errors import InputError
+from msg_analysis.model.network.graphs import Graph
+from msg_analysis.theory.moments import MomentSolver
+from msg_analysis.theory.system import jump_system as systems
+from msg_analysis.theory.system.jump_system import JumpSystem
+from msg_analysis.types import FloatArray
+
+if TYPE_CHECKING:
+    from msg_analysis.theory.prediction import Prediction
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphIndices:
+    """Indices of one undirected connected graph from its effective resistances r_uv; edge weights are conductances."""
+
+    name: str
+    # Sum of r_uv over pairs, m tr(L^+) (Klein and Randić 1993): 2 m times the system error of the graph with F = I.
+    kirchhoff_index: float
+    # (m,) 1 / sum_v r_uv, the convention of networkx; Stephenson and Zelen (1989) have m times that.
+    information_centrality: FloatArray
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of one graph."""
+        return {
+            "name": self.name,
+            "kirchhoff_index": self.kirchhoff_index,
+            "information_centrality": self.information_centrality.tolist(),
+        }
+
+
+def graph_indices(graph: Graph) -> GraphIndices | None:
+    """Kirchhoff index and information centrality; None for a directed or disconnected graph.
+
+    From r_uv = L^+_uu + L^+_vv - 2 L^+_uv (Klein and Randić 1993): sum_v r_uv = m L^+_uu + tr(L^+).
+    """
+    if not graph.symmetric or not nx.is_connected(nx.from_numpy_array(graph.adjacency)):
+        return None
+    m = graph.agents
+    helmert = scipy.linalg.helmert(m)
+    inverse = helmert.T @ scipy.linalg.solve(helmert @ graph.laplacian @ helmert.T, helmert, assume_a="pos")
+    trace = float(np.trace(inverse))
+    return GraphIndices(graph.name, m * trace, 1.0 / (m * np.diag(inverse) + trace))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bounds:
+    """Bounds of the system error for a given stationary law, whatever the rates.
+
+    Attributes
+    ----------
+    lower
+        error of the averaged graph; None where it is not a bound
+    upper
+        static baseline: mean error of the graphs held fixed; None where it is not a bound, or is infinite
+    note
+        why there are these bounds and no others
+    """
+
+    lower: float | None
+    upper: float | None
+    note: str
+
+    def to_json(self) -> dict[str, Any]:
+        """The document."""
+        return {"lower": self.lower, "upper": self.upper, "note": self.note}
+
+
+_NO_BOUNDS = "the averaged graph and the graphs held for ever bound nothing here: "
+
+
+def error_bounds(prediction: Prediction) -> Bounds:
+    """Bounds of the system error of the paper's law: continuous time, or discrete time with W = exp(-Z).
+
+    For undirected graphs and independent noise of equal variance q for every agent and graph (F = sqrt(q) I), in
+    consensus and tracking, and any ergodic chain, with Zbar = sum pi_i Z_i (proof: docs/theory.md, "Bounds"):
+
+        continuous time    q tr(Zbar^-1) / 2 <= E <= E_static         (pseudo-inverse in consensus)
+        discrete time                           E <= E_static
+
+    In discrete time the averaged graph gives no lower bound: graphs that alternate can be better than independent
+    draws. With unequal or correlated noise, or directed graphs, E can lie outside on both sides.
+
+    Parameters
+    ----------
+    prediction
+        of the experiment
+    """
+    experiment = prediction.experiment
+    if experiment.protocol:
+        return Bounds(None, None, _NO_BOUNDS + "they belong to the built-in law, not to a protocol")
+    if experiment.time == "continuous":
+        if prediction.continuous is None:
+            return Bounds(None, None, _NO_BOUNDS + "they belong to the law without noise on the air, loss or delay")
+        system = systems.continuous(experiment)
+    else:
+        system = prediction.system
+    if not all(graph.symmetric for graph in experiment.graph_list):
+        return Bounds(None, None, _NO_BOUNDS + "a graph is directed")
+    if not _equal_noise(system):
+        return Bounds(None, None, _NO_BOUNDS + "the noise is not the same, and independent, for every agent")
+    upper = prediction.static.system_error if prediction.static else None
+    if system.time == "discrete":
+        return Bounds(None, upper, "undirected graphs and equal noise: E is at most that of the graphs held for ever")
+    try:
+        lower = float(np.trace(MomentSolver(averaged(system)).steady()[0]))
+    except InputError:  # connected, but so weakly that rounding hides it
+        lower = None
+    note = "undirected graphs and equal noise: E lies between the averaged graph and the graphs held for ever"
+    return Bounds(lower, upper, note)
+
+
+def averaged(system: JumpSystem) -> JumpSystem:
+    """The limit of infinitely fast switching in continuous time: one graph, with Z and Q averaged over pi."""
+    weights = system.stationary[:, None, None]
+    return JumpSystem(
+        time=system.time,
+        matrices=(weights * system.matrices).sum(axis=0)[None],
+        noise=(weights * system.noise).sum(axis=0)[None],
+        chain=np.zeros((1, 1)),
+        stationary=np.ones(1),
+        lift=system.lift,
+    )
+
+
+def _equal_noise(system: JumpSystem) -> bool:
+    """Whether the noise is equal and independent, in every mode, in all coordinates not held at the reference."""
+    scale = float(np.abs(system.noise).max(initial=0.0))
+    pinned = (system.matrices == 0.0).all(axis=(0, 1)) & (system.matrices == 0.0).all(axis=(0, 2))
+    pinned &= (system.noise == 0.0).all(axis=(0, 1))
+    expected = scale * np.diag((~pinned).astype(float))
+    return system.loss_variance is None and bool(np.abs(system.noise - expected).max(initial=0.0) <= 1e-12 * scale)

@@ -1,0 +1,167 @@
+"""Reduced Markov jump linear systems: the coordinates in which second moments stay finite.
+
+Sections 3.1 (consensus) and 3.2 (tracking) of the paper, its Appendix I in discrete time; for the steps of a run,
+docs/theory.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg
+
+from msg_analysis.model.network.markov_chain import Time
+from msg_analysis.types import FloatArray
+
+if TYPE_CHECKING:
+    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.step.step_model import StepModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JumpSystem:
+    """A jump linear system in reduced coordinates y of dimension d, with s - (what s should be) = lift @ y.
+
+    s are the states x of the m agents. With values that are D steps old, it is x(k), x(k - 1), ..., x(k - D) stacked,
+    m (D + 1) numbers, and x - (what x should be) = output @ y.
+
+    Discrete: y(k+1) = W_g(k) y(k) + noise, then g jumps with P (eq. 19 of the paper). Continuous: dy = -Z_g y dt + F
+    dW, g jumps with Gamma (eq. 4).
+    """
+
+    time: Time
+    matrices: FloatArray  # (n, d, d) Z_i [1 / unit of time] or W_i
+    noise: FloatArray  # (n, d, d) covariance of the noise, Q_i per unit of time or N_i per step
+    chain: FloatArray  # (n, n) Gamma or P
+    stationary: FloatArray  # (n,) pi
+    lift: FloatArray  # (k, d) for k numbers s, columns orthonormal, so that y = lift^T (s - what s should be)
+    loss_variance: FloatArray | None = None  # (n, k, k), see ``StepModel.loss_variance``; discrete time only
+    readout: FloatArray | None = None  # (m, d) with a delay; None without, where ``lift`` has this role
+
+    @property
+    def modes(self) -> int:
+        """Number of graphs n."""
+        return int(self.matrices.shape[0])
+
+    @property
+    def dimension(self) -> int:
+        """Number of reduced coordinates d."""
+        return int(self.lift.shape[1])
+
+    @property
+    def output(self) -> FloatArray:
+        """(m, d): output @ y is the deviation of the agents from what they should be."""
+        return self.lift if self.readout is None else self.readout
+
+    def lifted(self, moments: FloatArray) -> FloatArray:
+        """(..., m, m) second moments of the agents from those of the reduced coordinates, (..., d, d)."""
+        return np.asarray(self.output @ moments @ self.output.T)
+
+    def reduced(self, deviations: FloatArray) -> FloatArray:
+        """(..., d) reduced coordinates of the deviations of the agents (..., m); in consensus, of their states.
+
+        With a delay, the earlier states are taken to be the same.
+        """
+        lift = self.lift.reshape(-1, deviations.shape[-1], self.dimension).sum(axis=0)
+        return np.asarray(deviations @ lift)
+
+    def propagate(self, moments: FloatArray) -> FloatArray:
+        """(n, d, d): K_j[C_j] = E[W C_j W^T | mode j] for every mode. Discrete time."""
+        after = self.matrices @ moments @ self.matrices.transpose(0, 2, 1)
+        if self.loss_variance is not None:
+            full = self.lift @ moments @ self.lift.T
+            own = np.diagonal(full, axis1=1, axis2=2)
+            squares = own[:, :, None] + own[:, None, :] - full - full.transpose(0, 2, 1)
+            spread = (self.loss_variance * squares).sum(axis=2)
+            after += np.einsum("ia,ni,ib->nab", self.lift, spread, self.lift)
+        return np.asarray(after)
+
+    def advance(self, moments: FloatArray, law: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Moments C_i (n, d, d) and law (n,) of the graph one step later (Proposition 6 of the paper). Discrete time.
+
+        C_i(k+1) = sum_j P_ji (K_j[C_j(k)] + pi_j(k) N_j): the noise enters before the jump.
+        """
+        after = self.propagate(moments) + law[:, None, None] * self.noise
+        return np.tensordot(self.chain, after, axes=(0, 0)), law @ self.chain
+
+
+def emulated(step: StepModel, problem: str) -> JumpSystem:
+    """What the steps of a run do, exactly (docs/theory.md, "What the network does" and "Beyond the paper").
+
+    "consensus": the disagreement, in a Helmert basis of the vectors whose entries sum to zero; exact for every W with
+    W 1 = 1. "tracking": the deviation from the reference, all agents (a start may put grounded leaders elsewhere).
+
+    With a delay the stacked states make the same kind of step, and W 1 = 1 holds for them. What drops out is one number
+    common to all of them, not one for each x(k - s): the agents' mean moves, and this acts on agents of unequal degree,
+    because they compare their own new values with old ones of others.
+    """
+    m, delay = step.agents, step.delay
+    size = m * (delay + 1)
+    consensus = problem == "consensus"
+    lift = scipy.linalg.helmert(size).T if consensus else np.eye(size)
+    weights, noise, loss_variance, readout = step.weights, step.noise, step.loss_variance, None
+    if delay:
+        own, old = slice(m), slice(size - m, size)
+        inner = weights * np.eye(m)
+        weights, noise, loss_variance = (np.zeros((step.modes, size, size)) for _ in range(3))
+        weights[:, own, own] = inner
+        weights[:, own, old] = step.weights - inner
+        weights[:, m:, :-m] = np.eye(size - m)
+        noise[:, own, own] = step.noise
+        loss_variance[:, own, old] = step.loss_variance
+        readout = lift[:m] - (lift[:m].mean(axis=0) if consensus else 0.0)
+    return JumpSystem(
+        time="discrete",
+        matrices=lift.T @ weights @ lift,
+        noise=_reduced_noise(noise, lift),
+        chain=step.transition,
+        stationary=step.stationary,
+        lift=lift,
+        loss_variance=loss_variance if step.loss else None,
+        readout=readout,
+    )
+
+
+def continuous(experiment: Experiment) -> JumpSystem:
+    """The paper's continuous-time system (Sections 3.1 and 3.2), without noise on the air, loss, delay or protocol.
+
+    Leaders of infinite gain are the exact limit: their rows and columns are deleted, ``lift`` puts the zeros back.
+    """
+    gains = experiment.leader_gains
+    follows = np.isfinite(gains)
+    m = experiment.agents
+    lift = scipy.linalg.helmert(m).T if experiment.problem == "consensus" else np.eye(m)[:, follows]
+    drift = np.stack([g.laplacian for g in experiment.graph_list]) + np.diag(np.where(follows, gains, 0.0))
+    gain = experiment.noise_gain
+    return JumpSystem(
+        time="continuous",
+        matrices=lift.T @ drift @ lift,
+        noise=_reduced_noise(gain @ gain.transpose(0, 2, 1), lift),
+        chain=experiment.chain.matrix,
+        stationary=experiment.chain.stationary,
+        lift=lift,
+    )
+
+
+def held(system: JumpSystem, mode: int) -> JumpSystem:
+    """The same system, in continuous or discrete time, with one graph (``mode``, from 0) held fixed."""
+    return JumpSystem(
+        time=system.time,
+        matrices=system.matrices[mode : mode + 1],
+        noise=system.noise[mode : mode + 1],
+        chain=np.zeros((1, 1)) if system.time == "continuous" else np.ones((1, 1)),
+        stationary=np.ones(1),
+        lift=system.lift,
+        loss_variance=None if system.loss_variance is None else system.loss_variance[mode : mode + 1],
+        readout=system.readout,
+    )
+
+
+def _reduced_noise(noise: FloatArray, lift: FloatArray) -> FloatArray:
+    """lift^T N lift for every mode, without what rounding leaves of noise that is common to all agents."""
+    reduced = lift.T @ noise @ lift
+    rounding = len(lift) * np.finfo(float).eps * np.abs(noise).max(axis=(1, 2), keepdims=True)
+    common = np.abs(reduced).max(axis=(1, 2), keepdims=True, initial=0.0) <= rounding
+    return np.where(common, 0.0, reduced)

@@ -1,0 +1,163 @@
+"""The bit-for-bit check: whether a bag holds exactly what the law and the seed give."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.model.run.graph_path import mode_path
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.neighbours import neighbour_tables
+from msg_analysis.twin.log_replay import replay
+from msg_analysis.twin.simulate import simulate
+from msg_analysis.types import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """Result of ``check``.
+
+    Attributes
+    ----------
+    compared
+        states that were compared; where the run logs both exact and published states, both count
+    missing
+        states that could not be compared: not in the bag or, in real time, without all their inputs
+    difference
+        the first difference in words (lowest step, then lowest agent; agents from 1), or None
+    """
+
+    compared: int
+    missing: int
+    difference: str | None
+
+
+def check(trajectory: Trajectory) -> Check:
+    """Compute a run again with the offline twin, and compare every state, lost message and graph bit for bit.
+
+    In lockstep the twin needs only the run record. In real time it also takes from the log which values every agent
+    used in every step, and no value may be used before it was made, according to the stamps.
+
+    Parameters
+    ----------
+    trajectory
+        the run, as read from its bag
+
+    Raises
+    ------
+    NotAvailableError
+        the twin cannot repeat a run of this kind
+    """
+    if trajectory.record.experiment.run.pace == "realtime":
+        return _check_realtime(trajectory)
+    twin = simulate(trajectory.record.experiment, record=trajectory.record)
+    # The states of step k follow from graphs and losses of earlier steps: the earliest difference is the cause.
+    found = [
+        _first_state(trajectory, trajectory.states, twin.states, "logged"),
+        _first_state(trajectory, trajectory.published, twin.published, "published"),
+        _first_loss(trajectory, twin),
+        _first_graph(trajectory, twin.modes),
+    ]
+    return Check(trajectory.completeness.received, trajectory.completeness.missing, _earliest(found))
+
+
+def _check_realtime(trajectory: Trajectory) -> Check:
+    experiment = trajectory.record.experiment
+    law = replay(trajectory)
+    path = mode_path(experiment, trajectory.record.step_model.initial)
+    found = [
+        _first_state(trajectory, trajectory.states, law, "logged"),
+        _first_early_use(trajectory),
+        _first_graph(trajectory, path),
+    ]
+    compared = int((trajectory.present & ~np.isnan(law).any(axis=2)).sum())
+    return Check(compared, trajectory.completeness.expected - compared, _earliest(found))
+
+
+def _earliest(found: Sequence[tuple[float, str] | None]) -> str | None:
+    """The earliest of some (step, words), without the step."""
+    differences = [difference for difference in found if difference is not None]
+    return min(differences, key=lambda difference: difference[0])[1] if differences else None
+
+
+def _first_graph(trajectory: Trajectory, modes: IntArray) -> tuple[float, str] | None:
+    graphs = [graph.name for graph in trajectory.record.experiment.graph_list]
+    return _first(
+        (trajectory.modes >= 0) & (trajectory.modes != modes),
+        lambda step: (
+            f"graph of step {step}: logged {graphs[trajectory.modes[step]]}, the seed gives {graphs[modes[step]]}"
+        ),
+    )
+
+
+def _first_early_use(trajectory: Trajectory) -> tuple[float, str] | None:
+    """The first value that was used in a state made before it, or at the same time."""
+    used, made, modes = trajectory.used, trajectory.made, trajectory.agent_modes
+    assert used is not None
+    assert made is not None
+    assert modes is not None
+    model = trajectory.record.step_model
+    # Where a state is missing its mode is -1, which picks the last graph: harmless, since ``used`` is -1 there too.
+    sender = neighbour_tables(model).senders[modes[1:], np.arange(model.agents)]
+    early = (used >= 0) & (made[1:] >= 0)[:, :, None] & (made[used, sender] >= made[1:, :, None])
+
+    def describe(step: int, agent: int, which: int) -> str:
+        return (
+            f"agent {agent + 1} at step {step + 1}: stamped {made[step + 1, agent] / 1e9} s of simulated time, and "
+            f"used step {used[step, agent, which]} of agent {sender[step, agent, which] + 1}, stamped "
+            f"{made[used[step, agent, which], sender[step, agent, which]] / 1e9} s"
+        )
+
+    found = _first(early, describe)
+    return found and (found[0] + 1, found[1])
+
+
+def _first(wrong: BoolArray, describe: Callable[..., str]) -> tuple[float, str] | None:
+    """Step (first index) and description of the first True entry; None if there is none."""
+    if not wrong.any():
+        return None
+    where = [int(i) for i in np.argwhere(wrong)[0]]
+    return where[0], describe(*where)
+
+
+def _first_state(
+    trajectory: Trajectory, logged: FloatArray | None, law: FloatArray | None, what: str
+) -> tuple[float, str] | None:
+    if logged is None or law is None:
+        return None
+    there = ~(np.isnan(logged) | np.isnan(law)).any(axis=2)
+
+    def describe(step: int, agent: int) -> str:
+        here, expected = logged[step, agent], law[step, agent]
+        where = int(np.argmax(here != expected))
+        row, replica = divmod(where, trajectory.record.experiment.run.replicas)
+        number = f", number {row + 1} of the state" if row else ""
+        return (
+            f"agent {agent + 1} at step {step}, replica {replica + 1}{number}: {what} {float(here[where])!r}, "
+            f"the law gives {float(expected[where])!r}"
+        )
+
+    return _first(there & (logged != law).any(axis=2), describe)
+
+
+def _first_loss(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] | None:
+    if trajectory.lost is None or twin.lost is None or trajectory.agent_modes is None:
+        return None
+    model = trajectory.record.model
+    # Only states that are there and used the right graph: under another one the neighbours differ.
+    comparable = trajectory.agent_modes[1:] == twin.modes[:, None]
+    logged, law = trajectory.lost, twin.lost
+
+    def describe(step: int, agent: int, which: int) -> str:
+        sender = int(model.neighbours(int(twin.modes[step]), agent)[which]) + 1
+        words = ("heard", "lost")
+        return (
+            f"the message of agent {sender} to agent {agent + 1} in step {step}: logged as "
+            f"{words[int(logged[step, agent, which])]}, the seed gives {words[int(law[step, agent, which])]}"
+        )
+
+    # After the graph of this step, before the states of the next one.
+    found = _first(comparable[:, :, None] & (logged != law), describe)
+    return found and (found[0] + 0.5, found[1])

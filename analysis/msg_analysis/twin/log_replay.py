@@ -1,0 +1,58 @@
+"""The twin of a run in real time: from what every agent logged of each step, what must have come out of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from msg_analysis.model.arithmetic.payload import from_payload, to_payload
+from msg_analysis.model.run.agent_law import agent_law
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.types import FloatArray
+
+
+def replay(trajectory: Trajectory) -> FloatArray:
+    """Make every step of a real-time run again, from the logged states that went into it, by the agents' own law.
+
+    By induction, a log that equals this from x(0) on is what the law makes of the start, the seed, and who heard what.
+
+    Parameters
+    ----------
+    trajectory
+        of a run in real time
+
+    Returns
+    -------
+    FloatArray
+        (N + 1, m, replicas) the states that the law gives, to the last bit; NaN where the log has not all that is
+        needed.
+
+    Raises
+    ------
+    ValueError
+        nothing was logged of who used what
+    """
+    used, modes = trajectory.used, trajectory.agent_modes
+    if used is None or modes is None:
+        raise ValueError("a run in lockstep: its twin is `simulate`")
+    record, states = trajectory.record, trajectory.states
+    model = record.step_model
+    there = np.asarray(~np.isnan(states).any(axis=2))
+    law_gives = np.full_like(states, np.nan)
+    law_gives[0] = record.start
+    for i in range(model.agents):
+        law = agent_law(record, model, i)
+        neighbours = [law.neighbours(mode) for mode in range(model.modes)]
+        for k in range(len(used)):
+            mode = int(modes[k + 1, i])
+            if mode < 0 or not there[k, i]:
+                continue
+            heard = list(zip(used[k, i].tolist(), neighbours[mode], strict=False))
+            if not all(step < 0 or there[step, j] for step, j in heard):
+                continue
+            own = to_payload(states[k, i])
+            if law.step != k:
+                law.resume(k, own)
+            law.state = own
+            values = [own if step < 0 else to_payload(states[step, j]) for step, j in heard]
+            law_gives[k + 1, i] = from_payload(law.advance(mode, values))
+    return law_gives

@@ -1,0 +1,374 @@
+"""The command line ``msg-agents``.
+
+Results go to stdout, everything else to stderr. Exit codes: 0 success or agreement, 1 disagreement, 2 bad usage or
+input, 3 incomplete data. Modules that take long to import are imported by the commands that need them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import msg_agents
+from msg_agents.cli import nodes, replay
+from msg_agents.cli.web_options import WebCommand, announce, page, web_options
+from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS
+from msg_analysis.cli.console import CommandGroup, complain, examples, print_json, result_console
+from msg_analysis.cli.options import (
+    BAG,
+    PATH,
+    RUN_RECORD,
+    InputPath,
+    PositiveFloat,
+    duration_option,
+    experiment_argument,
+    json_option,
+    seed_option,
+    suggest,
+)
+from msg_analysis.cli.storage_options import storage, storage_options
+
+if TYPE_CHECKING:
+    from msg_agents.running.runner import RunResult
+    from msg_analysis.bags.format.storage_options import Compression
+    from msg_analysis.model.experiment.experiment import Experiment
+
+DISAGREES, INCOMPLETE = 1, 3
+
+
+@click.group(cls=CommandGroup)
+@click.version_option(msg_agents.__version__, prog_name="msg-agents")
+def main() -> None:
+    """Networks of agents under Markov-switching graphs, as ROS 2 processes."""
+
+
+@main.command(
+    cls=WebCommand,
+    epilog=examples(
+        "msg-agents run line_ring.yaml",
+        "msg-agents run line_ring.yaml --web",
+        "msg-agents run line_ring.yaml --seed 3 --duration 100 --out runs --json",
+    ),
+)
+@experiment_argument
+@click.option(
+    "--out",
+    type=PATH,
+    metavar="DIR",
+    default=Path("runs"),
+    help="Where the bag's directory <name>_<time> is made.",
+)
+@click.option("--no-record", is_flag=True, help="Only run: no bag, no verdict.")
+@seed_option
+@duration_option
+@click.option(
+    "--pace",
+    metavar="PACE",
+    shell_complete=suggest("lockstep", "realtime"),
+    help="Instead of run.pace: lockstep or realtime.",
+)
+@click.option(
+    "--speed",
+    type=float,
+    metavar="SPEED",
+    help="Instead of run.speed: units of simulated time per second (realtime).",
+)
+@click.option(
+    "--processes",
+    metavar="P",
+    shell_complete=suggest("auto", "one_per_agent"),
+    help="Instead of run.processes: auto, one_per_agent or a number.",
+)
+@click.option(
+    "--restarts",
+    type=click.IntRange(0),
+    metavar="N",
+    default=RESTARTS,
+    help="How often, in all, agents or the switcher are started again when they were killed.",
+)
+@click.option(
+    "--domain",
+    type=click.IntRange(0, LAST_DOMAIN),
+    metavar="D",
+    show_default="a free one of the run's own",
+    help="ROS_DOMAIN_ID.",
+)
+@nodes.use_sim_time
+@click.option(
+    "--pin/--no-pin",
+    default=True,
+    help="Keep each process to one core, where there are more of them than cores: faster (lockstep).",
+)
+@storage_options
+@web_options
+@click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
+@json_option
+def run(
+    experiment: Path,
+    *,
+    out: Path,
+    no_record: bool,
+    seed: int | None,
+    duration: float | None,
+    pace: str | None,
+    speed: float | None,
+    processes: str | None,
+    restarts: int,
+    domain: int | None,
+    use_sim_time: bool,
+    pin: bool,
+    compression: Compression,
+    split_size: float | None,
+    web: int | None,
+    web_host: str,
+    executor: str | None,
+    as_json: bool,
+) -> None:
+    """Run EXPERIMENT as a network of processes, record it, and compare the record with the theory.
+
+    On a terminal, a panel shows how the run stands; with --web, a page for browsers does, too.
+    """
+    from msg_agents.running.runner import run_network
+    from msg_agents.watching.run_view import RunView
+
+    changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
+    if processes is not None:
+        changes["processes"] = int(processes) if processes.isdigit() else processes
+    what = _load(experiment).with_run(**{key: value for key, value in changes.items() if value is not None})
+    with page(web, web_host) as served:
+        with RunView(what, served) as view:
+            if served is not None:
+                announce(served, web_host, view.note)
+            result = run_network(
+                what,
+                None if no_record else out,
+                domain=domain,
+                restarts=restarts,
+                use_sim_time=use_sim_time,
+                storage=storage(compression, split_size),
+                pin=pin,
+                on_note=view.note,
+                view=view,
+                environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
+            )
+        _end(result, as_json, view.say)
+
+
+def _end(result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
+    """Print the failures, judge what was recorded, show the result, and exit with its code."""
+    from msg_agents.running.runner import conclude
+
+    for line in result.failures:
+        complain(line, "failed:")
+    conclude(result)
+    say(_ending(result))
+    _show(result, as_json)
+    if result.failures or (result.bag is not None and result.comparison is None):
+        sys.exit(INCOMPLETE)
+    if result.comparison is not None:
+        sys.exit(result.comparison.exit_code)
+
+
+def _ending(result: RunResult) -> dict[str, Any]:
+    """Text and verdict of the end of a run, for the live page."""
+    if result.failures:
+        return {"text": f"The run has ended early: {result.failures[0]}", "verdict": "incomplete"}
+    if result.comparison is None:
+        return {"text": "The run has ended.", "verdict": None}
+    verdict = result.comparison.verdict
+    words = {
+        "agrees": "The run has ended; it agrees with the prediction.",
+        "disagrees": "The run has ended; it disagrees with the prediction.",
+        "incomplete": "The run has ended; the data are incomplete.",
+        "unpredicted": "The run has ended; there is no prediction.",
+    }
+    return {"text": words[verdict], "verdict": verdict}
+
+
+def _show(result: RunResult, as_json: bool) -> None:
+    """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
+    from msg_agents.running.runner import REPORT_FILE, RESULT_FILE
+
+    document: dict[str, Any] = {"verdict": "incomplete" if result.failures else None}  # None: nothing to judge
+    if result.comparison is not None:
+        document = dict(result.comparison.to_json())
+    document |= {
+        "bag": str(result.bag) if result.trajectory else None,
+        "report": str(result.bag / REPORT_FILE) if result.bag and result.comparison else None,
+        "rate": result.rate,
+        "wall_time": result.wall_time,
+        "restarts": result.restarts,
+        "strangers": result.strangers,
+        "failures": result.failures,
+    }
+    if result.bag is not None and result.comparison is not None:
+        (result.bag / RESULT_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    if as_json:
+        print_json(document)
+        return
+    if result.comparison is not None:
+        from msg_analysis.report.terminal.result_text import print_comparison
+
+        print_comparison(document, result_console())
+        click.echo(f"bag:    {document['bag']}\nreport: {document['report']}")
+    if result.rate:
+        click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
+
+
+@main.command(epilog=examples("msg-agents check runs/line_ring_20250101_120000", "msg-agents check"))
+@click.argument("bag", type=BAG, required=False)
+@json_option
+def check(bag: Path | None, *, as_json: bool) -> None:
+    """Compute the run in BAG again with the offline twin; name the first agent and step that differ.
+
+    Without BAG, the newest one below ./runs is checked.
+    """
+    from msg_analysis.bags.reader import read_bag
+    from msg_analysis.twin.check import check as check_trajectory
+
+    path = bag or _newest_bag(Path("runs"))
+    outcome = check_trajectory(read_bag(path))
+    if as_json:
+        document = {"bag": str(path), "equal": outcome.difference is None, "compared": outcome.compared}
+        print_json(document | {"missing": outcome.missing, "difference": outcome.difference})
+    elif outcome.difference:
+        click.echo(f"{path}: differs from the twin, first: {outcome.difference}")
+    else:
+        missing = f", {outcome.missing} missing" if outcome.missing else ""
+        click.echo(f"{path}: equal to the twin to the last bit: {outcome.compared} states{missing}")
+    sys.exit(DISAGREES if outcome.difference else INCOMPLETE if outcome.missing else 0)
+
+
+def _newest_bag(directory: Path) -> Path:
+    bags = sorted(directory.glob("*/metadata.yaml"), key=lambda file: file.stat().st_mtime)
+    if not bags:
+        raise click.UsageError(f"no bag below {directory.absolute()}: name one")
+    return bags[-1].parent
+
+
+@main.command(epilog=examples("msg-agents prepare line_ring.yaml > run.json"))
+@experiment_argument
+def prepare(experiment: Path) -> None:
+    """Print the run record of a new run of EXPERIMENT: the file that the single nodes are started with."""
+    from msg_analysis.twin.simulate import new_record
+
+    what = _load(experiment)
+    what.require_available()
+    click.echo(new_record(what).to_json())
+
+
+@main.command(
+    epilog=examples(
+        "msg-agents prepare line_ring.yaml > run.json   # once; copy it to all hosts",
+        "msg-agents host run.json hosts.yaml            # on every host",
+    )
+)
+@click.argument("run_record", type=RUN_RECORD)
+@click.argument("hosts", type=InputPath(".yaml", ".yml", ".json"))
+@click.option("--name", metavar="NAME", show_default="the name of this machine", help="Which of the hosts this is.")
+@click.option(
+    "--out",
+    type=PATH,
+    metavar="DIR",
+    default=Path("runs"),
+    help="Where the directory <name>_<time> is made: bag, report and logs on the recorder's host, logs on the others.",
+)
+@click.option(
+    "--discovery-timeout",
+    type=PositiveFloat(),
+    metavar="SECONDS",
+    default=120.0,
+    help="How long to wait for the other hosts [s].",
+)
+@click.option(
+    "--patience",
+    type=PositiveFloat(),
+    metavar="SECONDS",
+    default=30.0,
+    help="After how long this host ends when another one has left the run before its end [s].",
+)
+@click.option(
+    "--restarts",
+    type=click.IntRange(0),
+    metavar="N",
+    default=RESTARTS,
+    help="How often, in all, what was killed on this host is started again.",
+)
+@click.option(
+    "--profile", "only_profile", is_flag=True, help="Only print the discovery profile, for other ROS 2 tools."
+)
+@storage_options
+@json_option
+def host(
+    run_record: Path,
+    hosts: Path,
+    *,
+    name: str | None,
+    out: Path,
+    discovery_timeout: float,
+    patience: float,
+    restarts: int,
+    only_profile: bool,
+    compression: Compression,
+    split_size: float | None,
+    as_json: bool,
+) -> None:
+    """Run this host's share of a network that is spread over several, as the file HOSTS says.
+
+    All hosts are given the same RUN_RECORD (of `msg-agents prepare`) and HOSTS, in any order. The recorder's host
+    compares the record with the theory, as `msg-agents run` does; the others end when the run does.
+    """
+    from msg_agents.processes.hosts import Hosts, this_host
+    from msg_agents.running.run_folder import workshop
+    from msg_agents.running.runner import run_network
+    from msg_agents.watching.run_view import RunView
+    from msg_analysis.model.experiment.problems import show
+
+    record = nodes.load_record(run_record)
+    what = record.experiment
+    places = Hosts.load(hosts, what)
+    if only_profile:
+        click.echo(places.profile(what), nl=False)
+        return
+    share = places.share(name or this_host(), discovery_timeout=discovery_timeout, patience=patience)
+    mine = show([agent + 1 for agent in share.agents])
+    with workshop() as folder, RunView(what) as view:
+        also = " and the recorder" if share.home else ""
+        view.note(f"this host runs agents {mine}{also} in ROS_DOMAIN_ID {places.domain}")
+        result = run_network(
+            what,
+            out,
+            domain=places.domain,
+            restarts=restarts,
+            storage=storage(compression, split_size),
+            on_note=view.note,
+            view=view,
+            environment=places.environment(what, folder),
+            record=record,
+            share=share,
+        )
+    _end(result, as_json)
+    if not share.home and not as_json:
+        click.echo(f"the run has ended: its verdict is on {places.recorder}")
+
+
+def _load(path: Path) -> Experiment:
+    from msg_analysis.model.experiment.experiment import Experiment
+
+    return Experiment.load(path)
+
+
+for _command in (
+    nodes.agent,
+    nodes.switcher,
+    nodes.recorder,
+    replay.play,
+    replay.live,
+    replay.markers,
+):
+    main.add_command(_command)

@@ -1,0 +1,258 @@
+"""Commands of ``msg-agents`` that run one process of a network: ``agent``, ``switcher`` and ``recorder``."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from click.shell_completion import CompletionItem
+
+from msg_agents.cli.ros_command import RosCommand
+from msg_agents.processes.environment import DISCOVERY_TIMEOUT
+from msg_analysis.cli.console import examples
+from msg_analysis.cli.options import PATH, RUN_RECORD, PositiveFloat, suggest
+from msg_analysis.cli.storage_options import storage, storage_options
+
+if TYPE_CHECKING:
+    from msg_agents.nodes.network_node import NetworkNode
+    from msg_analysis.bags.format.storage_options import Compression
+    from msg_analysis.model.run.record import RunRecord
+
+INCOMPLETE = 3
+
+use_sim_time = click.option(
+    "--use-sim-time",
+    is_flag=True,
+    help="Take the time from /clock, which somebody else publishes in the same domain (realtime).",
+)
+
+
+def _node_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that the commands of single nodes share."""
+    for option in (
+        click.argument("run_record", type=RUN_RECORD),
+        click.option(
+            "--discovery-timeout",
+            type=PositiveFloat(),
+            metavar="SECONDS",
+            default=DISCOVERY_TIMEOUT,
+            help="How long to wait for the other nodes [s].",
+        ),
+        use_sim_time,
+        click.option(
+            "--parameter-services",
+            is_flag=True,
+            help="Offer the parameters to `ros2 param`: six services a node, which large networks cannot afford.",
+        ),
+        click.option("--lifeline", type=int, hidden=True),
+        click.option(
+            "--account",
+            type=PATH,
+            metavar="FILE",
+            help="File that says once a second what the nodes refused and wait for: for health checks.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+_await = click.option(
+    "--await",
+    "readers",
+    multiple=True,
+    metavar="NODE",
+    shell_complete=suggest("recorder"),
+    help="A node, such as recorder, that must be there before the run starts. Repeatable.",
+)
+
+
+_patience = click.option(
+    "--patience",
+    type=PositiveFloat(),
+    metavar="SECONDS",
+    show_default="it waits for ever",
+    help="After how long it ends when others have left before the end [s].",
+)
+
+
+_checkpoint = click.option(
+    "--checkpoint",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="Directory that keeps what is needed to go on after being killed: the same command then takes over.",
+)
+
+
+def _agents_of_record(context: click.Context, _option: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Shell completion: the agents of the run record on the command line."""
+    try:
+        agents = len(json.loads(Path(context.params["run_record"]).read_text(encoding="utf-8"))["start"])
+    except (OSError, ValueError, KeyError, TypeError):  # better no completion than a wrong one
+        return []
+    return [CompletionItem(str(i)) for i in range(1, agents + 1) if str(i).startswith(incomplete)]
+
+
+@click.command(cls=RosCommand, epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
+@_node_options
+@click.option(
+    "--agent",
+    "agents",
+    type=int,
+    metavar="I",
+    multiple=True,
+    required=True,
+    shell_complete=_agents_of_record,
+    help="Number of an agent, from 1. Repeatable.",
+)
+@_await
+@_checkpoint
+@_patience
+def agent(
+    run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...], checkpoint: Path | None, **options: Any
+) -> None:
+    """Run one or more agents of the run in RUN_RECORD in one process."""
+    from msg_analysis.errors import InputError
+
+    record = load_record(run_record)
+    record.experiment.require_available()
+    total = record.experiment.agents
+    for number in agents:
+        if not 1 <= number <= total:
+            raise InputError(f"--agent: {number}: expected a number from 1 to {total}")
+    if len(set(agents)) < len(agents):
+        raise InputError(f"--agent: {list(agents)}: expected each agent once")
+
+    def nodes() -> list[NetworkNode]:
+        from msg_agents.nodes.agents.agent_group import AgentGroup
+        from msg_agents.nodes.node_process import enter_participant
+        from msg_agents.processes.process_plan import agent_name
+        from msg_agents.recovery.takeover import succeed
+
+        indices = [number - 1 for number in agents]
+        model, directory = record.model, _make(checkpoint)
+        successions = succeed(directory, map(agent_name, indices))
+        group = AgentGroup(record=record, model=model, agents=indices, readers=readers, checkpoints=directory)
+        enter_participant(successions, group.nodes[0])
+        return list(group.nodes)
+
+    _run_nodes(nodes, record, **options)
+
+
+@click.command(cls=RosCommand, epilog=examples("msg-agents switcher run.json --await recorder"))
+@_node_options
+@_await
+@_checkpoint
+@_patience
+@click.option("--status", type=int, hidden=True)
+def switcher(
+    run_record: Path,
+    *,
+    readers: tuple[str, ...],
+    checkpoint: Path | None,
+    status: int | None,
+    patience: float | None,
+    **options: Any,
+) -> None:
+    """Run the switcher of the run in RUN_RECORD: it publishes the experiment and the active graph."""
+    record = load_record(run_record)
+
+    def report(steps: Any) -> None:
+        if status is not None:
+            os.write(status, json.dumps(list(steps)).encode() + b"\n")
+
+    def nodes() -> list[NetworkNode]:
+        from msg_agents.nodes.network_node import FAREWELL
+        from msg_agents.nodes.node_process import enter_participant
+        from msg_agents.nodes.switcher import SWITCHERS
+        from msg_agents.recovery.takeover import succeed
+
+        model, directory = record.model, _make(checkpoint)
+        successions = succeed(directory, ["switcher"])
+        kind = SWITCHERS[record.experiment.run.pace]
+        node = kind(
+            record=record,
+            model=model,
+            readers=list(readers),
+            on_progress=report,
+            checkpoints=directory,
+            farewell=max(FAREWELL, patience or 0.0),
+        )
+        enter_participant(successions, node)
+        return [node]
+
+    _run_nodes(nodes, record, patience=patience, **options)
+
+
+@click.command(cls=RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
+@_node_options
+@click.option("--out", type=PATH, metavar="BAG", required=True, help="Bag to write; must not exist.")
+@storage_options
+def recorder(
+    run_record: Path, *, out: Path, compression: Compression, split_size: float | None, **options: Any
+) -> None:
+    """Record the run in RUN_RECORD to a bag."""
+    record = load_record(run_record)
+
+    def nodes() -> list[NetworkNode]:
+        from msg_agents.nodes.recorder import Recorder
+
+        return [Recorder(record=record, directory=out, storage=storage(compression, split_size))]
+
+    _run_nodes(nodes, record, **options)
+
+
+def _run_nodes(
+    nodes: Callable[[], list[NetworkNode]],
+    record: RunRecord,
+    *,
+    lifeline: int | None,
+    discovery_timeout: float,
+    use_sim_time: bool,
+    account: Path | None,
+    parameter_services: bool,  # noqa: ARG001  see QuietNode
+    patience: float | None = None,
+) -> None:
+    from msg_agents.nodes.node_process import hold_lifeline, run_nodes
+
+    if lifeline is not None:
+        hold_lifeline(lifeline)
+    executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
+    throughput = record.experiment.run.pace == "lockstep"
+    if not run_nodes(
+        nodes,
+        executor=executor,
+        discovery_timeout=discovery_timeout,
+        throughput=throughput,
+        use_sim_time=use_sim_time,
+        account=account,
+        patience=patience,
+    ):
+        sys.exit(INCOMPLETE)
+
+
+def _make(directory: Path | None) -> Path | None:
+    from msg_analysis.errors import InputError
+
+    if directory is not None:
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"--checkpoint: {directory}: cannot be made ({error.strerror}): name another") from error
+    return directory
+
+
+def load_record(path: Path) -> RunRecord:
+    """Read a run record from ``msg-agents prepare``; InputError if it cannot be read or is not one."""
+    from msg_analysis.errors import InputError
+    from msg_analysis.model.run.record import RunRecord
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read ({error}): expected a run record from msg-agents prepare") from error
+    return RunRecord.from_json(text, str(path))

@@ -1,0 +1,396 @@
+"""Commands of ``msg-agents`` about running and recorded networks: ``play``, ``live`` and ``markers``."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from click.shell_completion import CompletionItem
+
+from msg_agents.cli.ros_command import RosCommand
+from msg_agents.cli.web_options import WebRosCommand, announce, page, web_options
+from msg_agents.processes.environment import LAST_DOMAIN
+from msg_analysis.cli.console import examples, print_json, result_console
+from msg_analysis.cli.options import BAG, PositiveFloat, json_option
+
+if TYPE_CHECKING:
+    from msg_agents.nodes.replay.player import Played
+    from msg_agents.nodes.watching.live import Watched
+    from msg_agents.watching.web_server import Web
+
+INCOMPLETE = 3
+_domain = click.option(
+    "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Instead of the environment's ROS_DOMAIN_ID."
+)
+_timeout = click.option(
+    "--timeout",
+    type=PositiveFloat(),
+    metavar="SECONDS",
+    show_default="for ever",
+    help="How long to wait for a network [s].",
+)
+
+
+def _topics_of_bag(context: click.Context, _option: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Shell completion: the topics of the bag on the command line."""
+    from msg_analysis.bags.format.metadata import read_metadata
+    from msg_analysis.errors import InputError
+
+    try:
+        information = read_metadata(Path(context.params["bag"])) or {}
+        names = [entry["topic_metadata"]["name"] for entry in information["topics_with_message_count"]]
+    except (InputError, OSError, KeyError, TypeError):  # better no completion than a wrong one
+        return []
+    return [CompletionItem(name) for name in sorted(names) if name.startswith(incomplete)]
+
+
+class _Rate(click.types.FloatParamType):
+    """A positive number, or "max" (infinite)."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """See click.ParamType."""
+        try:
+            rate = math.inf if value == "max" else float(value)
+        except ValueError:
+            rate = math.nan
+        if not rate > 0 or (isinstance(value, str) and math.isinf(rate) and value != "max"):
+            self.fail(f"{value}: expected a positive number, or max (as a parameter, .inf)", param, ctx)
+        return rate
+
+
+@click.command(
+    cls=RosCommand,
+    node_name="player",
+    epilog=examples(
+        "msg-agents play runs/line_ring_20260114_083441",
+        "msg-agents play BAG --rate max --await recorder",
+        "msg-agents play BAG --topics '/agent_*/state' --start-offset 10 --clock 100",
+        "msg-agents play BAG --remap /agent_1/state:=/lab/one",
+    ),
+)
+@click.argument("bag", type=BAG)
+@click.option(
+    "-r",
+    "--rate",
+    type=_Rate(),
+    metavar="RATE",
+    default="1",
+    help="Seconds of the bag per second; of a network's bag, units of simulated time. max: as fast as readers take it.",
+)
+@click.option(
+    "--start-offset",
+    type=click.FloatRange(0, 1e9),
+    default=0.0,
+    metavar="SECONDS",
+    help="Seconds of the bag to leave out at the start.",
+)
+@click.option("--duration", type=PositiveFloat(), metavar="SECONDS", help="Seconds of the bag to play; otherwise all.")
+@click.option("-l", "--loop", is_flag=True, help="Begin again at the end.")
+@click.option("--paused", is_flag=True, help="Stand at first; the space bar starts it.")
+@click.option(
+    "--clock",
+    type=PositiveFloat(),
+    metavar="HZ",
+    help="Publish the time of the bag on /clock so often a second.",
+)
+@click.option(
+    "--topics",
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=_topics_of_bag,
+    help="Only this topic; or a pattern such as '/agent_*/state'. Repeatable.",
+)
+@click.option(
+    "-x",
+    "--exclude",
+    multiple=True,
+    metavar="TOPIC",
+    shell_complete=_topics_of_bag,
+    help="Not this topic, or pattern. Repeatable.",
+)
+@click.option(
+    "-m", "--remap", "remaps", multiple=True, metavar="OLD:=NEW", help="Another name for a topic. Repeatable."
+)
+@click.option(
+    "--wait-for-subscribers",
+    "subscribers",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Begin when every topic has N readers (latched topics, whose readers miss nothing, are not waited for).",
+)
+@click.option("--await", "readers", multiple=True, metavar="NODE", help="Begin when NODE reads them. Repeatable.")
+@click.option(
+    "--wait-timeout",
+    type=PositiveFloat(),
+    metavar="SECONDS",
+    default=30.0,
+    help="How long to wait for readers [s].",
+)
+@_domain
+@json_option
+def play(
+    bag: Path,
+    *,
+    rate: float,
+    start_offset: float,
+    duration: float | None,
+    loop: bool,
+    paused: bool,
+    clock: float | None,
+    topics: tuple[str, ...],
+    exclude: tuple[str, ...],
+    remaps: tuple[str, ...],
+    subscribers: int | None,
+    readers: tuple[str, ...],
+    wait_timeout: float,
+    domain: int | None,
+    as_json: bool,
+) -> None:
+    """Publish the messages of BAG again, a bag of ROS 2 with MCAP storage, in the order in which they were recorded.
+
+    No message is lost: readers that do not keep up hold the player back.
+
+    On a terminal, space pauses and goes on, s or the right arrow plays one message, up and down change the rate.
+    """
+    from msg_agents.nodes.replay.player import PlayOptions
+    from msg_agents.nodes.replay.player import play as play_bag
+
+    _enter(domain)
+    options = PlayOptions(
+        rate=rate,
+        start_offset=start_offset,
+        duration=duration,
+        loop=loop,
+        paused=paused,
+        clock=clock,
+        topics=topics,
+        exclude=exclude,
+        remaps=remaps,
+        subscribers=subscribers or 0,
+        readers=readers,
+        wait_timeout=wait_timeout,
+    )
+    with _play_bar(bag.name) as bar:
+        try:
+            played = play_bag(
+                bag, options, on_progress=bar.update, on_note=bar.note, on_stop=bar.hide, on_continue=bar.show
+            )
+        except (KeyboardInterrupt, SystemExit):
+            if bar.played.begun:
+                bar.note(f"stopped at {bar.played.now:g} s of the bag after {bar.played.messages} messages")
+            else:
+                bar.note("stopped before it began: nothing but latched messages has been played")
+            raise
+    held = f"; held back by readers for {played.held_back:.1f} s" if played.held_back >= 0.1 else ""
+    click.echo(f"{played.messages} messages played in {played.seconds:.1f} s{held}", err=True)
+    if as_json:
+        print_json({"messages": played.messages, "seconds": played.seconds, "held_back": played.held_back})
+
+
+class _play_bar:  # noqa: N801  used like a function
+    """Prints notes on stderr and, on a terminal, a bar with the time in the bag and the rate."""
+
+    def __init__(self, name: str) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        from msg_agents.nodes.replay.player import Played
+
+        self.played: Played = Played()
+        self._console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[state]}"),
+            console=self._console,
+            disable=not self._console.is_terminal,
+            transient=True,
+            auto_refresh=False,  # no thread: it might hold a lock that a signal handler needs
+        )
+        self._task = self._progress.add_task(name, total=None, state="looking for readers")
+
+    def __enter__(self) -> _play_bar:
+        self.show()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.hide()
+
+    def show(self) -> None:
+        """Draw the bar from now on."""
+        self._progress.start()
+
+    def hide(self) -> None:
+        """Remove the bar, and leave the terminal as it was."""
+        self._progress.stop()
+
+    def update(self, played: Played) -> None:
+        self.played = played
+        pace = "as fast as it goes" if math.isinf(played.rate) else f"x {played.rate:.3g}"
+        state = f"{played.now:.1f}/{played.length:.1f} s  {'paused' if played.paused else pace}"
+        if not played.begun:
+            state = "looking for readers"
+        self._progress.update(self._task, completed=played.now, total=played.length, state=state, refresh=True)
+
+    def note(self, line: str) -> None:
+        from rich.text import Text
+
+        self._console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
+
+
+def _notes() -> Callable[[str], None]:
+    """A function that prints a note on stderr."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(stderr=True)
+    return lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
+
+
+def _enter(domain: int | None) -> None:
+    """Set the ROS domain, and let SIGTERM and SIGHUP end the process in order."""
+    if domain is not None:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+
+    def end(number: int, _: object) -> None:
+        sys.exit(128 + number)
+
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # ignored under nohup
+            signal.signal(number, end)
+
+
+@click.command(
+    cls=WebRosCommand,
+    epilog=examples(
+        "msg-agents live --domain 42",
+        "msg-agents live --domain 42 --web",
+        "msg-agents live --reliable --json    # misses nothing of:",
+        "msg-agents play BAG --await live",
+    ),
+)
+@click.option(
+    "--reliable",
+    is_flag=True,
+    help="Miss no state, and hold the network back where that takes too long. By default it never waits.",
+)
+@_timeout
+@json_option
+@web_options
+@_domain
+def live(
+    *, reliable: bool, timeout: float | None, as_json: bool, web: int | None, web_host: str, domain: int | None
+) -> None:
+    """Watch a network, running or played: its errors up to now beside their prediction.
+
+    It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). The numbers are those of `msg-analysis
+    compare`, on the topic `estimate` too, but they are no verdict.
+    """
+    from msg_analysis.report.terminal.live_text import live_document
+
+    with page(web, web_host) as served:
+        found = _watch(reliable=reliable, timeout=timeout, as_json=as_json, domain=domain, served=served, host=web_host)
+        if served is not None and found is not None:
+            words = "The run has ended." if found.finished else "Nobody watches any more."
+            served.end({"text": words, "verdict": None if found.finished else "incomplete"})
+    if found is None:
+        _notes()("no network was seen")
+        sys.exit(INCOMPLETE)
+    if as_json:
+        print_json(live_document(found.report, found.record))
+    elif found.report.note and not result_console().is_terminal:
+        _notes()(found.report.note)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0 if found.finished else INCOMPLETE)  # all is done, and leaving the middleware may hang
+
+
+def _watch(
+    *, reliable: bool, timeout: float | None, as_json: bool, domain: int | None, served: Web | None, host: str
+) -> Watched | None:
+    """Watch a network and show it meanwhile; what was seen, or None without a network."""
+    from msg_agents.nodes.watching.live import watch
+    from msg_analysis.report.terminal.live_text import live_line, live_table
+
+    _enter(domain)
+    note = _notes()
+    if served is not None:
+        announce(served, host, note)
+    publish = _publisher(served)
+    console = result_console()
+    if as_json or not console.is_terminal:
+
+        def show(watched: Watched, rate: float) -> None:
+            publish(watched, rate)
+            if not as_json:
+                click.echo(live_line(watched.report, watched.record, rate))
+
+        found = watch(reliable=reliable, timeout=timeout, on_report=show, on_note=note)
+    else:
+        from rich.live import Live
+
+        from msg_agents.terminal.job_control import JobControl
+
+        screen = Live(console=console, auto_refresh=False)
+        with screen, JobControl(before=screen.stop, after=lambda: screen.start(refresh=True)) as jobs:
+
+            def draw(watched: Watched, rate: float) -> None:
+                publish(watched, rate)
+                screen.update(live_table(watched.report, watched.record, rate), refresh=True)
+
+            found = watch(reliable=reliable, timeout=timeout, on_report=draw, on_note=note, on_look=jobs.check)
+    return found
+
+
+def _publisher(served: Web | None) -> Callable[[Watched, float], None]:
+    """A function that sends reports to the page; without a page it does nothing."""
+    if served is None:
+        return lambda *_: None
+    from msg_agents.watching.snapshot import Clockwork, moment_document, setting
+
+    clockworks: list[Clockwork] = []
+
+    def publish(watched: Watched, _: float) -> None:
+        if not clockworks:
+            clockworks.append(Clockwork(watched.record.experiment))
+            served.begin(setting(watched.record.experiment))
+        # The steps of single agents are not counted here: the newest step of any agent stands for all.
+        moment = clockworks[0].moment([watched.report.newest], watched.report)
+        served.show(moment_document(moment) | {"steps": []})
+
+    return publish
+
+
+@click.command(
+    cls=RosCommand,
+    epilog=examples("msg-agents markers --domain 42", "msg-agents markers --rate 30 --replica 2 --frame map"),
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0, 1000, min_open=True),
+    metavar="HZ",
+    default=10.0,
+    help="Pictures a second.",
+)
+@click.option("--replica", type=click.IntRange(1), metavar="R", default=1, help="Which of the copies is drawn.")
+@click.option("--frame", metavar="FRAME", default="network", help="Frame of reference: the fixed frame of RViz.")
+@_timeout
+@_domain
+def markers(*, rate: float, replica: int, frame: str, timeout: float | None, domain: int | None) -> None:
+    """Draw a network, running or played, for RViz and Foxglove: markers on the topic `markers`.
+
+    Agents on a circle, coloured by how far their states are from the mean (or the reference), and the links of the
+    active graph. It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). Nobody waits for it.
+    """
+    from msg_agents.nodes.watching.markers import show_markers
+
+    _enter(domain)
+    over = show_markers(rate=rate, replica=replica - 1, frame=frame, timeout=timeout, on_note=_notes())
+    sys.stderr.flush()
+    os._exit(0 if over else INCOMPLETE)  # all is done, and leaving the middleware may hang

@@ -1,0 +1,185 @@
+"""The agent node: one row of the MJLS on topics. What depends on the pace: ``lockstep_agent``, ``realtime_agent``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from msg_agents_interfaces.msg import AgentState as AgentStateMsg
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+
+from msg_agents.nodes.network_node import NetworkNode, state_topic, truth_topic
+from msg_agents.nodes.ros.qos import STREAM
+from msg_agents.processes.process_plan import RECORDER, agent_name
+from msg_agents.recovery.checkpoint import Checkpoint, longest_heard
+from msg_agents.stepping.stall_detection import Pace
+from msg_agents.stepping.turn_queue import Turns
+from msg_analysis.errors import InputError
+from msg_analysis.model.run.agent_law import agent_law
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.step.step_model import Wiring
+from msg_analysis.wire.messages import ActiveGraph, StateCodec, StateFrame, with_state
+
+NOT_FINITE = "not finite"
+
+
+class Group(Protocol):
+    """What an agent needs from the agents of its process together: see AgentGroup."""
+
+    turns: Turns
+    progress_period: float
+
+    def report(self, agent: int, step: int) -> None:
+        """See AgentGroup."""
+
+    def ask_again(self, agent: int, step: int) -> None:
+        """See AgentGroup."""
+
+    def fail(self, error: Exception) -> None:
+        """See AgentGroup."""
+
+
+class Agent(NetworkNode):
+    """Connects topics and law; the subclass for the pace decides when to step and with which inputs.
+
+    Other agents read ``state``. Where that is not the exact state (broadcast noise, or a protocol that publishes only a
+    part of it), the exact one is published on ``truth``, for the log and the live node.
+    """
+
+    def __init__(
+        self,
+        *,
+        record: RunRecord,
+        model: Wiring,
+        agent: int,  # index from 0
+        peers: Sequence[int],  # every other agent that it hears or is heard by at any time, ascending
+        colleagues: Collection[int],  # agents of its process, itself included
+        readers: Sequence[str],  # other nodes that must read the states before the run starts
+        checkpoints: Path | None,  # directory of the published states, from which it resumes after a restart
+        group: Group,
+    ) -> None:
+        super().__init__(agent_name(agent), record=record)
+        experiment = record.experiment
+        self._law = agent_law(record, model, agent)
+        self._codec = StateCodec(self.run, agent + 1, experiment.width, experiment.step_length)
+        self._frame = StateFrame(self.run, experiment.run.replicas, longest_heard(record))
+        self._whole = StateFrame(self.run, experiment.width, longest_heard(record))
+        self._published = Checkpoint(checkpoints and checkpoints / f"{agent_name(agent)}.states", self._whole.size)
+        self._resumed = self._take_over()
+        self._group = group
+        self._inputs = [self._law.neighbours(mode) for mode in range(model.modes)]
+        self._peers = list(peers)
+        near = set(peers).intersection(colleagues)
+        self._far = [j for j in peers if j not in near]
+        self._near = [j for j in peers if j in near]
+        self._listeners: list[Callable[[int, int, Any], None]] = []
+        self._expected = [*map(agent_name, self._far), *readers]
+        self._next_progress = 0.0
+        self._pace = Pace()
+        self._states = self.create_publisher(AgentStateMsg, state_topic(agent), STREAM)
+        self._truth: Publisher | None = None
+        if experiment.truth:
+            self._truth = self.create_publisher(AgentStateMsg, truth_topic(agent), STREAM)
+            self._awaits_truth = [name for name in readers if name == RECORDER]  # others need only what agents hear
+
+    def meet(self, colleagues: Mapping[int, Agent]) -> None:
+        """Connect to the peers: agents of this process (by index) by direct calls, the others by topics."""
+        self._listeners = [colleagues[j].hear for j in self._near]
+        for j in self._far:
+            self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), STREAM, raw=True)
+
+    def host(self, agents: Sequence[Agent]) -> None:
+        """Create what a process needs only once. Called on its first agent, with all its agents."""
+
+    def found(self) -> bool:
+        """See NetworkNode."""
+        return self.has_readers(self._states, self._expected) and (
+            self._truth is None or self.has_readers(self._truth, self._awaits_truth)
+        )
+
+    def awaited(self) -> list[str]:
+        """See NetworkNode."""
+        missing = self.missing_readers(self._states, self._expected)
+        if self._truth is not None:
+            missing += self.missing_readers(self._truth, self._awaits_truth)
+        return missing
+
+    def finish(self, *, complete: bool, deadline: float) -> None:
+        """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""
+        for writer in (self._states, self._truth):
+            if complete and writer is not None and self.has_guests(writer):
+                writer.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
+
+    def begin(self) -> None:
+        """Publish x(0); after a takeover, repeat all states that are kept and ask the peers to repeat theirs."""
+        if self._published.found:
+            self._repeat(0)
+            self._ask_again()
+        if not self._law.step:
+            self._publish_state(0)
+        self._report()
+
+    def _take_over(self) -> bytes | None:
+        """Resume from the last state that an earlier process published; its message, or None without one."""
+        published = self._published.read()
+        if published:
+            step, message = published[-1]
+            frame = self._whole.unwrap(message)
+            if frame is None or frame[:2] != (self._law.agent + 1, step):
+                raise InputError(
+                    f"--checkpoint: what is kept for {self.get_name()} is of another run than the run record: remove "
+                    "it, or give another directory"
+                )
+            self._law.resume(step, frame[3])
+            return message
+        return None
+
+    def _publish_state(self, mode: int) -> None:
+        law = self._law
+        message = self._codec.wrap(law.step, mode, law.state, law.heard)
+        self._published.write(law.step, message)
+        self._send(law.step, law.state, message)
+
+    def _send(self, step: int, state: bytes, message: bytes) -> None:
+        """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it."""
+        if self._truth is not None:
+            self.publish(self._truth, message)
+            whole, state = state, self._law.published(step, state)
+            message = with_state(message, state, len(whole))
+        self.publish(self._states, message)
+        for hear in self._listeners:
+            hear(self._law.agent, step, state)
+
+    def send_again(self, since: int) -> None:
+        """Repeat the states from step ``since`` on, for a reader that may have missed them."""
+        self._repeat(since)
+
+    def _repeat(self, since: int) -> None:
+        """Repeat the kept states from step ``since`` on; what others hear is derived from the exact states."""
+        for step, message in self._published.read(since):
+            frame = self._whole.unwrap(message)
+            assert frame is not None, "of our own making"
+            self._send(step, frame[3], message)
+
+    def _ask_again(self) -> None:
+        """Ask the peers in other processes for states that may have been missed."""
+        raise NotImplementedError
+
+    def _receiver(self, peer: int) -> Callable[[bytes], None]:
+        """The callback for a peer's states (hot path)."""
+        raise NotImplementedError
+
+    def hear(self, peer: int, step: int, value: Any) -> None:
+        """Take x_peer(step) by a direct call from an agent of the same process (index from 0)."""
+        raise NotImplementedError
+
+    def learn(self, graph: ActiveGraph) -> str | None:
+        """Take note of a sojourn of the graph; the reason if it is refused, else None."""
+        raise NotImplementedError
+
+    def _report(self) -> None:
+        self._group.report(self._law.agent, self._law.step)
+        self._next_progress = time.monotonic() + self._group.progress_period

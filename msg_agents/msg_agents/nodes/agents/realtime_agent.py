@@ -1,0 +1,203 @@
+"""The agent in real time: it makes each step when it is due, with the newest values that it has."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from msg_agents_interfaces.msg import Progress as ProgressMsg
+
+from msg_agents.nodes.agents.agent import NOT_FINITE, Agent
+from msg_agents.nodes.diagnostics import Health
+from msg_agents.nodes.network_node import EPOCH_TOPIC, NOT_AN_AGENT, OTHER_RUN, state_topic, why_not
+from msg_agents.nodes.ros.qos import LATCHED
+from msg_agents.nodes.ros.timers import DueTimer
+from msg_agents.stepping.newest_values import NOTHING, Newest
+from msg_agents.stepping.realtime_schedule import MARGIN, Schedule
+from msg_analysis.model.arithmetic.payload import all_finite
+from msg_analysis.model.arithmetic.step_clock import SECOND
+from msg_analysis.model.step.air import LOST
+from msg_analysis.model.step.phases import phases
+from msg_analysis.wire.messages import ActiveGraph, stamp_ns
+
+AT_ONCE = 64
+"""Late steps that are made in a row before the executor gets its turn: messages, timers, signals."""
+
+OTHER_EPOCH = "another epoch than the one of this run"
+Value = tuple[bytes, int]  # a state, and the simulated time [ns] at which it was made
+
+
+class RealtimeAgent(Agent):
+    """An agent that steps by a timer on the clock of its node; parameters as in ``Agent``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        experiment = self.record.experiment
+        self._phase = float(phases(experiment)[self._law.agent])
+        self._speed = experiment.run.speed
+        self._dt = experiment.step_length
+        self._schedule: Schedule | None = None
+        self._timer = DueTimer(self, self._advance)
+        self._newest: Newest[Value] = Newest(
+            agent=self._law.agent,
+            steps=experiment.steps,
+            inputs=self._inputs,
+            peers=self._peers,
+            reach=self._reach,
+            start=self._law.step,
+        )
+        self._made = stamp_ns(self._resumed) if self._resumed else 0  # simulated time [ns] of the newest state
+        self._margin = round(MARGIN * SECOND * self._speed)  # the stamps of others may be so much ahead of our clock
+        self._late = 0  # largest lateness since the last report [ns of simulated time]
+        self._looked = 0  # time of the clock at the last call of ``_waiting_for`` [ns]
+        self._missed = self._missed_before = 0  # steps made later than the next one was due
+
+    def _reach(self) -> int:
+        """Newest step that any agent can have reached by now; no limit before the epoch is known."""
+        return self._schedule.reach(self._timer.now()) if self._schedule else self.record.experiment.steps
+
+    def host(self, agents: Sequence[Agent]) -> None:
+        """Subscribe to the epoch, for all agents of the process."""
+
+        def receive(data: bytes) -> None:
+            progress = self.decode_progress(data, EPOCH_TOPIC)
+            if progress is None:
+                return
+            if progress.agent != NOT_AN_AGENT:
+                self.refuse(OTHER_RUN, EPOCH_TOPIC)
+                return
+            for agent in agents:
+                assert isinstance(agent, RealtimeAgent)
+                agent.start(progress.stamp)
+
+        self.create_subscription(ProgressMsg, EPOCH_TOPIC, receive, LATCHED, raw=True)
+
+    def start(self, epoch: int) -> None:
+        """Set the epoch, the time of the clock [ns] at which simulated time is 0; another one later is refused."""
+        if self._schedule:
+            if self._schedule.epoch != epoch:
+                self.refuse(OTHER_EPOCH, EPOCH_TOPIC)
+            return
+        self._schedule = Schedule(epoch=epoch, speed=self._speed, step_length=self._dt, phase=self._phase)
+        self._newest.review()
+        # After a takeover steps are overdue; by the time of the next step all others have published their state.
+        self._set_timer(self._timer.now())
+
+    def _set_timer(self, now: int) -> None:
+        assert self._schedule is not None
+        if not self._newest.finished:
+            self._timer.set(self._schedule.clock_time(self._schedule.next_step(now, after=self._law.step)))
+
+    def _advance(self) -> None:
+        """Make every step that is due. Hot path."""
+        schedule, newest, law = self._schedule, self._newest, self._law
+        assert schedule is not None
+        now = self._timer.now()
+        simulated = schedule.simulated(now)
+        for _ in range(AT_ONCE):
+            due = schedule.due(law.step)
+            if due > simulated or not newest.ready():
+                self._set_timer(now)
+                break
+            mode, inputs = newest.inputs()
+            self._step(mode, inputs, simulated)
+            newest.advance()
+            self._late = max(self._late, self._made - due)
+            self._missed += schedule.due(law.step) < self._made
+        else:
+            self._timer.set(now, now)
+        if time.monotonic() >= self._next_progress or newest.finished:
+            self._report()
+
+    def _step(self, mode: int, inputs: Sequence[tuple[int, Value | None]], now: int) -> None:
+        """Make a step at simulated time ``now`` [ns]."""
+        law = self._law
+        newest = max((value[1] for _, value in inputs if value), default=0)
+        # A message can arrive before our clock shows its stamp (``/clock`` is late, or clocks of hosts disagree). The
+        # new state is stamped later than its inputs all the same (up to the margin): the log is in causal order.
+        self._made = max(now, self._made + 1, min(newest, now + self._margin) + 1)
+        own = law.state
+        law.advance(mode, [value[0] if value else own for _, value in inputs])
+        steps = [LOST if step == NOTHING else step for step, _ in inputs]
+        message = self._codec.wrap(law.step, mode + 1, law.state, steps, self._made)
+        self._published.write(law.step, message)
+        self._send(law.step, law.state, message)
+
+    def _send(self, step: int, state: bytes, message: bytes) -> None:
+        """Publish the state and hand it to the agents of the process; in real time no noise is added to it."""
+        self.publish(self._states, message)
+        for hear in self._listeners:
+            hear(self._law.agent, step, (state, stamp_ns(message)))
+
+    def send_again(self, since: int) -> None:  # noqa: ARG002  only the newest value is of use
+        """Publish the newest state again; older ones are of no use."""
+        self._repeat(self._law.step)
+
+    def _ask_again(self) -> None:
+        for j in self._far:
+            self._group.ask_again(j, self._law.step)
+
+    def _receiver(self, peer: int) -> Callable[[bytes], None]:
+        unwrap = self._frame.unwrap
+        offer = self._newest.offer
+        topic, replicas = state_topic(peer), self.record.experiment.run.replicas
+
+        def receive(data: bytes) -> None:
+            frame = unwrap(data)
+            if frame is None or frame[0] != peer + 1:
+                self.refuse(why_not(data, self.record, peer, replicas), topic)
+                return
+            state = frame[3]
+            reason = offer(peer, frame[1], (state, stamp_ns(data))) if all_finite(state) else NOT_FINITE
+            if reason:
+                self.refuse(reason, topic)
+
+        return receive
+
+    def hear(self, peer: int, step: int, value: Value) -> None:
+        """Take the state of an agent of the same process."""
+        self._newest.offer(peer, step, value)
+
+    def learn(self, graph: ActiveGraph) -> str | None:
+        """Take a graph; None if taken, else the reason."""
+        if not 1 <= graph.mode <= len(self._inputs):
+            return OTHER_RUN
+        return self._newest.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step)
+
+    def health(self) -> Health:
+        """How late the agent is, or what it waits for."""
+        step, pace = self._law.step, self._pace
+        overdue = pace.look(step)
+        missed, late = self._missed - self._missed_before, self._late / self._speed / 1e6
+        self._missed_before, self._late = self._missed, 0
+        values = {
+            "step": str(step),
+            "steps per second": f"{pace.rate:.1f}",
+            "latest step [ms]": f"{late:.3f}",
+            "deadlines missed": str(self._missed),
+            "oldest value of a neighbour [steps]": str(max(self._newest.behind.values(), default=0)),
+        }
+        if self._newest.finished:
+            return Health("has made all steps", values=values)
+        waiting = self._waiting_for()
+        if overdue and waiting:
+            self.get_logger().warning(f"no step for {pace.stalled:.0f} s at step {step}: waiting for {waiting}")
+        if pace.stalled and waiting:
+            return Health(
+                f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting}
+            )
+        message = f"at step {step}, late by {late:.1f} ms" + (f", {missed} deadlines missed" if missed else "")
+        return Health(message, waiting=missed > 0, values=values)
+
+    def _waiting_for(self) -> str | None:
+        """What keeps the agent from a due step, or its clock from reaching it; None if the step is not yet due."""
+        now = self._timer.now()
+        if not now:
+            return "the time on /clock"
+        if self._schedule is None:
+            return "the epoch, which the switcher publishes when all agents have started"
+        if self._schedule.simulated(now) < self._schedule.due(self._law.step):
+            stood, self._looked = self._looked == now, now
+            return f"its clock, which stands at {now / 1e9:g} s" if stood else None
+        return self._newest.waiting_for()

@@ -1,0 +1,205 @@
+"""The life of one process of a network: nodes, start gate, spin, end."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import rclpy
+from rclpy.exceptions import NotInitializedException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+
+from msg_agents.nodes.diagnostics import Reporter
+from msg_agents.nodes.network_node import FAREWELL, NetworkNode
+from msg_agents.nodes.peer_presence import Presence
+from msg_agents.nodes.ros.node_parameters import ros_arguments
+from msg_agents.recovery.takeover import PREFIX_SIZE, Succession
+from msg_analysis.errors import InputError
+
+GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
+SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wakes up
+GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collections find nothing
+LEAVE_GRACE = 5  # s
+INTERRUPTED_GRACE = 15  # s; longer, because a process that ends by it has failed
+LIFELINE_GRACE = 5.0  # s
+USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
+
+
+class NotFoundError(InputError):
+    """Some nodes of the run were not discovered in time."""
+
+
+def make_executor(kind: str = "events") -> Executor:
+    """The events executor where this rclpy has it (a third of the CPU time per message), else the single-threaded one.
+
+    ``kind``: "events" or "single"; "single" is for comparison.
+    """
+    if kind == "events":
+        try:
+            from rclpy.experimental.events_executor import EventsExecutor
+        except ImportError:
+            pass
+        else:
+            return EventsExecutor()
+    return SingleThreadedExecutor()
+
+
+def prefer_throughput() -> None:
+    """Ask the scheduler for throughput instead of immediate wake-ups (Linux: SCHED_BATCH).
+
+    In lockstep all cores are busy with processes that wake each other with every message; if each wake-up preempts the
+    running process, a third of the time goes into the switches. Threads made later inherit the policy.
+    """
+    with contextlib.suppress(AttributeError, OSError):  # other systems have no such policy
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def hold_lifeline(descriptor: int) -> None:
+    """End this process when the other end of a pipe closes: its parent has ended, for whatever reason."""
+
+    def watch() -> None:
+        while os.read(descriptor, 1):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(LIFELINE_GRACE)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True, name="lifeline").start()
+
+
+def run_nodes(
+    make_nodes: Callable[[], Sequence[NetworkNode]],  # called after rclpy.init
+    *,
+    executor: str = "events",  # or "single"
+    discovery_timeout: float,  # s
+    throughput: bool = True,  # see ``prefer_throughput``
+    use_sim_time: bool = False,
+    account: Path | None = None,  # file of what the nodes refused and wait for, written once a second and at the end
+    patience: float | None = None,  # s, see ``Presence``; None: never ends for lack of companions
+) -> bool:
+    """Run nodes until each has done its part; False if the process was told to stop (SIGINT, SIGTERM) before.
+
+    NotFoundError: names the missing nodes. InputError: names that several nodes have, or what a node failed with.
+    """
+    # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
+    # installed on top, ends the spin between two callbacks.
+    signal.signal(signal.SIGINT, lambda *_: None)
+    if throughput:
+        prefer_throughput()
+    with ros_arguments():
+        rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
+    nodes: Sequence[NetworkNode] = []
+    reporter: Reporter | None = None
+    complete = False
+    try:
+        nodes = make_nodes()
+        reporter = Reporter(nodes, account)
+        spinner = make_executor(executor)
+        for node in nodes:
+            spinner.add_node(node)
+        _gate(nodes, discovery_timeout)
+        # All objects made so far live until the end: the garbage collector need not scan them again and again.
+        gc.collect()
+        gc.freeze()
+        gc.set_threshold(GC_THRESHOLD)
+        for node in nodes:
+            node.begin()
+        if patience is not None:
+            Presence(nodes[0], patience)
+        for node in nodes:
+            while not node.done.done():
+                spinner.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
+            node.done.result()
+        complete = True
+    except ExternalShutdownException:
+        pass
+    except (RuntimeError, NotInitializedException):  # RCLError among them: a signal came in the middle of a call
+        if rclpy.ok():
+            raise
+    finally:
+        deadline = time.monotonic() + FAREWELL
+        for node in nodes:
+            node.finish(complete=complete, deadline=deadline)
+        if reporter:
+            reporter.keep_account()
+        leave(nodes, complete=complete)
+    return complete
+
+
+def enter_participant(successions: Sequence[Succession], node: Node) -> None:
+    """Note the name of this process, which the endpoints of its nodes bear, for the one that will follow.
+
+    Parameters
+    ----------
+    successions
+        of the nodes of this process
+    node
+        one of them
+    """
+    if not successions:
+        return
+    own = (node.get_name(), node.get_namespace())
+    endpoints = [p for topic in node.publishers for p in node.get_publishers_info_by_topic(topic.topic_name)]
+    prefixes = {bytes(p.endpoint_gid[:PREFIX_SIZE]) for p in endpoints if (p.node_name, p.node_namespace) == own}
+    if len(prefixes) == 1:  # else somebody bears the same name: nobody is buried for him
+        for succession in successions:
+            succession.enter(*prefixes)
+
+
+def leave(nodes: Sequence[Node], *, complete: bool) -> None:
+    """Take the nodes off the network, so that no other node waits for them, and make sure that the process ends.
+
+    When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
+    interpreter's lock held or after the interpreter has gone. Then only C code helps: an alarm, whose default action
+    ends the process. Nothing is lost, because a complete process has delivered everything by now.
+    """
+    if complete:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(LEAVE_GRACE)
+    else:
+        faulthandler.dump_traceback_later(INTERRUPTED_GRACE, exit=True)
+    for node in nodes:
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
+    """Wait until the publishers of all nodes have found their readers, and every name belongs to one node only.
+
+    Readers are identified by name: with duplicates, a run might start without the node that belongs to it.
+    """
+    deadline = time.monotonic() + timeout
+    waiting = list(nodes)
+    warned = False
+    while True:
+        waiting = [node for node in waiting if not node.found() or node.awaited_clock()]
+        late = time.monotonic() > deadline
+        twice = nodes[0].namesakes() if late or not waiting else []
+        if not waiting and not twice:
+            return
+        if twice and not warned:
+            warned = True
+            names = ", ".join(twice)
+            nodes[0].get_logger().warning(f"there is more than one {names}: waiting until only one is left")
+        if late and twice:
+            raise nodes[0].clash(twice, timeout)
+        if late:
+            missing = sorted({name for node in waiting for name in node.awaited() + node.awaited_clock()})
+            raise NotFoundError(
+                f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} had not found: "
+                f"{', '.join(missing)}. Are they running, in the same ROS_DOMAIN_ID "
+                f"({os.environ.get('ROS_DOMAIN_ID', '0')}) and within ROS_AUTOMATIC_DISCOVERY_RANGE "
+                f"({os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')})?"
+            )
+        if not rclpy.ok():
+            raise ExternalShutdownException
+        time.sleep(GATE_POLL)

@@ -1,0 +1,122 @@
+"""Nodes without the services that ROS 2 gives every node and that are not needed here."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from msg_agents.nodes.ros.node_parameters import PROCESS
+from msg_agents.nodes.ros.rclpy_error import RCLError
+from msg_analysis.errors import InputError
+
+LOSSLESS = ("history", "reliability", "durability", "lifespan")
+"""Policies that must not change where nothing may be lost, except that a publisher may become latched."""
+
+
+class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
+    """A node without parameter services, type descriptions and /rosout.
+
+    Each node would have seven services and /rosout, which cost more than the network if there are many nodes.
+    Parameters are declared all the same; the option ``parameter_services`` brings their services back.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._takes_overrides = False  # rclpy cannot handle overrides yet when it makes the node's own topics
+        super().__init__(
+            name,
+            start_parameter_services=bool(PROCESS.values.get("parameter_services")),
+            enable_rosout=False,
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
+        )
+        self._takes_overrides = PROCESS.qos_overrides
+        PROCESS.declare(self)
+
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Publisher:
+        """As in rclpy; with the user's overrides of the quality of service, as far as no message would be lost."""
+        kinds = [
+            QoSPolicyKind.DEADLINE,
+            QoSPolicyKind.LIFESPAN,
+            QoSPolicyKind.LIVELINESS,
+            QoSPolicyKind.LIVELINESS_LEASE_DURATION,
+        ]
+        return self._create(super().create_publisher, kinds, msg_type, topic, qos_profile, **options)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[[Any], None], qos_profile: Any, **options: Any
+    ) -> Subscription:
+        """As in rclpy; overrides as in ``create_publisher``."""
+
+        def create(msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Subscription:
+            return super(QuietNode, self).create_subscription(msg_type, topic, callback, qos_profile, **options)
+
+        return self._create(create, [], msg_type, topic, qos_profile, **options)
+
+    def _create(
+        self,
+        create: Callable[..., Any],
+        kinds: list[QoSPolicyKind],
+        msg_type: Any,
+        topic: str,
+        qos: Any,
+        **options: Any,
+    ) -> Any:
+        if not self._takes_overrides:
+            return create(msg_type, topic, qos, **options)
+        qos = copy.copy(qos) if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)  # rclpy changes it in place
+        before, publishes = copy.copy(qos), bool(kinds)
+        kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY, *kinds]
+        if before.history != HistoryPolicy.KEEP_ALL:  # depth has no meaning there
+            kinds.append(QoSPolicyKind.DEPTH)
+        # The parameters go by the resolved name of the topic.
+        final = self.resolve_topic_name(topic)
+
+        def check(profile: QoSProfile) -> SetParametersResult:
+            reason = objection(before, profile, publishes=publishes)
+            return SetParametersResult(successful=not reason, reason=reason)
+
+        try:
+            return create(
+                msg_type, topic, qos, qos_overriding_options=QoSOverridingOptions(kinds, callback=check), **options
+            )
+        except (InvalidQosOverridesError, RuntimeError) as error:
+            if not isinstance(error, InvalidQosOverridesError) and "QoS override" not in str(error):
+                raise
+            side = "publisher" if publishes else "subscription"
+            reason = str(error).partition("not valid: ")[2] or str(error)
+            raise InputError(f"parameter qos_overrides.{final}.{side}: {reason}") from error
+
+    def publish(self, publisher: Publisher, data: bytes) -> None:
+        """Publish CDR bytes on a reliable, keep-all publisher, again until they go through.
+
+        A slow reader blocks such a writer; after 100 ms the middleware raises, and the message has not been written.
+        """
+        while True:
+            try:
+                # What Publisher.publish does with bytes, without entering the handle's context each time.
+                publisher.handle.publish_raw(data)
+                return
+            except RCLError:
+                if not self.context.ok():
+                    raise
+
+
+def objection(before: QoSProfile, after: QoSProfile, *, publishes: bool) -> str:
+    """Why a quality of service may not be overridden so, or empty text; publishers may become latched."""
+    if before.history != HistoryPolicy.KEEP_ALL:  # messages may be lost there anyway
+        return ""
+    for policy in LOSSLESS:
+        ours, theirs = getattr(before, policy), getattr(after, policy)
+        latched_as_well = policy == "durability" and publishes and theirs.name == "TRANSIENT_LOCAL"
+        if theirs != ours and not latched_as_well:
+            names = [str(getattr(value, "name", value)).lower() for value in (theirs, ours)]
+            return f"{policy}: {names[0]}: messages of the run would be lost, or not come at all: expected {names[1]}"
+    return ""

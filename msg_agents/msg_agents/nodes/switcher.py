@@ -1,0 +1,288 @@
+"""The switcher node: publishes the experiment and the path of the active graph.
+
+In lockstep it keeps ahead of the agents; in real time it publishes the epoch, and each sojourn when it begins.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
+from msg_agents_interfaces.msg import Progress as ProgressMsg
+from rclpy.duration import Duration
+from std_msgs.msg import String
+
+from msg_agents.nodes.diagnostics import Health
+from msg_agents.nodes.network_node import (
+    END_TOPIC,
+    EPOCH_TOPIC,
+    EXPERIMENT_TOPIC,
+    FAREWELL,
+    GRAPH_TOPIC,
+    NOT_AN_AGENT,
+    PROGRESS_TOPIC,
+    NetworkNode,
+)
+from msg_agents.nodes.ros.qos import LATCHED
+from msg_agents.nodes.ros.timers import DueTimer, every
+from msg_agents.processes.process_plan import RECORDER, agent_name
+from msg_agents.stepping.realtime_schedule import Schedule
+from msg_analysis.model.arithmetic.step_clock import SECOND
+from msg_analysis.model.run.graph_path import Sojourn, sojourns
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.step.step_model import Wiring
+from msg_analysis.wire.messages import ActiveGraph, Progress, encode_string
+
+AHEAD = 1000
+"""Sojourns that are published before the slowest agent reaches them: enough that no agent waits for one; bounded, so
+that a long run takes little memory, and below the 5,000 messages that a late reader gets."""
+
+AHEAD_LEAST, AHEAD_BYTES = 50, 1 << 22
+"""Graphs of many agents are large messages, and their agents are slow: only as many sojourns ahead as fit
+AHEAD_BYTES, but at least AHEAD_LEAST."""
+
+BEHIND = 5000
+"""Sojourns that a reader may be behind: the number of messages that the middleware keeps of a writer."""
+
+REPORT_PERIOD = 0.1  # s
+
+NAMESAKE = "a second node of this name"
+HEAD_START = SECOND // 2
+"""ns of the clock from the publication of the epoch to the epoch: time for all nodes to receive it."""
+
+
+class Switcher(NetworkNode):
+    """Draws the exact path of the chain; subclasses, one per pace, decide when to publish which part of it."""
+
+    def __init__(
+        self,
+        *,
+        record: RunRecord,
+        model: Wiring,
+        readers: list[str],  # nodes, besides the agents, that must read the graph before the run starts
+        on_progress: Callable[[Sequence[int]], None] = lambda _: None,  # newest step of every agent, -1: none yet
+        checkpoints: Path | None = None,  # directory for a mark; finding one there means a takeover
+        farewell: float = FAREWELL,  # s to wait for acknowledgements of the end
+    ) -> None:
+        super().__init__("switcher", record=record)
+        self._farewell = farewell
+        self._graphs = record.experiment.graph_list
+        self._path = sojourns(record.experiment, model.initial)
+        self._steps = record.experiment.steps
+        self._reached = [-1] * model.agents
+        self._slowest = -1
+        self._heard = False  # from an agent since the last call of on_progress
+        self._recorded = RECORDER not in readers
+        self._on_progress = on_progress
+        self._namesakes: set[str] = set()  # names seen at the last check
+        self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
+        self._expected = [agent_name(i) for i in range(model.agents)] + readers
+        self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LATCHED)
+        self._graph = self.create_publisher(ActiveGraphMsg, GRAPH_TOPIC, LATCHED)
+        self._end = self.create_publisher(ProgressMsg, END_TOPIC, LATCHED)
+        self.create_subscription(ProgressMsg, PROGRESS_TOPIC, self._receive, LATCHED, raw=True)
+        every(self, REPORT_PERIOD, self._report)
+
+    def found(self) -> bool:
+        """Whether all expected nodes are there."""
+        return not self.awaited()
+
+    def awaited(self) -> list[str]:
+        """Names of nodes that are not there yet; all its topics are latched, so being there is enough."""
+        here = self.get_namespace()
+        there = {name for name, namespace in self.get_node_names_and_namespaces() if namespace == here}
+        return [name for name in self._expected if name not in there]
+
+    def companions(self) -> list[str]:
+        """All agents and the required readers."""
+        return self._expected
+
+    def health(self) -> Health:
+        """Progress of the slowest agent, or which agents have not started."""
+        self._look_for_namesakes()
+        values = {"step of the slowest agent": str(self._slowest)}
+        if self._slowest < 0:
+            silent = [agent_name(i) for i, step in enumerate(self._reached) if step < 0]
+            return Health(f"waiting for {', '.join(silent)}", waiting=True, values=values)
+        return self._how(values)
+
+    def _how(self, values: dict[str, str]) -> Health:
+        """Health once all agents have started; ``values``: facts to include."""
+        raise NotImplementedError
+
+    def _look_for_namesakes(self) -> None:
+        """Warn of a duplicate node when it is seen twice in a row: a killed one may not be gone yet."""
+        there = set(self.namesakes())
+        for name in there & self._namesakes:
+            if not self.refused[name, NAMESAKE]:
+                self.refused[name, NAMESAKE] = 1
+                self.get_logger().warning(f"there is a second node called {name}: what only one of them says is taken")
+        self._namesakes = there
+
+    def begin(self) -> None:
+        """Publish the experiment."""
+        self.publish(self._experiment, encode_string(self.record.to_json()))
+
+    def _moved(self) -> None:
+        """Called when the slowest agent has advanced."""
+
+    def finish(self, *, complete: bool, deadline: float) -> None:  # noqa: ARG002  it has a time limit of its own
+        """Wait until the end is acknowledged; readers need nothing else any more, and those that left have had it."""
+        if complete:
+            self._end.wait_for_all_acked(Duration(seconds=self._farewell))
+
+    def _receive(self, data: bytes) -> None:
+        progress = self.decode_progress(data, PROGRESS_TOPIC)
+        if progress is None:
+            return
+        if progress.agent == NOT_AN_AGENT:
+            self._recorded = self._recorded or progress.step == self._steps
+        else:
+            self._reached[progress.agent - 1] = max(progress.step, self._reached[progress.agent - 1])
+            self._heard = True
+        slowest = min(self._reached)
+        if slowest > self._slowest:
+            self._slowest = slowest
+            self._moved()
+        if self._recorded and slowest >= self._steps and not self.done.done():
+            self._report()
+            self.publish(self._end, self.progress(NOT_AN_AGENT, self._steps))
+            self.done.set_result(None)
+
+    def _report(self) -> None:
+        if self._heard:
+            self._heard = False
+            self._on_progress(self._reached)
+
+    def _publish_sojourn(self, sojourn: Sojourn) -> int:
+        """Publish a sojourn; the size of its message [bytes]."""
+        message = self._message(sojourn).encode()
+        self.publish(self._graph, message)
+        return len(message)
+
+    def _message(self, sojourn: Sojourn) -> ActiveGraph:
+        graph = self._graphs[sojourn.mode]
+        return ActiveGraph(
+            stamp=self._step_clock.nanoseconds(sojourn.first_step),
+            run=self.run,
+            sequence=sojourn.sequence,
+            mode=sojourn.mode + 1,
+            name=graph.name,
+            first_step=sojourn.first_step,
+            last_step=sojourn.last_step,
+            arcs=graph.arcs,
+        )
+
+
+class LockstepSwitcher(Switcher):
+    """Keeps a bounded number of sojourns ahead of the agents; parameters as in ``Switcher``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # A mark means that part of the path has been published; how much is not known.
+        self._behind = bool(self._mark and self._mark.exists())
+        self._ahead: deque[int] = deque()  # first steps of published sojourns that the slowest agent has not reached
+        self._most_ahead = AHEAD
+
+    def _how(self, values: dict[str, str]) -> Health:
+        values["sojourns ahead of it"] = str(len(self._ahead))
+        return Health(f"{len(self._ahead)} sojourns ahead of step {self._slowest}", values=values)
+
+    def begin(self) -> None:
+        """Publish the experiment and the beginning of the path."""
+        if self._mark:
+            self._mark.touch()
+        super().begin()
+        self._moved()
+
+    def _moved(self) -> None:
+        slowest = self._slowest
+        if self._behind:
+            if slowest < 0:  # not all agents have reported yet
+                return
+            self._catch_up(slowest)
+        while self._ahead and self._ahead[0] <= slowest:
+            self._ahead.popleft()
+        while len(self._ahead) < self._most_ahead:
+            sojourn = next(self._path, None)
+            if sojourn is None:
+                return
+            self._go_ahead(sojourn)
+
+    def _catch_up(self, slowest: int) -> None:
+        """Publish again what may not have been delivered when the process before this one ended."""
+        recent: deque[Sojourn] = deque(maxlen=BEHIND)
+        for sojourn in self._path:
+            recent.append(sojourn)
+            if sojourn.last_step >= slowest:
+                break
+        for sojourn in recent:
+            self._go_ahead(sojourn)
+        self._behind = False
+
+    def _go_ahead(self, sojourn: Sojourn) -> None:
+        size = self._publish_sojourn(sojourn)
+        self._most_ahead = min(self._most_ahead, max(AHEAD_LEAST, AHEAD_BYTES // size))
+        self._ahead.append(sojourn.first_step)
+
+
+class RealtimeSwitcher(Switcher):
+    """Sets the epoch of simulated time, and publishes each sojourn when it begins; parameters as in ``Switcher``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._timer = DueTimer(self, self._keep_up)
+        self._schedule: Schedule | None = None
+        self._next = next(self._path, None)
+
+    def _how(self, values: dict[str, str]) -> Health:
+        if self._schedule is None:
+            return Health("waiting for the time on /clock", waiting=True, values=values)
+        late = self._next is not None and self._timer.now() - self._schedule.clock_time(self._next.first_step)
+        values["lateness of the graph [ms]"] = f"{max(0, late) / 1e6:.3f}"
+        return Health(f"step of the slowest agent: {self._slowest}", values=values)
+
+    def begin(self) -> None:
+        """Publish the experiment and, after a takeover, the epoch and the path so far."""
+        super().begin()
+        text = self._mark.read_text(encoding="ascii") if self._mark and self._mark.exists() else ""
+        if text:
+            self._start(int(text))
+
+    def _report(self) -> None:
+        super()._report()
+        now = self._timer.now()
+        if self._schedule is None and self._slowest >= 0 and now:
+            epoch = now + HEAD_START
+            if self._mark:  # whole or not at all: a process that takes over must go on with this epoch
+                draft = self._mark.with_suffix(".draft")
+                draft.write_text(str(epoch), encoding="ascii")
+                draft.replace(self._mark)
+            self._start(epoch)
+
+    def _start(self, epoch: int) -> None:
+        """Publish the epoch, and the path so far."""
+        experiment = self.record.experiment
+        self._schedule = Schedule(epoch=epoch, speed=experiment.run.speed, step_length=experiment.step_length)
+        publisher = self.create_publisher(ProgressMsg, EPOCH_TOPIC, LATCHED)
+        self.publish(publisher, Progress(epoch, self.run, NOT_AN_AGENT, 0).encode())
+        self._keep_up()
+
+    def _keep_up(self) -> None:
+        """Publish every sojourn that has begun; the first one before the epoch."""
+        assert self._schedule is not None
+        simulated = self._schedule.simulated(self._timer.now())
+        come: deque[Sojourn] = deque(maxlen=BEHIND)
+        while self._next and (self._next.first_step == 0 or self._schedule.due(self._next.first_step) <= simulated):
+            come.append(self._next)
+            self._next = next(self._path, None)
+        for sojourn in come:
+            self._publish_sojourn(sojourn)
+        if self._next:
+            self._timer.set(self._schedule.clock_time(self._next.first_step))
+
+
+SWITCHERS: dict[str, type[Switcher]] = {"lockstep": LockstepSwitcher, "realtime": RealtimeSwitcher}  # by pace

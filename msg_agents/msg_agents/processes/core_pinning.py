@@ -1,0 +1,46 @@
+"""Which CPU core each process of a network keeps to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from itertools import accumulate
+
+from msg_agents.processes.process_plan import RECORDER, ProcessPlan
+
+RECORDING = 0.25
+"""Cost of a message for the recorder, relative to the cost of the step that made it for the agent."""
+
+
+def available_cores() -> list[int]:
+    """The cores that this process may use, ascending; none where the system does not say (not Linux)."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
+def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) -> dict[str, int]:
+    """A core for each process by name, where agent processes and recorder outnumber two or more cores; else empty.
+
+    In lockstep every message wakes the process that receives it. To wake it on another core costs an interrupt there,
+    and without pinning the scheduler spreads communicating processes over the cores: with two cores, the demo network
+    makes a third to a half fewer steps per second (docs/performance.md). ``plans`` must have the order of
+    ``plan_network``, so that neighbours share a core. Networks with successive values of ``first`` begin at different
+    cores, and so share them evenly. The switcher, which needs hardly any time, gets no core.
+    """
+    agents = sum(len(plan.agents) for plan in plans)
+    loads = {
+        plan.name: len(plan.agents) or RECORDING * agents for plan in plans if plan.agents or plan.name == RECORDER
+    }
+    if len(cores) < 2 or len(loads) <= len(cores):
+        return {}
+    total = sum(loads.values())
+    ends = accumulate(loads.values())
+    middles = {name: end - load / 2 for (name, load), end in zip(loads.items(), ends, strict=True)}
+    return {name: cores[(first + int(middle / total * len(cores))) % len(cores)] for name, middle in middles.items()}
+
+
+def keep_to(process: int, core: int) -> None:
+    """Pin a process that has just been started, and its children, to a core; errors are ignored."""
+    try:
+        os.sched_setaffinity(process, {core})
+    except OSError:  # it has ended already, or the core has been taken from us
+        return

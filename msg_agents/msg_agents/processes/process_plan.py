@@ -1,0 +1,121 @@
+"""The plan of a network: which nodes run in which processes. The runner and the launch files both use it."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from msg_agents.processes.environment import DISCOVERY_TIMEOUT
+from msg_analysis.bags.format.storage_options import DEFAULT, MEGABYTE, Storage
+from msg_analysis.errors import InputError
+from msg_analysis.model.experiment.experiment import Experiment
+
+RECORDER, SWITCHER = "recorder", "switcher"
+SMALL = 8
+"""Of ``processes: auto``: up to so many agents, each has a process of its own; beyond, there is one process per so many
+agents, but not more than the machine has cores."""
+MOST_PROCESSES = 90
+"""Agent processes. Discovery on one machine finds up to ``maxInitialPeersRange`` of loopback.xml participants, of which
+the switcher, the recorder and the user's own tools need some."""
+
+
+def agent_name(agent: int) -> str:
+    """Name of the node, and namespace of the topics, of an agent (index from 0; the name counts from 1)."""
+    return f"agent_{agent + 1}"
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessPlan:
+    """One process of a network."""
+
+    name: str
+    arguments: tuple[str, ...]  # of the command ``msg-agents``
+    agents: tuple[int, ...] = ()  # indices from 0
+    resumes: bool = False  # whether the same command takes over after the process was killed
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """What one host runs of a network that is spread over several hosts."""
+
+    agents: tuple[int, ...]  # indices from 0, ascending
+    home: bool  # whether recorder and switcher run here
+    discovery_timeout: float  # s for which nodes look for those of other hosts, which the user starts
+    patience: float  # s that companions may be gone before a node ends itself
+
+
+def count_processes(experiment: Experiment, agents: int | None = None) -> int:
+    """Number of processes for ``agents`` agents (None: all) on this machine; InputError: too many for discovery."""
+    agents, wanted = experiment.agents if agents is None else agents, experiment.run.processes
+    if wanted == "auto":
+        # A message to another process costs more than the step it is for: no more processes than can run at once.
+        return agents if agents <= SMALL else min(math.ceil(agents / SMALL), MOST_PROCESSES, os.cpu_count() or 1)
+    count = agents if wanted == "one_per_agent" else min(int(wanted), agents)
+    if count > MOST_PROCESSES:
+        raise InputError(
+            f"run.processes: {wanted} ({count} processes): expected at most {MOST_PROCESSES}, because discovery on one "
+            "machine finds about 100 participants: give a smaller number, several agents share a process"
+        )
+    return count
+
+
+def most_processes(experiment: Experiment, agents: int) -> int:
+    """Most processes that an experiment may have for so many agents, on a machine of any number of cores."""
+    wanted = experiment.run.processes
+    return min(agents, MOST_PROCESSES, int(wanted) if isinstance(wanted, int) else agents)
+
+
+def discovery_timeout(agents: int, processes: int) -> float:
+    """Seconds after which a node of a network of so many agents and processes gives up on the missing ones.
+
+    The first process waits for the last one: two or more start per second, and many endpoints take longer to discover.
+    """
+    return max(DISCOVERY_TIMEOUT, 2.0 * processes + 0.1 * agents)
+
+
+def plan_network(
+    experiment: Experiment,
+    run_file: Path,  # run record, read by every node
+    bag: Path | None,  # directory to record to; None: no recorder
+    checkpoints: Path | None = None,  # directory of the states for a takeover; None: killed processes cannot resume
+    *,
+    use_sim_time: bool = False,
+    storage: Storage = DEFAULT,
+    share: Share | None = None,
+) -> list[ProcessPlan]:
+    """The processes of a run, in the order in which to start them; with ``share``, those of this host only.
+
+    InputError: more processes than discovery can handle.
+    """
+    here = tuple(range(experiment.agents)) if share is None else share.agents
+    count = count_processes(experiment, len(here))
+    common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
+    timeout = discovery_timeout(experiment.agents, count) if share is None else share.discovery_timeout
+    if timeout != DISCOVERY_TIMEOUT:
+        common += ("--discovery-timeout", f"{timeout:g}")
+    options = common + (("--await", RECORDER) if bag is not None or share is not None else ())
+    if checkpoints is not None:
+        options += ("--checkpoint", str(checkpoints))
+    if share is not None:
+        options += ("--patience", f"{share.patience:g}")
+    resumes = checkpoints is not None
+    home = share is None or share.home
+    plans = []
+    if bag is not None and home:
+        files: tuple[str, ...] = ("--compression", storage.compression)
+        if storage.split_size is not None:
+            files += ("--split-size", repr(storage.split_size / MEGABYTE))
+        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
+    for index in range(count):
+        # Consecutive agents share a process: in most graphs they are neighbours, and their messages stay inside.
+        agents = here[index * len(here) // count : (index + 1) * len(here) // count]
+        numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
+        first, last = agents[0] + 1, agents[-1] + 1
+        rest = f"to_{last}" if last - first == len(agents) - 1 else f"and_{len(agents) - 1}_more"
+        name = f"agent_{first}" if first == last else f"agents_{first}_{rest}"
+        plans.append(ProcessPlan(name, ("agent", str(run_file), *numbers, *options), agents, resumes))
+    if home:
+        plans.append(ProcessPlan(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
+    return plans

@@ -1,0 +1,94 @@
+"""The last states that an agent has published, in a file that outlives its process.
+
+Every state is written before it is published. A process that takes over from a killed one resumes from there, and
+publishes again what may have been lost on the way. Any agent can also repeat what a restarted peer has missed.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+from pathlib import Path
+
+from msg_agents.stepping.synchronizer import AGAIN
+from msg_analysis.errors import InputError
+from msg_analysis.model.run.record import RunRecord
+
+MOST, LEAST, ROOM = AGAIN, 256, 1 << 24
+"""States kept of each agent: as many as fit into ROOM bytes, between LEAST and MOST. Where possible, more than the
+5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
+
+# Length of the message and step + 1, written after the message: 0 or the mark of an older step until it is whole.
+MARK = struct.Struct("<QQ")
+
+
+def longest_heard(record: RunRecord) -> int:
+    """The largest length that ``heard`` of a state message can have in a run."""
+    experiment = record.experiment
+    return experiment.agents - 1 if experiment.noise.loss or experiment.run.pace == "realtime" else 0
+
+
+def room_for(size: int) -> int:
+    """Size of the checkpoint file of an agent whose longest message has ``size`` bytes."""
+    slot = size + MARK.size
+    return slot * max(LEAST, min(MOST, ROOM // slot))
+
+
+class Checkpoint:
+    """A ring of messages in a memory-mapped file, which survives its process, but not its machine.
+
+    ``found``: the file was there, so another process has run this agent before. ``size`` is that of the longest message
+    in bytes. Without a path it is in memory, for this process only. InputError: a file of another size, or no room.
+    """
+
+    def __init__(self, path: Path | None, size: int) -> None:
+        self.found = False
+        self._size = size
+        self._slot = size + MARK.size
+        total = room_for(size)
+        self._capacity = total // self._slot
+        if path is None:
+            self._map = mmap.mmap(-1, total)
+            return
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            found = os.fstat(descriptor).st_size
+            if found not in (0, total):
+                raise InputError(
+                    f"{path}: {found} bytes, expected {total}: it is of another run: remove it, or name another place"
+                )
+            self.found = bool(found)
+            # Allocate all of it now: if the disk were full later, writing to the map would kill the process.
+            os.posix_fallocate(descriptor, 0, total)
+            self._map = mmap.mmap(descriptor, total)
+        except OSError as error:
+            raise InputError(
+                f"{path}: no room for {total} bytes ({error.strerror}): name another place, or let nobody be started "
+                "again (--restarts 0)"
+            ) from error
+        finally:
+            os.close(descriptor)
+
+    def write(self, step: int, message: bytes) -> None:
+        """Keep the message (CDR) of a step; steps must be consecutive."""
+        start = step % self._capacity * self._slot
+        self._map[start : start + len(message)] = message
+        MARK.pack_into(self._map, start + self._size, len(message), step + 1)
+
+    def read(self, first: int = 0) -> list[tuple[int, bytes]]:
+        """(step, message) of the newest consecutive steps, ascending, from step ``first`` on.
+
+        The slot after the newest is left out: it may be torn.
+        """
+        marks = [MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self._capacity)]
+        newest = max(mark for _, mark in marks) - 1
+        found: list[tuple[int, bytes]] = []
+        for step in range(newest, max(first - 1, newest - self._capacity + 1, -1), -1):
+            slot = step % self._capacity
+            length, mark = marks[slot]
+            if mark != step + 1:
+                break
+            start = slot * self._slot
+            found.append((step, self._map[start : start + length]))
+        return found[::-1]

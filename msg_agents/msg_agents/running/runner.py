@@ -1,0 +1,331 @@
+"""A whole run: processes, bag, verdict, report."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import time
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from msg_agents.processes.core_pinning import available_cores, place
+from msg_agents.processes.environment import RESTARTS, node_environment
+from msg_agents.processes.process_plan import Share, count_processes, plan_network
+from msg_agents.processes.ros_domain import free_domain
+from msg_agents.recovery.checkpoint import longest_heard, room_for
+from msg_agents.running.run_folder import workshop
+from msg_agents.running.supervisor import ACCOUNTS, CRASHED, Supervisor
+from msg_agents.stepping.stall_detection import Pace
+from msg_agents.terminal.interruption import Interruption
+from msg_analysis.bags.format.storage_options import DEFAULT, Storage
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.salvage import salvage_in_place
+from msg_analysis.bags.writer import RECORDING_MARKER
+from msg_analysis.errors import BagError
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.twin.simulate import new_record
+from msg_analysis.wire.messages import StateFrame
+
+if TYPE_CHECKING:
+    from msg_agents.watching.run_view import RunView
+    from msg_analysis.inference.verdict.comparison import Comparison
+
+POLL = 0.05  # s
+REPORT_FILE, RESULT_FILE = "report.html", "result.json"
+
+
+@dataclass(slots=True)
+class RunResult:
+    """What a run left behind.
+
+    Attributes
+    ----------
+    bag
+        directory; None if nothing was to be recorded on this host
+    failures
+        what went wrong, one line each
+    interrupted
+        whether a signal (Ctrl-C, for example) ended the run
+    wall_time
+        s from the first state of the slowest agent to its last one, as reported a few times a second
+    rate
+        steps of the slowest agent per second of wall time
+    restarts
+        processes that were killed, or crashed, and were started again, one line each
+    strangers
+        messages that the nodes refused: dictionaries with "node", "topic", "reason", "count"
+    trajectory
+        states of the bag; None if there is none or it could not be read
+    comparison
+        with the prediction; None before ``conclude``
+    """
+
+    bag: Path | None
+    failures: list[str] = field(default_factory=list)
+    interrupted: bool = False
+    wall_time: float = 0.0
+    rate: float = 0.0
+    restarts: list[str] = field(default_factory=list)
+    strangers: list[dict[str, Any]] = field(default_factory=list)
+    trajectory: Trajectory | None = None
+    comparison: Comparison | None = None
+
+
+def make_bag_directory(experiment: Experiment, out: Path) -> Path:
+    """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name."""
+    stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
+    candidate, number = out / stem, 2
+    while True:
+        try:
+            candidate.mkdir()
+            return candidate
+        except FileExistsError:
+            candidate, number = out / f"{stem}_{number}", number + 1
+
+
+def run_network(
+    experiment: Experiment,
+    out: Path | None,
+    *,
+    domain: int | None = None,
+    restarts: int = RESTARTS,
+    use_sim_time: bool = False,
+    storage: Storage = DEFAULT,
+    pin: bool = True,
+    on_progress: Callable[[int], None] = lambda _: None,
+    on_note: Callable[[str], None] = lambda _: None,
+    view: RunView | None = None,
+    environment: Mapping[str, str] | None = None,
+    record: RunRecord | None = None,
+    share: Share | None = None,
+) -> RunResult:
+    """Run an experiment as a network of ROS 2 processes.
+
+    To be called from the main thread, since it handles signals; the callbacks and ``view`` are called from there.
+
+    Parameters
+    ----------
+    experiment
+        what to run
+    out
+        directory in which a new bag is made; None: do not record
+    domain
+        ROS_DOMAIN_ID; None: a free one is chosen
+    restarts
+        how often, in all, processes of agents and the switcher are started again when they were killed (or crashed for
+        the first time); one more failure ends the run. 0: no states are kept for a restart
+    use_sim_time
+        whether the nodes take the time from ``/clock``, which another process publishes in the same domain
+    storage
+        compression and file size of the bag
+    pin
+        whether each process of a run in lockstep keeps to one core, if there are more processes than cores
+    on_progress
+        called about 20 times a second, once all agents have started, with the step that every agent has reached
+    on_note
+        called with a line of text about each restart or stall
+    view
+        shows the run while it goes on
+    environment
+        changes to the environment of the processes
+    record
+        record of the run; None: a new one is made
+    share
+        what this host runs, of several hosts; None: all. Without the recorder only the logs are kept, in the
+        directory that would hold the bag
+
+    Returns
+    -------
+    RunResult
+        The result, without comparison. ``failures`` is empty if every process did its part.
+
+    Raises
+    ------
+    NotAvailableError, InputError
+        the experiment cannot be run, or no domain is free; nothing was started, and no bag or log is left
+    """
+    experiment.require_available()
+    count_processes(experiment, None if share is None else len(share.agents))
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
+    bag = directory if share is None or share.home else None
+    result = RunResult(bag)
+    try:
+        record = record or new_record(experiment)
+        longest = StateFrame(record.run.bytes, experiment.width, longest_heard(record)).size
+        keeping = workshop(experiment.agents * room_for(longest)) if restarts else nullcontext()
+        with workshop() as folder, keeping as checkpoints:
+            run_file = folder / "run.json"
+            run_file.write_text(record.to_json(), encoding="utf-8")
+            with (
+                free_domain() if domain is None else nullcontext(domain) as chosen,
+                Interruption() as interruption,
+                Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
+            ):
+                plans = plan_network(
+                    experiment,
+                    run_file,
+                    bag,
+                    checkpoints=checkpoints,
+                    use_sim_time=use_sim_time,
+                    storage=storage,
+                    share=share,
+                )
+                if pin and experiment.run.pace == "lockstep":
+                    supervisor.cores = place(plans, available_cores(), first=chosen)
+                supervisor.start(plans)
+                if view is not None:
+                    view.begin(record, checkpoints if share is None else None)
+                _watch(supervisor, experiment.steps, result, restarts, interruption, on_progress, on_note, view)
+                if view is not None:
+                    view.end()
+                # Before the supervisor ends the rest: what ends because we end it has not failed.
+                _collect_failures(supervisor, result, interruption, restarts)
+            result.strangers = supervisor.account().strangers()
+            if bag is not None:
+                _settle(bag, result)
+            if directory is not None:
+                _keep_logs(folder, directory / "log", result)
+    finally:
+        if directory is not None:
+            with suppress(OSError):
+                directory.rmdir()  # if it is empty
+    return result
+
+
+def _watch(
+    supervisor: Supervisor,
+    steps: int,
+    result: RunResult,
+    restarts: int,
+    interruption: Interruption,
+    on_progress: Callable[[int], None],
+    on_note: Callable[[str], None],
+    view: RunView | None = None,
+) -> None:
+    """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
+    began: float | None = None
+    pace = Pace()
+    while interruption.caught is None and _revive(supervisor, result, restarts, on_note) and supervisor.awaited:
+        time.sleep(POLL)
+        supervisor.read_status()
+        if view is not None:
+            view.look(supervisor.steps)
+        reached = min(supervisor.steps, default=-1)
+        if pace.look(sum(supervisor.steps)) and 0 <= reached < steps:
+            on_note(f"no step for {pace.stalled:.0f} s: {_standstill(supervisor)}")
+        if reached < 0:
+            continue
+        now = time.monotonic()
+        began = began or now
+        if reached < steps or not result.wall_time:
+            result.wall_time = now - began
+        on_progress(reached)
+    if result.wall_time:
+        result.rate = min(supervisor.steps, default=0) / result.wall_time
+
+
+def _standstill(supervisor: Supervisor) -> str:
+    """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
+    words = [f"{node}: {message}" for node, message in sorted(supervisor.account().waiting.items())]
+    silent = [child.plan.name for child in supervisor.silent]
+    if silent:
+        words.append("nothing heard from " + ", ".join(silent))
+    if not words and supervisor.steps:  # the processes that know are on another host
+        last = min(supervisor.steps)
+        words.append(f"the last to get on is agent {supervisor.steps.index(last) + 1}, at step {last}")
+    return "; ".join(words) or "nobody says why"
+
+
+def _revive(supervisor: Supervisor, result: RunResult, restarts: int, on_note: Callable[[str], None]) -> bool:
+    """Start killed processes again; False if one cannot be."""
+    for child in supervisor.failures:
+        if not child.resumes or len(result.restarts) >= restarts:
+            return False
+        step = min((supervisor.steps[i] for i in child.plan.agents), default=-1) if supervisor.steps else -1
+        after = f" after step {step}" if step >= 0 else ""
+        words = f" ({child.last_words()})" if child.process.returncode == CRASHED else ""
+        result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
+        on_note(result.restarts[-1])
+        supervisor.restart(child)
+    return True
+
+
+def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: Interruption, restarts: int) -> None:
+    if interruption.caught is not None:
+        result.interrupted = True
+        result.failures.append(f"ended by {signal.Signals(interruption.caught).name}")
+    for child in supervisor.failures:
+        words = child.last_words()
+        line = f"{child.plan.name}: {child.failure}" + (f": {words}" if words else "")
+        if child.resumes and result.restarts:
+            counts = {c.plan.name: c.number - 1 for c in supervisor.children if c.number > 1}
+            listed = ", ".join(
+                f"{name} {times} times" if times > 1 else f"{name} once" for name, times in counts.items()
+            )
+            line += f". Not started again: all restarts are used up (--restarts {restarts}): {listed}"
+        result.failures.append(line)
+
+
+def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
+    try:
+        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS))
+    except OSError as error:
+        # The argument of shutil.Error is a list of (from, to, reason).
+        reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)
+        shutil.rmtree(directory, ignore_errors=True)
+        result.failures.append(f"the logs of the processes could not be kept: {reason}")
+
+
+def _settle(bag: Path, result: RunResult) -> None:
+    """Salvage the bag if its recorder did not close it, read it, and say how far each agent came."""
+    try:
+        if (bag / RECORDING_MARKER).exists():
+            report = salvage_in_place(bag)
+            result.failures.append(f"the bag was salvaged: {report.kept_messages} messages kept")
+        if result.failures and not any(bag.glob("*.mcap")):
+            result.failures.append("nothing was recorded: it ended before the recorder had made a bag")
+            return
+        result.trajectory = read_bag(bag)
+    except BagError as error:
+        result.failures.append(str(error))
+        return
+    if result.failures:
+        last = [
+            int(steps[-1]) if (steps := present.nonzero()[0]).size else -1 for present in result.trajectory.present.T
+        ]
+        result.failures.append(
+            "last recorded step: " + ", ".join(f"agent {i + 1}: {k if k >= 0 else 'none'}" for i, k in enumerate(last))
+        )
+
+
+def conclude(result: RunResult) -> None:
+    """Compare the bag of a run with its prediction, and write report.html into the bag.
+
+    Does nothing if there is no bag or it could not be read.
+
+    Parameters
+    ----------
+    result
+        from ``run_network``; its ``comparison`` is set
+
+    Raises
+    ------
+    InputError
+        there is no prediction (too large, unbounded), the bag lacks what is needed, or the report cannot be written
+    """
+    if result.trajectory is None or result.bag is None:
+        return
+    from msg_analysis.inference.verdict.compare import compare
+    from msg_analysis.report.html.report_page import write_report
+
+    result.comparison = compare(result.trajectory)
+    report = result.bag / REPORT_FILE
+    write_report(result.comparison, result.trajectory, report, restarts=result.restarts, strangers=result.strangers)

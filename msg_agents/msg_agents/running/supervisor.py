@@ -1,0 +1,218 @@
+"""Starts the processes of a network, watches them and ends them: none outlives its parent."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from msg_agents.processes.core_pinning import keep_to
+from msg_agents.processes.process_plan import RECORDER, SWITCHER, ProcessPlan
+from msg_agents.processes.status_file import Account, read_accounts
+
+ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
+"""Signals and the seconds that a process has to obey each."""
+
+POLL = 0.02  # s
+SILENCE = 3.0  # s; accounts are written once a second
+CRASHED = 1  # exit code of Python after an uncaught exception
+ACCOUNTS = "accounts"
+
+
+@dataclass(slots=True)
+class Child:
+    """A process of the network."""
+
+    plan: ProcessPlan
+    process: subprocess.Popen[bytes]
+    log: Path  # file of what it printed
+    number: int = 1  # of this start; 2: restarted once
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self.process.poll() is None
+
+    @property
+    def age_of_account(self) -> float:
+        """Seconds since it last wrote its account; inf: never."""
+        path = self.log.parent / ACCOUNTS / f"{self.plan.name}.{self.number}.json"
+        try:
+            return time.time() - path.stat().st_mtime
+        except OSError:
+            return math.inf
+
+    @property
+    def ended_well(self) -> bool:
+        """Whether it has ended and done its part."""
+        return self.process.poll() is not None and self.failure is None
+
+    @property
+    def failure(self) -> str | None:
+        """How it failed, in words; None if it is running or has ended well."""
+        code = self.process.poll()
+        # A process that has done its part and hangs in the middleware ends itself by an alarm: see ``leave``.
+        if code is None or code in (0, -signal.SIGALRM):
+            return None
+        if code < 0:
+            return f"killed by {signal.Signals(-code).name}"
+        return f"exit code {code}"
+
+    @property
+    def resumes(self) -> bool:
+        """Whether it can take over from itself, and starting it again makes sense.
+
+        It does for a process that was killed, for whatever reason. A crash of its own will probably repeat: one more
+        try. It does not after bad input, failed discovery or an order to stop.
+        """
+        code = self.process.poll()
+        if not self.plan.resumes or code is None:
+            return False
+        return code < 0 or (code == CRASHED and self.number == 1)
+
+    def last_words(self) -> str:
+        """The last line that it printed."""
+        with contextlib.suppress(OSError):
+            lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            return lines[-1] if lines else ""
+        return ""
+
+
+@dataclass(slots=True)
+class Supervisor:
+    """The processes of one run; at the end of the context they are ended.
+
+    Children run in sessions of their own, so that Ctrl-C in the terminal reaches the parent only, which then ends them
+    in order. Each holds the reading end of a pipe whose writing end only the parent has: when the parent ends, for
+    whatever reason, the pipe closes and the child leaves.
+    """
+
+    logs: Path  # directory for what the children print
+    environment: Mapping[str, str]  # of the children
+    children: list[Child] = field(default_factory=list)  # as started; a restarted one keeps its place
+    steps: list[int] = field(default_factory=list)  # newest step of every agent, as reported
+    cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
+    _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
+    _status: tuple[int, int] = field(default=(-1, -1), init=False)
+    _pending: bytes = field(default=b"", init=False)
+    _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
+
+    def start(self, plans: Sequence[ProcessPlan]) -> None:
+        """Start all processes."""
+        self._lifeline = os.pipe()
+        self._status = os.pipe()
+        os.set_blocking(self._status[0], False)
+        self.children += [self._start(plan) for plan in plans]
+
+    def restart(self, child: Child) -> None:
+        """Start a process that has ended again; the new child takes its place in ``children``."""
+        self.children[self.children.index(child)] = self._start(child.plan, child.number + 1)
+
+    def _start(self, plan: ProcessPlan, number: int = 1) -> Child:
+        log = self.logs / f"{plan.name}.log"
+        account = self.logs / ACCOUNTS / f"{plan.name}.{number}.json"
+        account.parent.mkdir(exist_ok=True)
+        self._accounts.append(account)
+        options = ["--lifeline", str(self._lifeline[0]), "--account", str(account)]
+        descriptors = [self._lifeline[0]]
+        if plan.name == SWITCHER:
+            options += ["--status", str(self._status[1])]
+            descriptors.append(self._status[1])
+        with log.open("ab") as output:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "msg_agents", *plan.arguments, *options],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=dict(self.environment),
+                pass_fds=descriptors,
+                start_new_session=True,
+            )
+        if plan.name in self.cores:
+            keep_to(process.pid, self.cores[plan.name])
+        return Child(plan, process, log, number)
+
+    def read_status(self) -> None:
+        """Read what the switcher has reported since the last call; does not block."""
+        with contextlib.suppress(BlockingIOError):
+            while chunk := os.read(self._status[0], 1 << 16):
+                self._pending += chunk
+        *lines, self._pending = self._pending.split(b"\n")
+        if lines:
+            self.steps = json.loads(lines[-1])
+
+    @property
+    def running(self) -> list[Child]:
+        """Children that have not ended."""
+        return [child for child in self.children if child.running]
+
+    def account(self) -> Account:
+        """What the nodes have refused, and what they wait for."""
+        return read_accounts(self._accounts)
+
+    @property
+    def silent(self) -> list[Child]:
+        """Running children that have not written their account lately."""
+        return [child for child in self.running if child.age_of_account > SILENCE]
+
+    @property
+    def over(self) -> bool:
+        """Whether all have done their part: no process leaves before, and the switcher only after it has said so."""
+        ended = {child.plan.name for child in self.children if child.ended_well}
+        rest = {child.plan.name for child in self.children} - ended
+        if all(child.plan.name != SWITCHER for child in self.children):  # it is on another host
+            return bool(ended)
+        return SWITCHER in ended or (bool(ended) and rest == {SWITCHER})
+
+    @property
+    def awaited(self) -> list[Child]:
+        """Running children that have something to do; one that was restarted after the end has not."""
+        return [child for child in self.running if child.number == 1 or not self.over]
+
+    @property
+    def failures(self) -> list[Child]:
+        """Children that failed; after the end of the run, only the recorder can still fail."""
+        failed = [child for child in self.children if child.failure]
+        if failed and self.over:
+            return [child for child in failed if child.plan.name == RECORDER]
+        return failed
+
+    def stop(self) -> None:
+        """End all: first the agents and the switcher, so that the recorder gets all that they sent."""
+        self._end([child for child in self.children if child.plan.name != RECORDER])
+        self._end([child for child in self.children if child.plan.name == RECORDER])
+
+    @staticmethod
+    def _end(children: Sequence[Child]) -> None:
+        for number, patience in ESCALATION:
+            for child in children:
+                if child.running:
+                    child.process.send_signal(number)
+            deadline = time.monotonic() + patience
+            while any(child.running for child in children):
+                if time.monotonic() > deadline:
+                    break
+                time.sleep(POLL)
+            else:
+                return
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        for descriptor in (*self._lifeline, *self._status):
+            with contextlib.suppress(OSError):
+                os.close(descriptor)

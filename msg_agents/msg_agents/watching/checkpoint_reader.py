@@ -1,0 +1,89 @@
+"""Reads the states of a running network from the checkpoint files of its agents.
+
+Nothing is sent and nothing waits: the network pays only for the CPU time of the reader.
+"""
+
+from __future__ import annotations
+
+import mmap
+from pathlib import Path
+
+import numpy as np
+
+from msg_agents.processes.process_plan import agent_name
+from msg_agents.recovery.checkpoint import MARK, longest_heard, room_for
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
+from msg_analysis.wire.messages import STATE_MODE, StateFrame
+
+BLOCK = 2000
+"""Steps that are taken at once: limits the memory that a large network needs."""
+
+
+class Tap:
+    """Reads whole steps from the checkpoints of the agents, each at most once, in order."""
+
+    def __init__(self, record: RunRecord, directory: Path) -> None:
+        experiment = record.experiment
+        self._directory, self._agents, self._width = directory, experiment.agents, experiment.width
+        size = StateFrame(record.run.bytes, experiment.width, longest_heard(record)).size
+        self._total, self._slot = room_for(size), size + MARK.size
+        self._size, self._capacity = size, self._total // self._slot
+        self._rings: list[AnyArray] = []  # (capacity, slot) bytes of each agent
+        self._next = 0
+        self.missed = 0  # steps that were overwritten before or while they were read
+
+    def ready(self) -> bool:
+        """Whether every agent has its checkpoint; opens them when they are there."""
+        if not self._rings:
+            paths = [self._directory / f"{agent_name(agent)}.states" for agent in range(self._agents)]
+            if not all(path.exists() and path.stat().st_size == self._total for path in paths):
+                return False
+            self._rings = [self._open(path) for path in paths]
+        return True
+
+    def _open(self, path: Path) -> AnyArray:
+        with path.open("rb") as file:
+            ring = np.frombuffer(mmap.mmap(file.fileno(), self._total, access=mmap.ACCESS_READ), np.uint8)
+        return ring.reshape(self._capacity, self._slot)
+
+    def take(self, reached: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        """The next steps that all agents have made, at most ``BLOCK``; ``reached``: newest state of all agents.
+
+        Returns steps k (b,), modes from 0 of k -> k+1 (b,), x(k) (b, m, width), x(k+1) (b, m, width). Modes are those
+        of the first agent; in real time others may have used another graph.
+        """
+        oldest = max(reached - self._capacity // 2, 0)  # older ones may be overwritten while they are read
+        if self._next < oldest:
+            self.missed += oldest - self._next
+            self._next = oldest
+        last = min(reached, self._next + BLOCK)
+        count = max(last - self._next, 0)
+        if not count:
+            none = np.empty(0, np.int64)
+            return none, none, np.empty((0, self._agents, self._width)), np.empty((0, self._agents, self._width))
+        steps = np.arange(self._next, last + 1)
+        states, modes = np.empty((count + 1, self._agents, self._width)), np.empty(0, np.int64)
+        there: BoolArray = np.ones(count + 1, dtype=bool)
+        for agent, ring in enumerate(self._rings):
+            states[:, agent], said, whole = self._read(ring, steps)
+            modes = said if agent == 0 else modes
+            there &= whole
+        self._next = last
+        good = there[:-1] & there[1:] & (modes[1:] >= 1)
+        self.missed += int((~good).sum())
+        return steps[:-1][good], modes[1:][good] - 1, states[:-1][good], states[1:][good]
+
+    def _read(self, ring: AnyArray, steps: IntArray) -> tuple[FloatArray, IntArray, BoolArray]:
+        """States (b, width), modes from 1 (b,), and whether the slots still held these steps (b,)."""
+        slots = steps % self._capacity
+        data = ring[slots]
+        marks = np.ascontiguousarray(data[:, self._size :]).view("<u8")
+        again = np.ascontiguousarray(ring[slots, self._size :]).view("<u8")
+        whole = (marks[:, 1] == steps + 1) & (again[:, 1] == steps + 1)
+        lengths = np.where(whole, marks[:, 0], self._size).astype(np.int64)
+        # The state ends the message, whose length depends on what was heard.
+        columns = lengths[:, None] - 8 * self._width + np.arange(8 * self._width)
+        states = np.take_along_axis(data, columns, axis=1).view("<f8")
+        modes = np.ascontiguousarray(data[:, STATE_MODE : STATE_MODE + 4]).view("<u4")[:, 0]
+        return states, modes.astype(np.int64), whole

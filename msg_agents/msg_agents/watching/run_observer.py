@@ -1,0 +1,77 @@
+"""Errors of a run while it goes on, from the states that its agents keep, in a thread of low priority."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from msg_agents.watching.checkpoint_reader import Tap
+from msg_analysis.errors import InputError
+from msg_analysis.model.run.record import RunRecord
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.online.running_errors import LiveEstimate, LiveReport
+
+PERIOD = 0.5  # s between two updates
+FAREWELL = 2.0  # s for the states that are left when the run ends
+NICE = 10  # of the thread: on a busy machine the network goes first
+MOST_NODES = 20
+"""Up to this many agents, each gets a standard error; for more it would cost the network too much CPU time."""
+
+
+class Observer:
+    """Estimates the errors of a run; ``checkpoints``: directory in which its agents keep their states.
+
+    Its thread sets ``report`` (the newest numbers; None before the first) and ``note`` (why there are none).
+    """
+
+    def __init__(self, record: RunRecord, checkpoints: Path) -> None:
+        self.report: LiveReport | None = None
+        self.note: str | None = None
+        self._record, self._tap = record, Tap(record, checkpoints)
+        self._reached = -1
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="observer", daemon=True)
+        self._thread.start()
+
+    def look(self, reached: int) -> None:
+        """Set the newest step that all agents have published (-1: none)."""
+        self._reached = reached
+
+    def end(self) -> None:
+        """Process what is there by now, for about ``FAREWELL`` s at most, and stop; the last report stays."""
+        self._over.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        from threadpoolctl import threadpool_limits
+
+        from msg_analysis.inference.online.running_errors import (
+            LiveEstimate,  # takes long to import, while the network starts
+        )
+
+        with suppress(OSError, AttributeError):  # on Linux each thread has its own priority
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+        try:
+            with threadpool_limits(1):
+                estimate = LiveEstimate(self._record, nodes=self._record.experiment.agents <= MOST_NODES)
+                while not self._over.wait(PERIOD):
+                    self._follow(estimate, math.inf)
+                self._follow(estimate, time.monotonic() + FAREWELL)
+        except InputError as error:
+            self.note = str(error)
+
+    def _follow(self, estimate: LiveEstimate, deadline: float) -> None:
+        if not self._tap.ready():
+            return
+        while time.monotonic() < deadline and not (deadline == math.inf and self._over.is_set()):
+            found = self._tap.take(self._reached)
+            if not len(found[0]):
+                break
+            estimate.add_whole(*found)
+        self.report = estimate.report()

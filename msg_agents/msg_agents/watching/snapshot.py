@@ -1,0 +1,150 @@
+"""A snapshot of a run, for a terminal or a browser."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from msg_analysis.model.run.graph_path import Sojourn, sojourns
+from msg_analysis.model.step.step_model import first_graph
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.online.running_errors import LiveReport
+    from msg_analysis.model.experiment.experiment import Experiment
+
+WINDOW = 3.0  # s over which speeds are measured
+GRAIN = 0.25  # s; least time between two measurements
+
+
+class Speeds:
+    """Steps per second of every agent over the last ``WINDOW`` seconds."""
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, list[int]]] = deque()
+
+    def add(self, steps: Sequence[int]) -> None:
+        """Take the newest step of every agent, by index."""
+        now = time.monotonic()
+        if self._seen and now - self._seen[-1][0] < GRAIN:
+            return
+        self._seen.append((now, list(steps)))
+        while len(self._seen) > 2 and now - self._seen[1][0] > WINDOW:
+            self._seen.popleft()
+
+    def rates(self) -> list[float]:
+        """Steps per second of every agent; empty before the second measurement."""
+        if len(self._seen) < 2:
+            return []
+        (then, before), (now, after) = self._seen[0], self._seen[-1]
+        return [(b - a) / (now - then) for a, b in zip(before, after, strict=True)]
+
+
+class Path:
+    """The sojourns of a run in order, to find that of a step."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._rest: Iterator[Sojourn] = sojourns(experiment, first_graph(experiment))
+        self._now = next(self._rest, None)
+
+    def at(self, step: int) -> Sojourn | None:
+        """The sojourn of the step k -> k+1; steps must not decrease from call to call."""
+        while self._now is not None and step > self._now.last_step:
+            following = next(self._rest, None)
+            if following is None:  # the end of the run
+                break
+            self._now = following
+        return self._now
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """The state of a run at one time."""
+
+    steps: list[int]  # newest step of every agent, -1: none; empty before the start
+    rates: list[float] = field(default_factory=list)  # steps per second of every agent; empty where not known
+    sojourn: Sojourn | None = None  # of the slowest agent's next step; None before the start
+    seconds: float = 0.0  # s since all agents were first seen to have a state
+    left: float | None = None  # s until the end at the speed of the slowest agent; None where not known
+    report: LiveReport | None = None  # the errors up to now
+    note: str | None = None  # about the errors
+
+    @property
+    def reached(self) -> int:
+        """The step that every agent has reached; -1: none."""
+        return min(self.steps, default=-1)
+
+    @property
+    def rate(self) -> float:
+        """Steps per second of the slowest agent."""
+        return min(self.rates, default=0.0)
+
+
+class Clockwork:
+    """Makes moments from the steps that the agents have reached."""
+
+    def __init__(self, experiment: Experiment) -> None:
+        self._steps = experiment.steps
+        self._path, self._speeds = Path(experiment), Speeds()
+        self._began: float | None = None
+
+    def moment(self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None) -> Moment:
+        """The moment now, from the newest step of every agent (-1: none; empty before the start)."""
+        reached = min(steps, default=-1)
+        if reached < 0:
+            return Moment(list(steps), note=note)
+        self._began = self._began or time.monotonic()
+        self._speeds.add(steps)
+        rates = self._speeds.rates()
+        rate = min(rates, default=0.0)
+        left = (self._steps - reached) / rate if rate > 0 else None
+        sojourn = self._path.at(min(reached, self._steps - 1))
+        return Moment(list(steps), rates, sojourn, time.monotonic() - self._began, left, report, note)
+
+
+def setting(experiment: Experiment) -> dict[str, Any]:
+    """What does not change in a run, for a page that draws it: agents, graphs, positions."""
+    from msg_analysis.report.figures.agent_places import places
+
+    where = places(experiment.graph_list)
+    return {
+        "name": experiment.name,
+        "problem": experiment.problem,
+        "agents": experiment.agents,
+        "steps": experiment.steps,
+        "dt": experiment.step_length,
+        "pace": experiment.run.pace,
+        "leaders": list(experiment.leaders.agents) if experiment.leaders else [],
+        "reference": experiment.reference if experiment.leaders else None,
+        "graphs": [
+            {
+                "name": graph.name,
+                "directed": not graph.symmetric,
+                "links": [[a - 1, b - 1] for a, b, _ in (graph.edges if graph.symmetric else graph.arcs)],
+            }
+            for graph in experiment.graph_list
+        ],
+        "places": [[float(x) for x in where[agent]] for agent in range(experiment.agents)],
+    }
+
+
+def moment_document(moment: Moment) -> dict[str, Any]:
+    """A moment for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1."""
+    report, sojourn = moment.report, moment.sojourn
+    latest = report.latest if report else None
+    return {
+        "steps": moment.steps,
+        "reached": moment.reached,
+        "rate": moment.rate,
+        "seconds": moment.seconds,
+        "left": moment.left,
+        "graph": None if sojourn is None else sojourn.mode,
+        "sojourn": None if sojourn is None else [sojourn.sequence + 1, sojourn.first_step, sojourn.last_step],
+        "system": report.system.to_json() if report else None,
+        "nodes": [node.to_json() for node in report.nodes] if report else None,
+        "values": None if latest is None else latest[2].tolist(),
+        "values_step": None if latest is None else latest[0],
+        "note": moment.note or (report.note if report else None),
+    }

@@ -1,0 +1,231 @@
+"""A small page on which browsers follow a run: one HTML file, and server-sent events.
+
+Each browser has a thread of its own, which sends what is newest whenever the browser is ready. A slow or lost browser
+delays nothing; it misses what it is too slow for.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import socket
+import threading
+import time
+from collections import deque
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from types import TracebackType
+from typing import Any, Self
+
+from msg_analysis.common.json_numbers import finite
+from msg_analysis.errors import InputError
+
+MOST_BROWSERS = 32
+HISTORY = 600
+"""Points of the running error that a browser gets when it connects."""
+SEND_TIMEOUT = 10.0  # s for a browser to take what it is sent
+ALIVE = 5.0  # s after which a comment is sent if there is nothing new, to detect lost browsers
+FAREWELL = 1.5  # s for telling the browsers of the end
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+class Web:
+    """Serves the page at ``address`` from when it is made until ``close``; port 0: any free one.
+
+    Its methods may be called from any thread. InputError: the port is taken, or the address is not one of this machine.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._changed = threading.Condition()
+        self._number = 0  # of the newest change
+        self._setting: dict[str, Any] | None = None
+        self._moment: dict[str, Any] | None = None
+        self._ending: dict[str, Any] | None = None
+        self._history: deque[list[float | None]] = deque(maxlen=HISTORY)
+        self._browsers = 0
+        try:
+            family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+            self._server = _Server(self, host, port, family)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise InputError(
+                f"--web: cannot serve at {host}, port {port} ({reason}): give another port (--web 0: any that is "
+                "free), or another --web-host"
+            ) from error
+        shown = f"[{host}]" if ":" in host else host
+        self.address = f"http://{shown}:{self._server.server_address[1]}/"
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), name="web", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def begin(self, setting: dict[str, Any]) -> None:
+        """Show a run, given by ``moment.setting``."""
+        with self._changed:
+            self._setting = finite(setting)
+            self._tell()
+
+    def show(self, moment: dict[str, Any]) -> None:
+        """Show the current state of the run, given by ``moment.moment_document``."""
+        system = moment["system"] or {}
+        with self._changed:
+            self._moment = finite(moment)
+            if system.get("measured") is not None and (
+                not self._history or self._history[-1][0] != moment["values_step"]
+            ):
+                keys = ("measured", "predicted", "standard_error")
+                self._history.append(finite([moment["values_step"], *(system[key] for key in keys)]))
+            self._tell()
+
+    def end(self, words: dict[str, Any]) -> None:
+        """Show that the run is over (first call only): ``words`` are "text", and "verdict" or None."""
+        with self._changed:
+            self._ending = self._ending or finite(words)
+            self._tell()
+
+    def close(self) -> None:
+        """Tell the browsers that the run is over, for ``FAREWELL`` s at most, and stop serving."""
+        self.end({"text": "The run has ended.", "verdict": None})
+        deadline = time.monotonic() + FAREWELL
+        with self._changed:
+            while self._browsers and (left := deadline - time.monotonic()) > 0:
+                self._changed.wait(left)
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def _tell(self) -> None:
+        self._number += 1
+        self._changed.notify_all()
+
+    def follow(self, handler: _Handler) -> None:
+        """Send one browser what is newest until the end or until it has gone; runs in that browser's thread."""
+        with self._changed:
+            if self._browsers >= MOST_BROWSERS:
+                handler.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_BROWSERS} browsers are watching already")
+                return
+            self._browsers += 1
+        try:
+            handler.start_events()
+            told, number = set[str](), -1
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._number != number, ALIVE)  # noqa: B023  called here and now
+                    number = self._number
+                    events = self._events(told)
+                if not handler.send_events(events) or "end" in told:
+                    return
+        finally:
+            with self._changed:
+                self._browsers -= 1
+                self._changed.notify_all()
+
+    def _events(self, told: set[str]) -> list[tuple[str, Any]]:
+        events: list[tuple[str, Any]] = []
+        if self._setting is not None and "setting" not in told:
+            told.add("setting")
+            events += [("setting", self._setting), ("history", list(self._history))]
+        if self._moment is not None and "setting" in told:
+            events.append(("moment", self._moment))
+        if self._ending is not None:
+            told.add("end")
+            events.append(("end", self._ending))
+        return events
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    allow_reuse_address = True
+    request_queue_size = 64
+
+    def __init__(self, web: Web, host: str, port: int, family: socket.AddressFamily) -> None:
+        self.address_family = family
+        self.web = web
+        page = resources.files("msg_agents.watching") / "pages" / "live.html"
+        self.page = page.read_bytes()
+        self.names: set[str] | None = None  # allowed in the Host header; None: any
+        super().__init__((host, port), _Handler)
+        address = ipaddress.ip_address(str(self.server_address[0]))
+        if address.is_loopback:
+            self.names = {"localhost", "127.0.0.1", "[::1]", host.lower()}
+
+    def server_bind(self) -> None:
+        """Bind without a look-up of our own name, which may take long or need a network."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.socket.bind(self.server_address)
+        self.server_address = self.socket.getsockname()
+        self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore browsers that disconnect."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    timeout = SEND_TIMEOUT
+    server_version, sys_version = "msg_agents", ""
+
+    def do_GET(self) -> None:
+        """Serve the page or the events."""
+        path = self.path.partition("?")[0]
+        # DNS rebinding: a foreign page whose name has been made to point here must not read this one.
+        name = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+        if self.server.names is not None and name.lower() not in self.server.names:
+            self.refuse(HTTPStatus.FORBIDDEN, "this page is served under the name of this machine only")
+        elif path == "/":
+            self._send(HTTPStatus.OK, self.server.page, "text/html; charset=utf-8")
+        elif path == "/events":
+            self.server.web.follow(self)
+        elif path == "/favicon.ico":
+            self._send(HTTPStatus.NO_CONTENT, b"", "image/x-icon")
+        else:
+            self.refuse(HTTPStatus.NOT_FOUND, "there is / and /events")
+
+    def refuse(self, status: HTTPStatus, words: str) -> None:
+        """Answer with an error and its reason."""
+        self._send(status, f"{words}\n".encode(), "text/plain; charset=utf-8")
+
+    def start_events(self) -> None:
+        """Send the head of a stream of events."""
+        self.close_connection = True
+        self._head(HTTPStatus.OK, "text/event-stream; charset=utf-8")
+        self.end_headers()
+
+    def send_events(self, events: list[tuple[str, Any]]) -> bool:
+        """Send events, or a comment if there are none; False if the browser did not take them."""
+        text = "".join(f"event: {name}\ndata: {json.dumps(data)}\n\n" for name, data in events) or ": still here\n\n"
+        try:
+            self.wfile.write(text.encode())
+            self.wfile.flush()
+        except OSError:  # the browser has gone, or is too slow
+            return False
+        return True
+
+    def _send(self, status: HTTPStatus, body: bytes, kind: str) -> None:
+        self._head(status, kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def _head(self, status: HTTPStatus, kind: str) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        for header, value in HEADERS.items():
+            self.send_header(header, value)
+
+    def log_message(self, *_: Any) -> None:
+        """Log nothing: stderr is for the run."""

@@ -1,0 +1,284 @@
+"""The command line: what goes to stdout, what to stderr, and the exit codes; the same in a process of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import uuid
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+pytest.importorskip("rclpy")
+
+from msg_agents.cli.main import main
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.simulate import new_record, simulate
+
+PROGRAM = Path(sys.executable).with_name("msg-agents")
+COMMANDS = ["agent", "check", "prepare", "recorder", "run", "switcher"]
+
+
+def document(**run: Any) -> dict[str, Any]:
+    return {
+        "name": "small",
+        "problem": "consensus",
+        "time": "continuous",
+        "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
+        "switching": {"generator": [[-1, 1], [1, -1]]},
+        "run": {"dt": 0.05, "duration": 5, "seed": 5, **run},
+    }
+
+
+def call(*arguments: str | Path, directory: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The command in this process, which takes a hundredth of the time."""
+    words = [str(argument) for argument in arguments]
+    with contextlib.chdir(directory or Path.cwd()):
+        result = CliRunner(env={"NO_COLOR": "1"}).invoke(main, words, prog_name="msg-agents", catch_exceptions=False)
+    return subprocess.CompletedProcess(words, result.exit_code, result.stdout, result.stderr)
+
+
+def execute(*arguments: str | Path, directory: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """As a user does."""
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1"}
+    command = [str(PROGRAM), *(str(argument) for argument in arguments)]
+    return subprocess.run(command, env=environment, cwd=directory, capture_output=True, text=True, timeout=60)
+
+
+def refused(process: subprocess.CompletedProcess[str], *words: str) -> None:
+    """Exit code 2, one error that names what is wrong, nothing on stdout, no traceback."""
+    assert process.returncode == 2, process
+    assert process.stdout == ""
+    assert "Traceback" not in process.stderr
+    errors = [line for line in process.stderr.splitlines() if line.lower().startswith("error:")]
+    assert len(errors) == 1, process.stderr
+    for word in words:
+        assert word in process.stderr
+
+
+@pytest.fixture
+def experiment(tmp_path: Path) -> Path:
+    file = tmp_path / "small.yaml"
+    file.write_text(yaml.safe_dump(document()))
+    return file
+
+
+@pytest.fixture
+def run_file(tmp_path: Path) -> Path:
+    file = tmp_path / "run.json"
+    file.write_text(new_record(Experiment.parse(document())).to_json())
+    return file
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "words"),
+    [
+        ({"run": {"pace": "realtime"}, "noise": {"link": 0.1}}, [], ["noise.link: 0.1", "real time", "lockstep"]),
+        ({"noise": {"delay": 2}}, [], ["noise.delay", "2"]),
+        ({"run": {"dt": 0.3, "duration": 5}}, [], ["run.duration"]),
+        ({"unknown": 1}, [], ["unknown"]),
+        (
+            {"agents": 100, "run": {"dt": 0.01, "start": "zero", "processes": "one_per_agent"}},
+            [],
+            ["run.processes", "at most 90"],
+        ),
+        ({"noise": {"loss": 0.1}}, ["--pace", "realtime"], ["noise.loss: 0.1", "real time"]),
+        ({"noise": {"delay": 1}}, ["--pace", "realtime"], ["noise.delay: 1"]),
+        ({}, ["--pace", "realtime", "--speed", "0"], ["run.speed: 0", "> 0"]),
+        ({}, ["--pace", "fast"], ["run.pace", "fast"]),
+        ({}, ["--processes", "many"], ["run.processes", "many"]),
+        ({}, ["--processes", "0"], ["run.processes"]),
+        ({}, ["--seed", "-1"], ["run.seed", "-1"]),
+        ({}, ["--duration", "-5"], ["run.duration"]),
+        ({}, ["--duration", "nan"], ["run.duration"]),
+        ({}, ["--duration", "0.07"], ["run.duration"]),
+        ({}, ["--domain", "500"], ["--domain", "500"]),
+        ({}, ["--seed", "many"], ["--seed"]),
+    ],
+    ids=lambda value: json.dumps(value) if isinstance(value, dict) else " ".join(value),
+)
+def test_experiments_that_cannot_be_run(
+    tmp_path: Path, changes: dict[str, Any], options: list[str], words: list[str]
+) -> None:
+    content = document()
+    for key, value in changes.items():
+        content[key] = {**content.get(key, {}), **value} if isinstance(value, dict) else value
+    if content.get("agents"):
+        content["graphs"] = {"star": {"star": {"center": 1}}, "all": {"complete": True}}
+    file = tmp_path / "bad.yaml"
+    file.write_text(yaml.safe_dump(content))
+    refused(call("run", file, "--out", tmp_path / "runs", *options), *words)
+    assert not (tmp_path / "runs").exists()  # nothing half-done
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    refused(execute("run", tmp_path / "nowhere.yaml"), "nowhere.yaml")
+    refused(call("run", tmp_path), str(tmp_path))
+    (tmp_path / "binary").write_bytes(bytes(range(256)))
+    refused(call("run", tmp_path / "binary"), "binary")
+
+
+def test_out_is_not_a_directory(experiment: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    refused(call("run", experiment, "--out", tmp_path / "file"), str(tmp_path / "file"))
+    refused(call("run", experiment, "--out", tmp_path / "file" / "below"), str(tmp_path / "file"))
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_out_is_not_writable(experiment: Path) -> None:
+    """Even root writes nothing below /proc."""
+    refused(call("run", experiment, "--out", "/proc/runs"), "/proc/runs")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["not a run record"]),
+        ("[]", ["not a run record"]),
+        ("{}", ["not a run record", "format"]),
+        ('{"format": 99}', ["99", "expected 1"]),
+        ("\x00", ["not a run record"]),
+    ],
+)
+def test_malformed_run_record(tmp_path: Path, text: str, words: list[str]) -> None:
+    (tmp_path / "run.json").write_text(text)
+    refused(call("agent", "run.json", "--agent", "1", directory=tmp_path), "run.json", *words)
+
+
+@pytest.mark.parametrize("command", [["switcher"], ["recorder", "--out", "bag"]], ids=" ".join)
+def test_no_run_record(tmp_path: Path, command: list[str]) -> None:
+    refused(call(command[0], "run.json", *command[1:], directory=tmp_path), "run.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"run": "not-a-uuid"}, "UUID"),
+        ({"start": [[1.0], [2.0]]}, "shape (2, 1), expected finite numbers of shape (3, 1)"),
+        ({"start": [[1.0], [2.0], [float("nan")]]}, "finite"),
+        ({"start": [[1.0], [2.0], [3.0, 4.0]]}, "run.json"),
+        ({"experiment": {}}, "name"),
+        ({"versions": None}, "run.json"),
+    ],
+    ids=str,
+)
+def test_damaged_run_record(tmp_path: Path, run_file: Path, change: dict[str, Any], word: str) -> None:
+    run_file.write_text(json.dumps(json.loads(run_file.read_text()) | change))
+    refused(call("agent", run_file, "--agent", "1"), "run.json", word)
+
+
+@pytest.mark.parametrize("value", ["232", "lab", "-1", "1.5"])
+@pytest.mark.parametrize("command", [["live"], ["switcher", "run.json"]], ids=" ".join)
+def test_no_domain(run_file: Path, command: list[str], value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """232 is the last that ROS knows, with ports for half of a large run; the middleware fails without saying why."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", value)
+    refused(call(*command, directory=run_file.parent), f"ROS_DOMAIN_ID: {value}: expected a number from 0 to 231")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        (["4"], ["--agent: 4", "1 to 3"]),
+        (["0"], ["--agent: 0"]),
+        (["-1"], ["--agent: -1"]),
+        (["1", "2", "1"], ["each agent once"]),
+        (["one"], ["--agent", "one"]),
+        ([], ["--agent"]),
+    ],
+)
+def test_unknown_agents(run_file: Path, numbers: list[str], words: list[str]) -> None:
+    options = [part for number in numbers for part in ("--agent", number)]
+    refused(call("agent", run_file, *options), *words)
+
+
+def test_the_recorder_never_overwrites(tmp_path: Path, run_file: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "mine").write_text("mine")
+    refused(execute("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
+    assert [file.name for file in (tmp_path / "bag").iterdir()] == ["mine"]
+
+
+def test_check(tmp_path: Path) -> None:
+    twin = simulate(Experiment.parse(document()))
+    write_trajectory(twin, tmp_path / "runs" / "good")
+    process = call("check", directory=tmp_path)  # finds the newest one below ./runs
+    assert (process.returncode, process.stderr) == (0, "")
+    assert "equal to the twin to the last bit: 303 states" in process.stdout
+
+    states = twin.states.copy()
+    states[40, 1] += 1e-12
+    write_trajectory(dataclasses.replace(twin, states=states), tmp_path / "bad")
+    process = call("check", tmp_path / "bad")
+    assert process.returncode == 1
+    assert "first: agent 2 at step 40" in process.stdout
+    process = execute("check", tmp_path / "bad", "--json")
+    assert process.returncode == 1
+    found = json.loads(process.stdout)
+    assert (found["equal"], found["compared"], found["missing"]) == (False, 303, 0)
+
+    states[50:] = np.nan
+    write_trajectory(dataclasses.replace(twin, states=states), tmp_path / "wrong_and_torn")
+    assert call("check", tmp_path / "wrong_and_torn").returncode == 1
+    states[40, 1] = twin.states[40, 1]
+    write_trajectory(dataclasses.replace(twin, states=states), tmp_path / "torn")
+    process = call("check", tmp_path / "torn")
+    assert process.returncode == 3
+    assert "150 states, 153 missing" in process.stdout
+
+
+def test_check_without_a_bag(tmp_path: Path) -> None:
+    refused(call("check", directory=tmp_path), "runs")
+    refused(call("check", tmp_path / "nowhere"), "nowhere")
+    refused(call("check", tmp_path), str(tmp_path))
+    (tmp_path / "text.mcap").write_text("no bag at all")
+    refused(call("check", tmp_path / "text.mcap"), "text.mcap")
+
+
+def test_prepare(experiment: Path) -> None:
+    process = call("prepare", experiment)
+    assert (process.returncode, process.stderr) == (0, "")
+    record = json.loads(process.stdout)
+    assert uuid.UUID(record["run"]).version == 4
+    assert Experiment.parse(record["experiment"]) == Experiment.parse(document())
+    assert np.array_equal(record["start"], simulate(Experiment.parse(document())).states[0])
+
+
+def test_help_and_version() -> None:
+    process = execute("--help")
+    assert process.returncode == 0
+    for command in COMMANDS:
+        assert command in process.stdout
+    assert "Examples:" in execute("run", "--help").stdout
+    assert execute("--version").stdout.startswith("msg-agents, version ")
+    refused(execute("fly"), "fly")
+
+
+@pytest.mark.integration
+def test_json_is_one_object_and_nothing_else(experiment: Path, tmp_path: Path) -> None:
+    process = execute("run", experiment, "--out", tmp_path / "runs", "--processes", "1", "--json")
+    assert process.returncode == 0, process.stderr
+    result = json.loads(process.stdout)
+    assert process.stdout.count("\n") == 1
+    assert (result["verdict"], result["failures"]) == ("agrees", [])
+    assert json.loads((Path(result["bag"]) / "result.json").read_text()) == result
+    assert Path(result["report"]).read_text(encoding="utf-8").startswith("<!")
+
+
+@pytest.mark.integration
+def test_run_without_recording(experiment: Path, tmp_path: Path) -> None:
+    process = execute("run", experiment, "--no-record", "--processes", "1", "--json", directory=tmp_path)
+    assert process.returncode == 0, process.stderr
+    result = json.loads(process.stdout)
+    assert result["bag"] is None
+    assert result["failures"] == []
+    assert [file.name for file in tmp_path.iterdir()] == ["small.yaml"]

@@ -1,0 +1,84 @@
+"""The Foxglove layout shows what our messages have."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from msg_agents_interfaces.msg import ActiveGraph, AgentState, Estimate
+from visualization_msgs.msg import MarkerArray
+
+from msg_agents.nodes.diagnostics import DIAGNOSTICS_TOPIC
+from msg_agents.nodes.network_node import GRAPH_TOPIC, state_topic
+from msg_agents.nodes.watching.live import ESTIMATE_TOPIC
+from msg_agents.nodes.watching.markers import MARKERS_TOPIC
+
+LAYOUT = Path(__file__).parents[3] / "ros_ws/src/msg_agents_bringup/foxglove/five_agents.json"
+TOPICS: dict[str, Any] = {
+    **{f"/{state_topic(agent)}": AgentState for agent in range(5)},
+    f"/{GRAPH_TOPIC}": ActiveGraph,
+    f"/{ESTIMATE_TOPIC}": Estimate,
+    f"/{MARKERS_TOPIC}": MarkerArray,
+    DIAGNOSTICS_TOPIC: DiagnosticArray,
+}
+
+
+def field_type(message: Any, path: str) -> str:
+    """The ROS type at the end of a path of fields; KeyError if there is none."""
+    name, _, rest = path.partition(".")
+    found = re.fullmatch(r"(\w+)(\[\d+\])?", name)
+    assert found, path
+    kind = message.get_fields_and_field_types()[found[1]]
+    if found[2]:
+        inner = re.fullmatch(r"sequence<(.*)>|(.*)\[\d+\]", kind)
+        assert inner, f"{path}: {kind} has no elements"
+        kind = inner[1] or inner[2]
+    if not rest:
+        return kind
+    package, _, name = kind.partition("/")
+    return field_type(getattr(importlib.import_module(f"{package}.msg"), name), rest)
+
+
+def panels(node: Any) -> Iterator[str]:
+    if isinstance(node, str):
+        yield node
+    else:
+        yield from panels(node["first"])
+        yield from panels(node["second"])
+
+
+def test_every_panel_is_placed_once() -> None:
+    layout = json.loads(LAYOUT.read_text())
+    assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
+
+
+def test_every_path_is_a_number_in_one_of_our_messages() -> None:
+    layout = json.loads(LAYOUT.read_text())
+    paths = [path for panel in layout["configById"].values() for path in panel.get("paths", [])]
+    assert len(paths) == 5 + 3 + 1
+    for path in paths:
+        topic, _, fields = path["value"].partition(".")
+        assert field_type(TOPICS[topic], fields) in {"double", "uint32", "uint64"}, path
+        assert path["timestampMethod"] == "headerStamp"
+        assert field_type(TOPICS[topic], "header.stamp") == "builtin_interfaces/Time"
+
+
+def test_every_topic_is_ours() -> None:
+    layout = json.loads(LAYOUT.read_text())["configById"]
+    shown = [*layout["3D!network"]["topics"], layout["DiagnosticSummary!health"]["topicToRender"]]
+    shown.append(layout["RawMessages!graph"]["topicPath"])
+    assert [TOPICS[topic] for topic in shown] == [MarkerArray, DiagnosticArray, ActiveGraph]
+
+
+def test_a_wrong_path_would_be_found() -> None:
+    with pytest.raises(KeyError):
+        field_type(AgentState, "status")

@@ -1,0 +1,134 @@
+"""Domains: taken by a lock, given back by the system, and never where somebody's ports are."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from msg_agents.processes import ros_domain
+from msg_agents.processes.ros_domain import DOMAINS, PORT_BASE, PORTS_PER_DOMAIN, free_domain
+from msg_analysis.errors import InputError
+
+HOLD = """
+from msg_agents.processes import ros_domain as domain
+domain.DOMAINS = range({first}, {end})
+with domain.free_domain() as held:
+    print(held, flush=True)
+    input()
+"""
+
+
+@pytest.fixture(autouse=True)
+def _own_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Locks of our own, so that runs on the same machine neither disturb the tests nor are disturbed."""
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
+
+
+def unused(count: int) -> range:
+    """Domains in a row whose ports nobody uses."""
+    busy = {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in ros_domain._ports_in_use()}
+    return next(
+        range(first, first + count)
+        for first in reversed(DOMAINS)
+        if first + count <= DOMAINS.stop and not busy & set(range(first, first + count))
+    )
+
+
+@contextmanager
+def holder(domains: range, directory: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """Another process that holds a domain."""
+    code = HOLD.format(first=domains.start, end=domains.stop)
+    environment = {**os.environ, "TMPDIR": str(directory)}
+    command = [sys.executable, "-P", "-c", code]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        try:
+            yield process, int(process.stdout.readline())
+        finally:
+            process.kill()
+
+
+def test_holders_get_different_domains(monkeypatch: pytest.MonkeyPatch) -> None:
+    domains = unused(3)
+    monkeypatch.setattr(ros_domain, "DOMAINS", domains)
+    with ExitStack() as stack:
+        assert {stack.enter_context(free_domain()) for _ in domains} == set(domains)
+        with pytest.raises(InputError, match="--domain"), free_domain():
+            pass
+    with free_domain() as again:
+        assert again in domains
+
+
+def test_a_killed_holder_gives_its_domain_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    domains = unused(1)
+    monkeypatch.setattr(ros_domain, "DOMAINS", domains)
+    with holder(domains, tmp_path) as (process, held):
+        assert held == domains[0]
+        with pytest.raises(InputError), free_domain():
+            pass
+        process.kill()
+        process.wait()
+        with free_domain() as mine:
+            assert mine == held
+
+
+@pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])
+def test_a_domain_whose_ports_are_in_use_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch, family: socket.AddressFamily
+) -> None:
+    domains = unused(2)
+    monkeypatch.setattr(ros_domain, "DOMAINS", domains)
+    with socket.socket(family, socket.SOCK_DGRAM) as somebody:
+        try:
+            somebody.bind(("::1" if family == socket.AF_INET6 else "127.0.0.1", _port(domains[0], 11)))
+        except OSError as error:
+            pytest.skip(f"this machine: cannot bind: {error}")
+        for _ in range(4):  # the order is random
+            with free_domain() as chosen:
+                assert chosen == domains[1]
+
+
+def test_the_lock_is_released_when_the_run_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_domain, "DOMAINS", unused(1))
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="the run failed"), free_domain():
+            raise RuntimeError("the run failed")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="run as root: only root can be another user")
+def test_lock_files_of_another_user_do_not_use_up_the_domains(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    shared = Path(tempfile.mkdtemp(dir="/tmp"))  # pytest's own directories are closed to others
+    request.addfinalizer(lambda: shutil.rmtree(shared))
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(shared))
+    monkeypatch.setattr(ros_domain, "DOMAINS", unused(1))
+    shared.chmod(0o1777)  # as /tmp is; Linux guards files of others in such directories
+    with free_domain() as held:
+        pass
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            os.setgid(65534)
+            os.setuid(65534)
+            with free_domain() as chosen:
+                code = 0 if chosen == held else 2
+        finally:
+            os._exit(code)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+
+
+def _port(number: int, offset: int) -> int:
+    return PORT_BASE + PORTS_PER_DOMAIN * number + offset

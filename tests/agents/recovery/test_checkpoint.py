@@ -1,0 +1,98 @@
+"""What an agent has published, kept in a file."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from msg_agents.recovery.checkpoint import LEAST, Checkpoint
+from msg_analysis.errors import InputError
+
+LARGE = 100_000  # bytes of a message, so that the ring has its least length
+
+
+def message(step: int, size: int = LARGE) -> bytes:
+    return step.to_bytes(8, "little") * (size // 8)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 5, LEAST - 1, LEAST, LEAST + 1, 3 * LEAST + 7])
+def test_the_newest_are_kept(tmp_path: Path, steps: int) -> None:
+    written = Checkpoint(tmp_path / "states", LARGE)
+    for step in range(steps):
+        written.write(step, message(step))
+    kept = range(max(0, steps - LEAST + 1), steps)
+    for ring in (written, Checkpoint(tmp_path / "states", LARGE)):
+        assert ring.read() == [(step, message(step)) for step in kept]
+        assert [step for step, _ in ring.read(steps - 3)] == [step for step in kept if step >= steps - 3]
+        assert ring.read(steps) == []
+
+
+def test_messages_of_different_length(tmp_path: Path) -> None:
+    """With lost messages, some list what was heard."""
+    ring = Checkpoint(tmp_path / "states", LARGE)
+    for step in range(LEAST + 5):
+        ring.write(step, message(step, LARGE - 8 * (step % 3)))
+    for again in (ring, Checkpoint(tmp_path / "states", LARGE)):
+        assert all(data == message(step, LARGE - 8 * (step % 3)) for step, data in again.read())
+        assert len(again.read()) == LEAST - 1
+
+
+def test_in_memory() -> None:
+    ring = Checkpoint(None, 24)
+    ring.write(0, message(0, 24))
+    assert ring.read() == [(0, message(0, 24))]
+
+
+def test_another_size_is_another_run(tmp_path: Path) -> None:
+    Checkpoint(tmp_path / "states", 200)
+    with pytest.raises(InputError, match=r"expected .* another run"):
+        Checkpoint(tmp_path / "states", 208)
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from msg_agents.recovery.checkpoint import Checkpoint
+ring = Checkpoint(Path(sys.argv[1]), 8000)
+for step in range(10**9):
+    ring.write(step, step.to_bytes(8, "little") * 1000)
+    if step == 5000:
+        print("under way", flush=True)
+"""
+
+
+def test_killed_in_the_middle_of_it(tmp_path: Path) -> None:
+    """Whenever it happens, what is read is whole and without a gap."""
+    for attempt in range(10):
+        file = tmp_path / f"states_{attempt}"
+        with subprocess.Popen([sys.executable, "-c", WRITER, str(file)], stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            os.kill(process.pid, signal.SIGKILL)
+        found = Checkpoint(file, 8000).read()
+        steps = [step for step, _ in found]
+        assert steps == list(range(steps[0], steps[0] + len(steps)))
+        assert len(steps) > 1000
+        assert all(data == step.to_bytes(8, "little") * 1000 for step, data in found)
+
+
+def test_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Said at once: who writes to a map without room behind it is killed by SIGBUS."""
+
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(InputError, match=r"no room for \d+ bytes \(No space left on device\).*--restarts 0"):
+        Checkpoint(tmp_path / "states", LARGE)
+
+
+def test_whether_somebody_was_there_before(tmp_path: Path) -> None:
+    assert not Checkpoint(None, 100).found
+    assert [Checkpoint(tmp_path / "states", 100).found for _ in range(2)] == [False, True]

@@ -1,0 +1,279 @@
+"""Starting, watching and ending processes."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.process_plan import ProcessPlan
+from msg_agents.processes.ros_domain import free_domain
+from msg_agents.running import supervisor as module
+from msg_agents.running.supervisor import Child, Supervisor
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.simulate import new_record
+
+STUBBORN = """
+import signal, time
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, lambda number, _: print(signal.Signals(number).name, flush=True))
+print("ready", flush=True)
+while True:
+    time.sleep(60)
+"""
+OBEDIENT = """
+import signal, sys
+signal.signal(signal.SIGINT, lambda *_: sys.exit(0))
+print("ready", flush=True)
+signal.pause()
+"""
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Child]]:
+    """Starts a child that is no node, waits until it is up, and sees to it that it goes."""
+    children: list[Child] = []
+
+    def start_child(code: str, name: str = "agent_1") -> Child:
+        log = tmp_path / f"{name}.log"
+        with log.open("wb") as output:
+            process = subprocess.Popen([sys.executable, "-P", "-c", code], stdout=output, stderr=output)
+        child = Child(ProcessPlan(name, ()), process, log)
+        children.append(child)
+        wait_for(lambda: "ready" in log.read_text() or not child.running)
+        return child
+
+    yield start_child
+    for child in children:
+        child.process.kill()
+        child.process.wait()
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same signals with less time to obey them."""
+    stages = [(number, 0.3 if number != signal.SIGKILL else 5.0) for number, _ in module.ESCALATION]
+    assert [number for number, _ in stages] == [signal.SIGINT, signal.SIGTERM, signal.SIGKILL]
+    monkeypatch.setattr(module, "ESCALATION", stages)
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 30.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+
+
+def gone(pid: int) -> bool:
+    """No such process, or only what is left of it in its parent's books."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
+
+
+@pytest.mark.usefixtures("impatient")
+def test_escalation(tmp_path: Path, start: Callable[..., Child]) -> None:
+    child = start(STUBBORN)
+    Supervisor(tmp_path, {}, [child]).stop()
+    assert child.log.read_text().split() == ["ready", "SIGINT", "SIGTERM"]
+    assert child.failure == "killed by SIGKILL"
+    assert not child.running
+
+
+@pytest.mark.usefixtures("impatient")
+def test_leaving_the_context_ends_everybody_whatever_happened(tmp_path: Path, start: Callable[..., Child]) -> None:
+    children = [start(STUBBORN, "agent_1"), start(OBEDIENT, "agent_2"), start(OBEDIENT, "recorder")]
+    with pytest.raises(RuntimeError, match="the runner failed"), Supervisor(tmp_path, {}, children):
+        raise RuntimeError("the runner failed")
+    assert [child.process.poll() for child in children] == [-signal.SIGKILL, 0, 0]
+
+
+@pytest.mark.usefixtures("impatient")
+def test_the_recorder_is_ended_last(tmp_path: Path, start: Callable[..., Child]) -> None:
+    recorder = start(
+        "import signal, sys, time\n"
+        "signal.signal(signal.SIGINT, lambda *_: (print(time.monotonic(), flush=True), sys.exit(0)))\n"
+        "print('ready', flush=True)\nsignal.pause()",
+        "recorder",
+    )
+    agent = start(
+        "import atexit, signal, sys, time\n"
+        "atexit.register(lambda: print(time.monotonic(), flush=True))\n"
+        "signal.signal(signal.SIGINT, lambda *_: (time.sleep(0.1), sys.exit(0)))\n"
+        "print('ready', flush=True)\nsignal.pause()"
+    )
+    Supervisor(tmp_path, {}, [recorder, agent]).stop()
+    told, ended = (float(child.last_words()) for child in (recorder, agent))
+    assert ended < told
+
+
+def test_a_stopped_process_is_ended_too(tmp_path: Path, start: Callable[..., Child], impatient: None) -> None:
+    child = start(OBEDIENT)
+    child.process.send_signal(signal.SIGSTOP)
+    Supervisor(tmp_path, {}, [child]).stop()
+    assert child.failure == "killed by SIGKILL"
+
+
+@pytest.mark.parametrize(
+    ("code", "failure", "words"),
+    [
+        ("print('ready')", None, "ready"),
+        ("import sys; print('ready'); sys.exit('error: no disk')", "exit code 1", "error: no disk"),
+        ("import os; os.kill(os.getpid(), 9)", "killed by SIGKILL", ""),
+        ("import os; os.kill(os.getpid(), 15)", "killed by SIGTERM", ""),
+    ],
+)
+def test_failures_in_words(
+    tmp_path: Path, start: Callable[..., Child], code: str, failure: str | None, words: str
+) -> None:
+    child = start(code)
+    child.process.wait()
+    supervisor = Supervisor(tmp_path, {}, [child])
+    assert child.failure == failure
+    assert supervisor.failures == ([child] if failure else [])
+    assert supervisor.running == []
+    assert child.last_words() == words
+
+
+@pytest.mark.parametrize(
+    ("code", "number", "resumes"),
+    [
+        ("import os; os.kill(os.getpid(), 9)", 1, True),
+        ("import os; os.kill(os.getpid(), 11)", 3, True),
+        ("raise MemoryError", 1, True),
+        ("raise MemoryError", 2, False),  # its own fault, again
+        ("import sys; sys.exit(2)", 1, False),  # bad input
+        ("import sys; sys.exit(3)", 1, False),  # told to stop
+        ("print('done')", 1, False),
+    ],
+)
+def test_which_deaths_are_worth_a_restart(start: Callable[..., Child], code: str, number: int, resumes: bool) -> None:
+    child = start(code)
+    child.process.wait()
+    child.number = number
+    assert not child.resumes  # without a checkpoint, never
+    child.plan = ProcessPlan("agent_1", (), resumes=True)
+    assert child.resumes == resumes
+
+
+@pytest.mark.parametrize("still_there", ["agent_1", "switcher"])
+def test_who_is_killed_after_the_end_has_not_failed(
+    tmp_path: Path, start: Callable[..., Child], still_there: str
+) -> None:
+    names = ["agent_1", "agent_2", "recorder", "switcher"]
+    children = {
+        name: start("import os; os.kill(os.getpid(), 9)" if name == still_there else "", name) for name in names
+    }
+    for child in children.values():
+        child.process.wait()
+    supervisor = Supervisor(tmp_path, {}, list(children.values()))
+    assert supervisor.over
+    assert supervisor.failures == []
+    children["recorder"].process.returncode = -9
+    assert supervisor.over == (still_there == "agent_1")
+    assert children["recorder"] in supervisor.failures
+
+
+def test_status_is_read_in_pieces(tmp_path: Path) -> None:
+    supervisor = Supervisor(tmp_path, {})
+    reading, writing = os.pipe()
+    os.set_blocking(reading, False)
+    supervisor._status = (reading, writing)
+    for piece, steps in [
+        (b"", []),
+        (b"[1, -", []),
+        (b"1]\n[2", [1, -1]),
+        (b", 0]\n[3, 1]\n", [3, 1]),
+        (b"[4, 2]\n", [4, 2]),
+    ]:
+        os.write(writing, piece)
+        supervisor.read_status()
+        assert supervisor.steps == steps
+    os.close(writing)
+    supervisor.read_status()  # the switcher has gone
+    assert supervisor.steps == [4, 2]
+    os.close(reading)
+
+
+@pytest.fixture
+def run_file(tmp_path: Path) -> Path:
+    experiment = Experiment.parse(
+        {
+            "name": "waiting",
+            "problem": "consensus",
+            "time": "continuous",
+            "graphs": {"line": {"path": [1, 2]}},
+            "switching": {"generator": [[0]]},
+            "run": {"dt": 0.05, "duration": 1, "start": "zero"},
+        }
+    )
+    file = tmp_path / "run.json"
+    file.write_text(new_record(experiment).to_json())
+    return file
+
+
+PARENT = """
+import sys, time
+from pathlib import Path
+from msg_agents.processes.process_plan import ProcessPlan
+from msg_agents.processes.environment import node_environment
+from msg_agents.running.supervisor import Supervisor
+directory = Path(sys.argv[1])
+run_file = str(directory / "run.json")
+plans = [
+    ProcessPlan("recorder", ("recorder", run_file, "--out", str(directory / "bag"))),
+    ProcessPlan("agent_1", ("agent", run_file, "--agent", "1")),
+    ProcessPlan("switcher", ("switcher", run_file)),
+]
+with Supervisor(directory, node_environment(int(sys.argv[2]))) as supervisor:
+    supervisor.start(plans)
+    print(*(child.process.pid for child in supervisor.children), flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("early", [True, False], ids=["while they start", "while they wait"])
+def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, run_file: Path, early: bool) -> None:
+    with free_domain() as domain:
+        command = [sys.executable, "-P", "-c", PARENT, str(tmp_path), str(domain)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+            assert parent.stdout is not None
+            pids = [int(word) for word in parent.stdout.readline().split()]
+            assert len(pids) == 3
+            if not early:
+                wait_for(lambda: (tmp_path / "bag").exists())
+                time.sleep(1.0)
+            parent.kill()
+        try:
+            wait_for(lambda: all(gone(pid) for pid in pids), 10.0)
+        finally:
+            for pid in pids:
+                if not gone(pid):
+                    os.kill(pid, signal.SIGKILL)
+
+
+def test_real_nodes_end_in_order_when_told(tmp_path: Path, run_file: Path) -> None:
+    plans = [
+        ProcessPlan("recorder", ("recorder", str(run_file), "--out", str(tmp_path / "bag"))),
+        ProcessPlan("agent_1", ("agent", str(run_file), "--agent", "1")),
+    ]
+    with free_domain() as domain, Supervisor(tmp_path, node_environment(domain)) as supervisor:
+        supervisor.start(plans)
+        wait_for(lambda: (tmp_path / "bag").exists())
+        time.sleep(1.0)
+    # 3: their part was not done; nobody had to be killed, and the recorder has closed its bag.
+    logs = {child.plan.name: child.log.read_text() for child in supervisor.children}
+    assert [child.failure for child in supervisor.children] == ["exit code 3", "exit code 3"], logs
+    assert (tmp_path / "bag" / "metadata.yaml").exists()
+    assert not any(re.search("Traceback", log) for log in logs.values()), logs

@@ -1,0 +1,136 @@
+"""Newest value wins, against a model that remembers everything that it was ever offered."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from msg_agents.stepping.newest_values import NOTHING, Newest
+from msg_agents.stepping.synchronizer import Refusal
+
+STEPS = 40
+INPUTS = [[1, 3], [3], []]
+PEERS = {1, 3, 4}  # 4 hears us, and is not heard
+
+
+class Clock:
+    """How far anybody can be."""
+
+    def __init__(self, reach: int = STEPS) -> None:
+        self.reach = reach
+
+    def __call__(self) -> int:
+        return self.reach
+
+
+def newest(clock: Clock, start: int = 0) -> Newest[Any]:
+    return Newest(agent=0, steps=STEPS, inputs=INPUTS, peers=PEERS, reach=clock, start=start)
+
+
+offers = st.tuples(st.just("offer"), st.integers(0, 5), st.integers(0, STEPS + 5))
+moves = st.one_of(offers, st.tuples(st.just("clock"), st.integers(0, 5)), st.tuples(st.just("step")))
+
+
+@given(st.lists(moves, max_size=60))
+def test_the_newest_that_can_be(script: list[tuple[Any, ...]]) -> None:
+    clock = Clock(0)
+    node = newest(clock)
+    assert node.learn(0, 0, 0, STEPS - 1) is None
+    taken: dict[int, list[int]] = {j: [] for j in PEERS}
+    for kind, *arguments in script:
+        if kind == "clock":
+            clock.reach += arguments[0]
+        elif kind == "step" and not node.finished:
+            node.advance()
+        elif kind == "offer":
+            agent, step = arguments
+            reason = node.offer(agent, step, (agent, step))
+            if agent not in PEERS:
+                assert reason == Refusal.STRANGER
+            elif step <= max(taken[agent], default=-1):
+                assert reason == Refusal.OLD
+            elif step > min(clock.reach, STEPS):
+                assert reason == Refusal.FAR
+            else:
+                assert reason is None
+                taken[agent].append(step)
+        expected = [(max(taken[j]), (j, max(taken[j]))) if taken[j] else (NOTHING, None) for j in INPUTS[0]]
+        assert node.inputs() == (0, expected)
+
+
+@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 2), st.integers(0, STEPS), st.integers(0, STEPS))))
+def test_graphs_come_in_sequence(offered: list[tuple[int, int, int, int]]) -> None:
+    """Whatever else is offered in between, only the one that follows is taken."""
+    node = newest(Clock())
+    path = [(0, 2, 0, 9), (1, 0, 10, 24), (2, 1, 25, STEPS - 1)]
+    for sojourn in path:
+        for other in offered:
+            if other[:3:2] != sojourn[:3:2]:  # neither number nor first step fit
+                assert node.learn(*other) in (Refusal.KNOWN, Refusal.SEQUENCE)
+        assert node.learn(*sojourn) is None
+        assert node.learn(*sojourn) in (Refusal.KNOWN, Refusal.SEQUENCE)
+        mode, inputs = node.inputs()
+        assert mode == sojourn[1]
+        assert inputs == [(NOTHING, None) for _ in INPUTS[mode]]
+
+
+def test_a_sojourn_before_its_time() -> None:
+    """Is not taken; should it have been a genuine one, the path goes on with the next."""
+    clock = Clock(5)
+    node = newest(clock)
+    assert not node.ready()
+    assert node.waiting_for() == "the first graph"
+    assert node.learn(0, 1, 0, 7) is None
+    assert node.ready()
+    assert node.learn(1, 0, 8, 20) == Refusal.EARLY
+    assert node.inputs()[0] == 1
+    clock.reach = 30
+    assert node.learn(0, 1, 0, 7) == Refusal.KNOWN
+    assert node.learn(2, 2, 21, STEPS - 1) is None
+    assert node.inputs()[0] == 2
+
+
+def test_who_takes_over_comes_into_the_middle() -> None:
+    node = newest(Clock(), start=17)
+    assert node.learn(3, 0, 12, 14) is None
+    assert node.learn(4, 1, 15, 22) is None
+    assert node.learn(6, 1, 30, 32) == Refusal.SEQUENCE
+    assert (node.step, node.inputs()) == (17, (1, [(NOTHING, None)]))
+    assert node.offer(3, 16, "a") is None
+    assert node.offer(3, 18, "b") is None
+    assert node.inputs() == (1, [(18, "b")])
+    assert node.behind == {1: 18, 3: -1, 4: 18}
+
+
+def test_what_came_before_anybody_knew_the_time_is_reviewed() -> None:
+    clock = Clock()
+    node = newest(clock, start=3)
+    assert node.learn(2, 2, 35, 39) is None
+    assert node.offer(1, 39, "forged") is None
+    assert node.offer(3, 4, "fine") is None
+    clock.reach = 5
+    node.review()
+    assert not node.ready()
+    assert node.learn(0, 0, 0, 39) is None
+    assert node.inputs() == (0, [(NOTHING, None), (4, "fine")])
+    assert node.offer(1, 5, "fine") is None
+
+
+def test_the_end() -> None:
+    node = newest(Clock(), start=STEPS - 1)
+    assert node.learn(0, 0, 0, STEPS - 1) is None
+    assert node.ready()
+    node.advance()
+    assert node.finished
+    assert not node.ready()
+    assert node.waiting_for() == "nothing, it has finished"
+    assert node.learn(1, 0, STEPS, STEPS) == Refusal.SEQUENCE
+    assert node.offer(1, STEPS + 1, "") == Refusal.FAR
+
+
+def test_inputs_must_be_peers() -> None:
+    with pytest.raises(ValueError, match="agent 0 uses"):
+        Newest(agent=0, steps=STEPS, inputs=[[2]], peers=[1], reach=Clock())

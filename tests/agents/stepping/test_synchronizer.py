@@ -1,0 +1,373 @@
+"""The lockstep against a serial loop: random networks in random orders of delivery, and a small one in every order.
+
+The values are integers that depend on everything which they were made of, in its order, so that a wrong step, a wrong
+agent or a wrong order anywhere changes what comes out at the end.
+"""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import random
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from msg_agents.stepping.synchronizer import AGAIN, WINDOW, Refusal, Synchronizer
+
+PRIME = 2**61 - 1
+Sojourn = tuple[int, int, int, int]  # sequence, mode, first step, last step
+Inputs = list[list[list[int]]]  # [mode][agent]: whom the agent uses
+
+
+@dataclass(frozen=True)
+class Case:
+    """A network without arithmetic."""
+
+    agents: int
+    steps: int
+    window: int
+    inputs: Inputs
+    path: list[Sojourn]
+
+    def peers(self, agent: int) -> set[int]:
+        heard = {j for mode in self.inputs for j in mode[agent]}
+        return heard | {j for mode in self.inputs for j in range(self.agents) if agent in mode[j]}
+
+
+def law(own: int, agent: int, mode: int, heard: list[tuple[int, int]]) -> int:
+    for number in (agent, mode, *(part for pair in heard for part in pair)):
+        own = (own * 1_000_003 + number + 1) % PRIME
+    return own
+
+
+def serial(case: Case) -> list[list[int]]:
+    """[step][agent], computed by one loop that knows everything."""
+    modes = [mode for _, mode, first, last in case.path for _ in range(first, last + 1)]
+    states = [[agent + 1 for agent in range(case.agents)]]
+    for mode in modes:
+        now = states[-1]
+        states.append([law(now[i], i, mode, [(j, now[j]) for j in case.inputs[mode][i]]) for i in range(case.agents)])
+    return states
+
+
+@dataclass
+class Network:
+    """Synchronizers and the FIFO queues between them; what happens next is chosen from outside."""
+
+    case: Case
+    nodes: list[Synchronizer[int]] = field(init=False)
+    states: list[list[int]] = field(init=False)  # [agent][step]
+    links: dict[tuple[int, int], deque[tuple[int, int]]] = field(init=False)
+    graphs: list[deque[Sojourn]] = field(init=False)
+    unheard: set[tuple[int, int]] = field(default_factory=set)  # links over which a new process has not asked yet
+    killed: bool = False
+
+    def __post_init__(self) -> None:
+        case = self.case
+        self.nodes = [self._node(i, 0) for i in range(case.agents)]
+        self.links = {(j, i): deque() for i in range(case.agents) for j in case.peers(i)}
+        self.graphs = [deque(case.path) for _ in range(case.agents)]
+        self.states = [[] for _ in range(case.agents)]
+        for i in range(case.agents):
+            self._publish(i, i + 1)
+
+    def _node(self, agent: int, start: int) -> Synchronizer[int]:
+        case = self.case
+        inputs = [mode[agent] for mode in case.inputs]
+        return Synchronizer(
+            agent=agent, steps=case.steps, inputs=inputs, peers=case.peers(agent), window=case.window, start=start
+        )
+
+    def _publish(self, agent: int, value: int) -> None:
+        for (source, _), queue in self.links.items():
+            if source == agent:
+                queue.append((len(self.states[agent]), value))
+        self.states[agent].append(value)
+
+    def kill(self, agent: int) -> None:
+        """All that is under way to and from it is lost; its next process publishes again what this one has."""
+        self.killed = True
+        self.nodes[agent] = self._node(agent, self.nodes[agent].step)
+        self.graphs[agent] = deque(self.case.path)
+        for source, target in self.links:
+            if source == agent:
+                self.links[source, target] = deque(enumerate(self.states[agent]))
+            elif target == agent:
+                self.links[source, target].clear()
+                self.unheard.add((source, target))
+
+    def events(self) -> list[tuple[str, int, int]]:
+        """Everything that can happen now."""
+        possible = [("state", j, i) for (j, i), queue in self.links.items() if queue]
+        possible += [("graph", i, i) for i, queue in enumerate(self.graphs) if queue]
+        possible += [("again", j, i) for j, i in self.unheard]
+        return possible + [("step", i, i) for i, node in enumerate(self.nodes) if node.ready()]
+
+    def happen(self, event: tuple[str, int, int]) -> None:
+        kind, source, target = event
+        node = self.nodes[target]
+        if kind == "state":
+            refused = node.offer(source, *self.links[source, target].popleft())
+            assert refused in ((None, Refusal.OLD) if self.killed else (None,))
+        elif kind == "graph":
+            refused = node.learn(*self.graphs[target].popleft())
+            assert refused in ((None, Refusal.KNOWN) if self.killed else (None,))
+        elif kind == "again":
+            self.unheard.discard((source, target))
+            first = max(0, node.step - self.case.window - 1)
+            self.links[source, target].extend(list(enumerate(self.states[source]))[first:])
+        else:
+            step = node.step
+            mode, values = node.inputs()
+            used = self.case.inputs[mode][target]
+            assert len(values) == len(used), "uses others than the row of this mode"
+            node.advance()
+            assert node.step == step + 1
+            self._publish(target, law(self.states[target][-1], target, mode, list(zip(used, values, strict=True))))
+        self.check_bounds()
+
+    def check_bounds(self) -> None:
+        window = self.case.window
+        for i, node in enumerate(self.nodes):
+            assert node.buffered <= window + 2
+            assert len(self.states[i]) == node.step + 1
+            for j in self.case.peers(i):
+                assert len(self.states[i]) - len(self.states[j]) <= window + 1
+
+    def check_end(self, expected: list[list[int]]) -> None:
+        texts = [f"agent {i + 1} waits for {node.waiting_for()}" for i, node in enumerate(self.nodes)]
+        assert all(node.finished for node in self.nodes), texts
+        assert [list(row) for row in zip(*self.states, strict=True)] == expected
+
+    def progress(self) -> tuple[int, ...]:
+        """Tells the situation completely: what was sent on a link is a function of its number."""
+        return (
+            *(node.step for node in self.nodes),
+            *(len(queue) for queue in self.links.values()),
+            *(len(queue) for queue in self.graphs),
+        )
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> Case:
+    agents, modes = draw(st.integers(1, 6)), draw(st.integers(1, 3))
+    steps, window = draw(st.integers(1, 25)), draw(st.integers(0, 5))
+    directed, everybody = draw(st.booleans()), range(agents)
+    pairs = [(i, j) for i in everybody for j in everybody if (i != j if directed else i < j)]
+    inputs: Inputs = []
+    for _ in range(modes):
+        # Any set of links will do, the empty one too: the graph may be disconnected, even all of them together.
+        chosen = draw(st.sets(st.sampled_from(pairs))) if pairs else set()
+        arcs = chosen if directed else chosen | {(j, i) for i, j in chosen}
+        inputs.append([sorted(j for i, j in arcs if i == agent) for agent in everybody])
+    ends = sorted(draw(st.sets(st.integers(0, steps - 1), max_size=8)) | {steps - 1})
+    firsts = [0] + [end + 1 for end in ends[:-1]]
+    path = [
+        (n, draw(st.integers(0, modes - 1)), first, last)
+        for n, (first, last) in enumerate(zip(firsts, ends, strict=True))
+    ]
+    return Case(agents, steps, window, inputs, path)
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases(), st.integers(0, 2**32), st.sampled_from([1.0, 0.1, 0.001]))
+def test_any_network_in_any_order_is_the_serial_loop(case: Case, seed: int, slowness: float) -> None:
+    rng = random.Random(seed)
+    network = Network(case)
+    # Some links, some agents and some graph topics are far slower than the others.
+    weight = {
+        (kind, j, i): rng.choice([1.0, slowness])
+        for kind in ("state", "graph", "step")
+        for i in range(case.agents)
+        for j in range(case.agents)
+    }
+    while events := network.events():
+        network.happen(rng.choices(events, [weight[event] for event in events])[0])
+    network.check_end(serial(case))
+
+
+@settings(max_examples=300, deadline=None)
+@given(cases(), st.integers(0, 2**32))
+def test_agents_may_be_killed_at_any_time(case: Case, seed: int) -> None:
+    """Each of them a few times, also while others wait for its answer."""
+    rng = random.Random(seed)
+    network, lives = Network(case), 2 * case.agents
+    while events := network.events():
+        if lives and rng.random() < 0.05:
+            lives -= 1
+            network.kill(rng.randrange(case.agents))
+        else:
+            network.happen(rng.choice(events))
+    network.check_end(serial(case))
+
+
+def explore(case: Case) -> Iterator[Network]:
+    """Every end that any order of events leads to."""
+    start = Network(case)
+    seen, pending = {start.progress()}, [start]
+    while pending:
+        network = pending.pop()
+        events = network.events()
+        if not events:
+            yield network
+        frozen = pickle.dumps(network)  # several times faster than copy.deepcopy
+        for event in events:
+            branch: Network = pickle.loads(frozen)
+            branch.happen(event)
+            if branch.progress() not in seen:
+                seen.add(branch.progress())
+                pending.append(branch)
+
+
+@pytest.mark.parametrize("window", [0, 1])
+@pytest.mark.parametrize(
+    ("agents", "inputs", "path"),
+    [
+        (2, [[[1], [0]], [[], []]], [(0, 0, 0, 0), (1, 1, 1, 1), (2, 0, 2, 2)]),
+        (2, [[[1], []], [[], [0]]], [(0, 0, 0, 1), (1, 1, 2, 2)]),
+        (3, [[[1], [0], []], [[], [2], [1]]], [(0, 0, 0, 0), (1, 1, 1, 1)]),
+    ],
+    ids=["pair that parts and meets", "directed pair that turns round", "three of whom one is always alone"],
+)
+def test_every_order_of_a_small_network(agents: int, inputs: Inputs, path: list[Sojourn], window: int) -> None:
+    case = Case(agents, path[-1][3] + 1, window, inputs, path)
+    expected = serial(case)
+    ends = 0
+    for network in explore(case):
+        network.check_end(expected)
+        ends += 1
+    assert ends == 1  # all orders meet in one end, with every queue empty
+
+
+def make_step(node: Synchronizer[str]) -> tuple[int, list[str]]:
+    """What the step that is ready uses."""
+    assert node.ready()
+    taken = node.inputs()
+    node.advance()
+    return taken
+
+
+def pair(window: int = 2, steps: int = 10) -> Synchronizer[str]:
+    """Agent 1 of a pair with a third one around who is never heard."""
+    return Synchronizer(agent=0, steps=steps, inputs=[[1], []], peers=[1], window=window)
+
+
+def everything(node: Synchronizer[str]) -> object:
+    return copy.deepcopy({key: value for key, value in vars(node).items() if key != "_limit"})
+
+
+@pytest.mark.parametrize(
+    ("agent", "step", "reason"),
+    [
+        (2, 0, Refusal.STRANGER),
+        (0, 0, Refusal.STRANGER),
+        (-1, 0, Refusal.STRANGER),
+        (1, 0, Refusal.CONTRADICTION),
+        (1, 1, Refusal.CONTRADICTION),
+        (1, 5, Refusal.FAR),
+        (1, 2**64 - 1, Refusal.FAR),
+    ],
+)
+def test_refused_states_change_nothing(agent: int, step: int, reason: str) -> None:
+    node = pair()
+    node.learn(0, 0, 0, 9)
+    assert node.offer(1, 0, "zero") is None
+    assert make_step(node) == (0, ["zero"])
+    assert node.offer(1, 1, "one") is None
+    before = everything(node)
+    assert node.offer(agent, step, "forged") == reason
+    assert everything(node) == before
+    assert [node.offer(1, 0, "zero"), node.offer(1, 1, "one")] == [Refusal.OLD] * 2  # the true ones again
+    assert everything(node) == before
+    assert make_step(node) == (0, ["one"])
+
+
+def test_another_value_is_noticed_for_as_long_as_the_true_one_can_take() -> None:
+    """Whoever forges a message is heard first and used; the true one comes at most a window of steps later."""
+    node = pair(window=WINDOW, steps=10 * WINDOW)
+    node.learn(0, 0, 0, 10 * WINDOW - 1)
+    for k in range(2 * WINDOW):
+        assert node.offer(1, k, f"{k}") is None
+        make_step(node)
+    assert node.offer(1, WINDOW, "forged") == Refusal.CONTRADICTION
+    assert node.offer(1, WINDOW - 1, "forged") == Refusal.OLD
+    assert node.buffered == 0
+
+
+def test_what_is_long_past_is_no_repetition() -> None:
+    node: Synchronizer[str] = Synchronizer(
+        agent=0, steps=10**6, inputs=[[1]], peers=[1], start=AGAIN + 100, window=WINDOW
+    )
+    assert node.offer(1, AGAIN + 100, "now") is None
+    assert node.offer(1, 100 - WINDOW, "the oldest that is sent again") == Refusal.OLD
+    assert node.offer(1, 99 - WINDOW, "forged") == Refusal.PAST
+
+
+@pytest.mark.parametrize(
+    ("sequence", "first", "last", "reason"),
+    [
+        (0, 0, 4, Refusal.KNOWN),
+        (2, 5, 9, Refusal.SEQUENCE),
+        (1, 6, 9, Refusal.SEQUENCE),
+        (1, 4, 9, Refusal.SEQUENCE),
+        (1, 5, 4, Refusal.SEQUENCE),
+    ],
+    ids=["again", "one left out", "gap", "overlap", "empty"],
+)
+def test_refused_sojourns_change_nothing(sequence: int, first: int, last: int, reason: str) -> None:
+    node = pair()
+    assert node.learn(0, 0, 0, 4) is None
+    before = everything(node)
+    assert node.learn(sequence, 1, first, last) == reason
+    assert everything(node) == before
+    assert node.learn(1, 1, 5, 9) is None
+
+
+def test_the_farthest_possible_step_is_taken() -> None:
+    node = pair(window=2)
+    assert [node.offer(1, k, str(k)) for k in range(4)] == [None] * 4
+    assert node.buffered == 4
+    assert node.offer(1, 4, "4") == Refusal.FAR
+
+
+def test_a_peer_without_a_link_still_holds_back() -> None:
+    node = pair(window=1)
+    node.learn(0, 1, 0, 9)  # a graph in which nobody is heard
+    make_step(node)  # with nothing heard: x(1) is one step ahead of a peer that has not even begun
+    assert not node.ready()
+    assert node.waiting_for() == "agents too far behind: 2"
+    assert node.offer(1, 0, "0") is None  # of no use any more, but it shows that the peer moves
+    assert node.offer(1, 0, "0") == Refusal.OLD
+    assert node.ready()
+    assert node.buffered == 0
+
+
+def test_alone() -> None:
+    node: Synchronizer[str] = Synchronizer(agent=0, steps=3, inputs=[[]], peers=[], window=0)
+    node.learn(0, 0, 0, 2)
+    assert [make_step(node) for _ in range(3)] == [(0, [])] * 3
+    assert node.finished
+    assert not node.ready()
+
+
+def test_waiting_for() -> None:
+    node: Synchronizer[str] = Synchronizer(agent=1, steps=1, inputs=[[0, 2]], peers=[0, 2], window=3)
+    assert node.waiting_for() == "the graph of step 0"
+    node.learn(0, 0, 0, 0)
+    assert node.waiting_for() == "step 0 of agent 1, agent 3"
+    node.offer(0, 0, "a")
+    assert node.waiting_for() == "step 0 of agent 3"
+    node.offer(2, 0, "c")
+    assert node.waiting_for() == "nothing"
+    make_step(node)
+    assert node.waiting_for() == "nothing, it has finished"
+
+
+def test_inputs_must_be_peers() -> None:
+    with pytest.raises(ValueError, match=r"uses \[3\]"):
+        Synchronizer(agent=0, steps=1, inputs=[[1, 3]], peers=[1])

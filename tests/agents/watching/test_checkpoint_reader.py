@@ -1,0 +1,130 @@
+"""Reading the states of a running network out of its agents' checkpoints: what was written, whole, each once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msg_agents.processes.process_plan import agent_name
+from msg_agents.recovery.checkpoint import Checkpoint, longest_heard
+from msg_agents.watching.checkpoint_reader import BLOCK, Tap
+from msg_agents.watching.run_observer import Observer
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.arithmetic.payload import to_payload
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.twin.simulate import simulate
+from msg_analysis.wire.messages import StateCodec, StateFrame
+
+
+def _experiment(duration: float = 20, **changes: Any) -> Experiment:
+    document = {
+        "name": "net",
+        "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
+        "switching": {"generator": [[-1, 1], [1, -1]]},
+        "run": {"dt": 0.05, "duration": duration, "replicas": 2, "seed": 3},
+    }
+    return Experiment.parse(document | changes)
+
+
+class Writers:
+    """Writes a trajectory as the agents would, up to any step."""
+
+    def __init__(self, trajectory: Trajectory, directory: Path) -> None:
+        self.record: RunRecord = trajectory.record
+        experiment, run = self.record.experiment, self.record.run.bytes
+        frame = StateFrame(run, experiment.width, longest_heard(self.record))
+        self._trajectory, self._done = trajectory, -1
+        self._files = [Checkpoint(directory / f"{agent_name(i)}.states", frame.size) for i in range(experiment.agents)]
+        self._codecs = [
+            StateCodec(run, i + 1, experiment.width, experiment.step_length) for i in range(experiment.agents)
+        ]
+
+    def write(self, last: int) -> None:
+        lossy = self.record.experiment.noise.loss > 0
+        for step in range(self._done + 1, last + 1):
+            mode = int(self._trajectory.modes[step - 1]) + 1 if step else 0
+            for agent, (file, codec) in enumerate(zip(self._files, self._codecs, strict=True)):
+                heard = [step - 1] * (1 + (step + agent) % 2) if lossy and step else []  # of changing length
+                payload = to_payload(np.ascontiguousarray(self._trajectory.states[step, agent]))
+                file.write(step, codec.wrap(step, mode, payload, heard))
+        self._done = last
+
+
+@pytest.mark.parametrize("noise", [{}, {"loss": 0.1}])
+def test_gives_what_was_written(tmp_path: Path, noise: dict[str, float]) -> None:
+    trajectory = simulate(_experiment(noise={"process": 1.0, **noise}))
+    tap = Tap(trajectory.record, tmp_path)
+    assert not tap.ready()
+    writers = Writers(trajectory, tmp_path)
+    assert tap.ready()
+    assert not len(tap.take(-1)[0])
+    seen = []
+    for last in (0, 1, 2, 150, 150, 400):
+        writers.write(last)
+        steps, modes, states, after = tap.take(last)
+        seen += steps.tolist()
+        assert np.array_equal(modes, trajectory.modes[steps])
+        assert np.array_equal(states, trajectory.states[steps])
+        assert np.array_equal(after, trajectory.states[steps + 1])
+    assert seen == list(range(400))
+    assert tap.missed == 0
+
+
+def test_what_was_written_over_is_missed(tmp_path: Path) -> None:
+    """The ring has room for 6000 steps; half of that is read, so that nothing is read while it is written over."""
+    trajectory = simulate(_experiment(duration=500))
+    writers = Writers(trajectory, tmp_path)
+    tap = Tap(trajectory.record, tmp_path)
+    writers.write(100)
+    assert tap.ready()
+    assert tap.take(100)[0].tolist() == list(range(100))
+    writers.write(9000)
+    seen = []
+    while len(found := tap.take(9000)[0]):
+        assert len(found) <= BLOCK
+        seen += found.tolist()
+    assert seen == list(range(6000, 9000))
+    assert tap.missed == 5900
+
+
+def test_half_written_states_do_not_count(tmp_path: Path) -> None:
+    trajectory = simulate(_experiment())
+    writers = Writers(trajectory, tmp_path)
+    writers.write(50)
+    path = tmp_path / "agent_2.states"
+    size = StateFrame(trajectory.record.run.bytes, 2).size
+    data = bytearray(path.read_bytes())
+    data[20 * (size + 16) + size + 8 : 20 * (size + 16) + size + 16] = bytes(8)  # the mark of step 20
+    path.write_bytes(data)
+    tap = Tap(trajectory.record, tmp_path)
+    assert tap.ready()
+    steps = tap.take(50)[0].tolist()
+    assert steps == [k for k in range(50) if k not in (19, 20)]  # a step needs the state after it, too
+    assert tap.missed == 2
+
+
+def test_the_observer_has_the_numbers_of_the_comparison(tmp_path: Path) -> None:
+    trajectory = simulate(_experiment())
+    writers = Writers(trajectory, tmp_path)
+    observer = Observer(trajectory.record, tmp_path)
+    writers.write(400)
+    observer.look(400)
+    observer.end()
+    assert observer.note is None
+    assert observer.report is not None
+    wanted = compare(trajectory)
+    found = observer.report.system
+    assert (found.measured, found.predicted, found.standard_error) == pytest.approx(
+        (wanted.system_error.measured, wanted.system_error.predicted, wanted.system_error.standard_error), rel=1e-9
+    )
+    for node, other in zip(observer.report.nodes, wanted.node_errors, strict=True):
+        assert (node.measured, node.z) == pytest.approx((other.measured, other.z), rel=1e-6)
+    assert observer.report.latest is not None
+    step, mode, values = observer.report.latest
+    assert (step, mode) == (399, trajectory.modes[399])
+    assert np.array_equal(values, trajectory.states[399, :, 0])

@@ -1,0 +1,136 @@
+"""The panel of a run: fits the terminal, says what it should, and nothing that is not known."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+
+from msg_agents.watching.snapshot import Clockwork, Moment, Path, moment_document, setting
+from msg_agents.watching.terminal_panel import gauge, plain_line, show
+from msg_analysis.inference.errors.estimates import Estimate
+from msg_analysis.inference.online.running_errors import LiveReport
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.graph_path import Sojourn
+from msg_analysis.twin.simulate import simulate
+
+
+def _experiment(agents: int = 5) -> Experiment:
+    numbers = list(range(1, agents + 1))
+    return Experiment.parse(
+        {
+            "name": "net",
+            "graphs": {"line": {"path": numbers}, "a ring [bold] of $$ a very long name": {"cycle": numbers}},
+            "switching": {"generator": [[-1, 1], [1, -1]]},
+            "run": {"dt": 0.05, "duration": 400, "seed": 7},
+        }
+    )
+
+
+def _report(agents: int, *, judged: bool = True) -> LiveReport:
+    error = 0.05 if judged else None
+    nodes = [Estimate(1.0 + i / 50, 1.0, error, i / 2.5 if judged else None) for i in range(agents)]
+    return LiveReport(0, 4000, 4001, 4001, Estimate(1.45, 1.41, 0.03, 1.33), nodes, None)
+
+
+def _moment(agents: int, **changes: object) -> Moment:
+    values: dict[str, object] = {
+        "steps": [4000 + i % 7 for i in range(agents)],
+        "rates": [500.0 + i for i in range(agents)],
+        "sojourn": Sojourn(41, 1, 3990, 4010),
+        "seconds": 8.0,
+        "left": 61.2,
+        "report": _report(agents),
+    }
+    return Moment(**(values | changes))  # type: ignore[arg-type]
+
+
+def _lines(moment: Moment, experiment: Experiment, width: int, height: int) -> list[str]:
+    console = Console(file=io.StringIO(), width=width, height=height, force_terminal=True, color_system=None)
+    console.print(show(moment, experiment, width=width, height=height))
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue().rstrip("\n").split("\n")
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (200, 60), (40, 12), (24, 8), (12, 4)])
+@pytest.mark.parametrize("agents", [3, 5, 20, 100])
+@pytest.mark.parametrize("judged", [True, False])
+def test_fits(width: int, height: int, agents: int, judged: bool) -> None:
+    lines = _lines(_moment(agents, report=_report(agents, judged=judged)), _experiment(agents), width, height)
+    assert max(map(len, lines)) <= width
+    assert len(lines) <= max(height, 9)  # of less, the terminal shows the beginning
+
+
+def test_says_how_it_stands() -> None:
+    text = "\n".join(_lines(_moment(5), _experiment(), 120, 24))
+    for words in (
+        "net: 5 agents, lockstep",
+        "step 4000 of 8000  50 %  500 steps/s  1:02 left",
+        "graph a ring [bold] of $$",
+        "for 0.5 units of time, steps 3990 to 4011, after 41 jumps",
+        "system error 1.45 ± 0.059 (95 %), predicted 1.41, z +1.33",
+    ):
+        assert words in text
+    assert re.search(r"\b5 +4004 +504 +1\.08 +1 +\+1\.6", text)
+
+
+def test_many_agents_are_summed_up() -> None:
+    text = "\n".join(_lines(_moment(100), _experiment(100), 80, 24))
+    assert "100 agents at steps 4000 to 4006, 500 to 599 steps/s" in text
+    assert "agents furthest off" in text
+    assert re.search(r"│ +100 ", text)
+    assert not re.search(r"│ +1 ", text)
+
+
+def test_before_anything_is_known() -> None:
+    experiment = _experiment()
+    assert "starting" in "\n".join(_lines(Moment([]), experiment, 80, 24))
+    assert "waiting for the first states" in "\n".join(_lines(Moment([-1] * 5), experiment, 80, 24))
+    text = "\n".join(_lines(_moment(5, report=None, rates=[], left=None, note="why not"), experiment, 80, 24))
+    assert "why not" in text
+    assert "left" not in text
+    assert plain_line(_moment(5), experiment) == (
+        "step 4000 of 8000, 500 steps/s, graph a ring [bold] of $$ a very long name, 1:02 left"
+    )
+
+
+@pytest.mark.parametrize(
+    ("estimate", "picture"),
+    [
+        (Estimate(1.0, 1.0, 0.1, 0.0), "├────◉────┤"),
+        (Estimate(1.0, 1.5, 0.1, -5.0), "├─●─┤       ◆"),
+        (Estimate(1.0, 0.5, 0.1, 5.0), "◆       ├─●─┤"),
+    ],
+)
+def test_gauge(estimate: Estimate, picture: str) -> None:
+    text = gauge(estimate, 20).plain.partition("  ●")[0]
+    marks = [re.sub(" +", " ", re.sub("─+", "─", line.strip())) for line in (text, picture)]
+    assert marks[0] == marks[1]
+    assert gauge(Estimate(1.0), 20).plain == ""
+
+
+def test_the_sojourns_are_those_of_the_run() -> None:
+    """Beside the path of the offline twin."""
+    experiment = _experiment()
+    modes = simulate(experiment).modes
+    path = Path(experiment)
+    for step in range(0, 8000, 37):
+        sojourn = path.at(step)
+        assert sojourn is not None
+        assert sojourn.first_step <= step <= sojourn.last_step
+        assert (modes[sojourn.first_step : sojourn.last_step + 1] == sojourn.mode).all()
+    assert path.at(8000) is not None
+
+
+def test_documents_for_the_page() -> None:
+    experiment = _experiment()
+    found = setting(experiment)
+    assert [graph["name"] for graph in found["graphs"]] == [graph.name for graph in experiment.graph_list]
+    assert found["graphs"][0]["links"] == [[0, 1], [1, 2], [2, 3], [3, 4]]
+    assert len(found["places"]) == 5
+    moment = moment_document(_moment(5))
+    assert moment["system"]["measured"] == 1.45
+    assert moment["sojourn"] == [42, 3990, 4010]
+    assert Clockwork(experiment).moment([]).reached == -1

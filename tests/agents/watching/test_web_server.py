@@ -1,0 +1,193 @@
+"""The page for browsers: what it serves, to whom, and that nobody holds anybody up."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from msg_agents.cli.main import main
+from msg_agents.cli.web_options import WebCommand, web_options
+from msg_agents.watching.web_server import MOST_BROWSERS, Web
+from msg_analysis.errors import InputError
+
+MOMENT = {"system": {"measured": 1.5, "predicted": 1.4, "standard_error": 0.1}, "values_step": 7, "reached": 8}
+
+
+@pytest.fixture
+def web() -> Iterator[Web]:
+    with Web("127.0.0.1", 0) as served:
+        yield served
+
+
+def _connection(web: Web) -> http.client.HTTPConnection:
+    return http.client.HTTPConnection(web.address.removeprefix("http://").rstrip("/"), timeout=20)
+
+
+def _get(web: Web, path: str, **headers: str) -> http.client.HTTPResponse:
+    connection = _connection(web)
+    connection.request("GET", path, headers=headers)
+    return connection.getresponse()
+
+
+class Events:
+    """Reads a stream of events."""
+
+    def __init__(self, web: Web) -> None:
+        self._response = _get(web, "/events")
+        assert self._response.status == 200
+        assert self._response.getheader("Content-Type", "").startswith("text/event-stream")
+
+    def next(self) -> tuple[str, Any] | None:
+        """The next one; None at the end."""
+        name = ""
+        while line := self._response.readline().decode():
+            if line.startswith("event: "):
+                name = line.removeprefix("event: ").strip()
+            elif line.startswith("data: "):
+                return name, json.loads(line.removeprefix("data: "))
+        return None
+
+
+def test_page(web: Web) -> None:
+    page = _get(web, "/")
+    text = page.read().decode()
+    assert page.status == 200
+    assert "default-src 'none'" in page.getheader("Content-Security-Policy", "")
+    assert "<!DOCTYPE html>" in text
+    for outside in ("http://", "https://", "//cdn"):
+        assert outside not in text.replace("http://www.w3.org/2000/svg", "")
+    assert _get(web, "/etc/passwd").status == 404
+    assert _get(web, "/../setup.py").status == 404
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("localhost:1", 200),
+        ("127.0.0.1", 200),
+        ("[::1]:80", 200),
+        ("evil.example", 403),
+        ("127.0.0.1.evil.example:80", 403),
+        ("", 403),
+    ],
+)
+def test_only_under_our_own_name(web: Web, host: str, status: int) -> None:
+    """A page from elsewhere whose name points here all of a sudden (DNS rebinding) gets nothing."""
+    assert _get(web, "/", Host=host).status == status
+
+
+def test_events(web: Web) -> None:
+    """Who comes early waits; who comes late gets what was, with the history."""
+    early = Events(web)
+    web.begin({"name": "net", "agents": 2})
+    assert early.next() == ("setting", {"name": "net", "agents": 2})
+    assert early.next() == ("history", [])
+    web.show(MOMENT | {"z": float("nan")})
+    assert early.next() == ("moment", MOMENT | {"z": None})
+    late = Events(web)
+    assert late.next() == ("setting", {"name": "net", "agents": 2})
+    assert late.next() == ("history", [[7, 1.5, 1.4, 0.1]])
+    assert late.next() == ("moment", MOMENT | {"z": None})
+    web.end({"text": "over", "verdict": "agrees"})
+    web.end({"text": "over again", "verdict": None})
+    for events in (early, late):
+        found = []
+        while event := events.next():
+            found.append(event)
+        assert found[-1] == ("end", {"text": "over", "verdict": "agrees"})
+
+
+def test_who_is_slow_or_goes_holds_nobody_up(web: Web) -> None:
+    """One browser never reads, one goes at once, one reads: 300 large moments are taken at once."""
+    web.begin({"name": "net"})
+    deaf = socket.create_connection(("127.0.0.1", int(web.address.rstrip("/").rpartition(":")[2])))
+    deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    deaf.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    gone = _connection(web)
+    gone.request("GET", "/events")
+    gone.close()
+    reader = Events(web)
+    large = MOMENT | {"values": [0.5] * 20_000}
+    began = time.monotonic()
+    for step in range(300):
+        web.show(large | {"reached": step})
+    assert time.monotonic() - began < 30  # of nobody's time-out: each would have cost 10 s at least, and 300 of them
+    newest = -1
+    while newest < 299:
+        event = reader.next()
+        assert event is not None
+        if event[0] == "moment":
+            assert event[1]["reached"] >= newest
+            newest = event[1]["reached"]
+    deaf.close()
+
+
+def test_not_too_many(web: Web) -> None:
+    web.begin({"name": "net"})
+    streams = [Events(web) for _ in range(MOST_BROWSERS)]
+    assert all(stream.next() for stream in streams)
+    assert _get(web, "/events").status == 503
+    assert _get(web, "/").status == 200
+
+
+def test_the_end_reaches_who_watches() -> None:
+    with Web("localhost", 0) as web:
+        events = Events(web)
+        web.begin({"name": "net"})
+        assert events.next() is not None
+    found = []
+    while event := events.next():
+        found.append(event[0])
+    assert found[-1] == "end"
+
+
+def test_the_port_is_taken(web: Web) -> None:
+    port = int(web.address.rstrip("/").rpartition(":")[2])
+    with pytest.raises(InputError, match=f"--web: cannot serve at 127.0.0.1, port {port} .*in use.*another port"):
+        Web("127.0.0.1", port)
+    with pytest.raises(InputError, match="cannot serve at nosuchhost"):
+        Web("nosuchhost.invalid", 0)
+
+
+def test_a_taken_port_ends_the_command_before_anything_starts(web: Web, tmp_path: Any) -> None:
+    experiment = tmp_path / "net.yaml"
+    experiment.write_text("name: net\ngraphs: {line: {path: [1, 2, 3]}}\nrun: {duration: 5}\n")
+    port = web.address.rstrip("/").rpartition(":")[2]
+    for command in (["run", str(experiment), "--out", str(tmp_path / "runs")], ["live", "--timeout", "1"]):
+        result = CliRunner().invoke(main, [*command, "--web", port])
+        assert result.exit_code == 2, result.output
+        assert "in use" in result.stderr
+        assert "Traceback" not in result.output
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "found"),
+    [
+        ([], (None, ())),
+        (["--web"], (8421, ())),
+        (["--web", "file"], (8421, ("file",))),
+        (["--web", "0", "file"], (0, ("file",))),
+        (["file", "--web=9000"], (9000, ("file",))),
+    ],
+)
+def test_the_port_may_be_left_out(arguments: list[str], found: Any) -> None:
+    seen = []
+
+    @click.command(cls=WebCommand)
+    @click.argument("files", nargs=-1)
+    @web_options
+    def command(files: tuple[str, ...], web: int | None, web_host: str) -> None:
+        seen.append((web, files))
+
+    assert CliRunner().invoke(command, arguments).exit_code == 0
+    assert seen == [found]
+    assert CliRunner().invoke(command, ["--web=70000"]).exit_code == 2

@@ -1,0 +1,238 @@
+"""Bags as others record them: analysed as ours are, or refused with the reason. Written by rosbags."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zstandard
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+
+from msg_analysis.bags.format.storage_options import Storage
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.salvage import salvage
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.errors import BagError
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.report.documents.info import describe_bag
+from msg_analysis.twin.simulate import simulate
+
+Message = tuple[str, str, bytes]  # topic, type, data
+WALL = 1_760_000_000_000_000_000  # ns
+Record = Callable[..., Path]
+
+
+@pytest.fixture(scope="module")
+def run() -> Trajectory:
+    """Long enough for numbers; published with noise, so that there are two topics of states."""
+    experiment = {
+        "name": "lab",
+        "graphs": {"line": {"path": [1, 2, 3]}, "all": {"cycle": [1, 2, 3]}},
+        "switching": {"generator": [[-2, 2], [2, -2]]},
+        "noise": {"broadcast": 0.3},
+        "run": {"dt": 0.05, "duration": 15, "replicas": 2, "seed": 5},
+    }
+    return simulate(Experiment.parse(experiment))
+
+
+@pytest.fixture
+def record(run: Trajectory, tmp_path: Path, typestore: Any) -> Record:
+    """Record the run again, with rosbags, as of the wall clock: what ``select`` makes of its messages."""
+    write_trajectory(run, tmp_path / "ours")
+    with AnyReader([tmp_path / "ours"]) as reader:
+        messages = [(c.topic, c.msgtype, bytes(raw)) for c, _, raw in reader.messages()]
+
+    def record_again(
+        select: Callable[[list[Message]], list[Message]] = lambda messages: messages,
+        name: str = "theirs",
+        compression: CompressionMode = CompressionMode.NONE,
+        storage: StoragePlugin = StoragePlugin.MCAP,
+    ) -> Path:
+        writer = Writer(tmp_path / name, version=9, storage_plugin=storage)
+        if compression != CompressionMode.NONE:
+            writer.set_compression(compression, CompressionFormat.ZSTD)
+        with writer:
+            connections: dict[str, Any] = {}
+            for number, (topic, kind, data) in enumerate(select(messages)):
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=typestore)
+                writer.write(connections[topic], WALL + 1000 * number, data)
+        return tmp_path / name
+
+    return record_again
+
+
+def _shuffled(messages: list[Message]) -> list[Message]:
+    return random.Random(1).sample(messages, len(messages))
+
+
+def _same(found: Trajectory, run: Trajectory) -> None:
+    assert found.completeness.complete
+    assert np.array_equal(found.states, run.states)
+    assert found.published is not None
+    assert run.published is not None
+    assert np.array_equal(found.published, run.published)
+    assert np.array_equal(found.modes, run.modes)
+
+
+@pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.STORAGE, CompressionMode.FILE])
+def test_in_any_order_by_the_wall_clock(run: Trajectory, record: Record, compression: CompressionMode) -> None:
+    """Log times and arrival say nothing: the verdict is that of our own bag."""
+    found = read_bag(record(_shuffled, compression=compression))
+    _same(found, run)
+    theirs, ours = compare(found).to_json(), compare(run).to_json()
+    for document in (theirs, ours):
+        del document["completeness"]
+    assert theirs == ours
+
+
+def test_extra_topics_in_a_namespace(run: Trajectory, record: Record) -> None:
+    """As `ros2 bag record -a` gives them: /rosout, another program's /experiment, a state that is none."""
+    string = "std_msgs/msg/String"
+
+    def everything(messages: list[Message]) -> list[Message]:
+        text = b"\x00\x01\x00\x00\x06\x00\x00\x00hello\x00"
+        strangers = [(f"/{name}", string, text) for name in ("chatter", "experiment", "camera/state")]
+        return strangers + [("/lab" + topic, kind, data) for topic, kind, data in messages] + strangers
+
+    bag = record(everything)
+    _same(read_bag(bag), run)
+    topics = {topic["name"]: topic["messages"] for topic in describe_bag(bag)["topics"]}
+    assert topics["/chatter"] == 2
+    assert topics["/lab/agent_2/truth"] == 301
+
+
+def test_a_missing_beginning(run: Trajectory, record: Record) -> None:
+    """No numbers without x(0), but what there is is said. Latched topics are there: they come to who is late."""
+
+    def late(messages: list[Message]) -> list[Message]:
+        latched = [message for message in messages if message[0] in ("/experiment", "/graph")]
+        return latched + [message for message in messages if message not in latched][6 * 120 :]
+
+    bag = record(late)
+    found = read_bag(bag)
+    assert found.stretch == (120, 300)
+    assert found.prefix == -1
+    assert np.array_equal(found.states[120:], run.states[120:])
+    document = compare(found).to_json()
+    assert document["verdict"] == "incomplete"
+    assert document["completeness"]["missing"] == 6 * 120
+    assert document["completeness"]["stretch"] == [120, 300]
+    assert document["system_error"]["measured"] is None
+    assert describe_bag(bag)["completeness"]["stretch"] == (120, 300)
+
+
+def test_a_missing_end(run: Trajectory, record: Record) -> None:
+    """The numbers are those of the complete beginning."""
+    bag = record(lambda messages: [m for m in messages if m[0] in ("/experiment", "/graph")] + messages[: 6 * 220])
+    comparison = compare(read_bag(bag))
+    document = comparison.to_json()
+    assert (document["verdict"], comparison.exit_code) == ("incomplete", 3)
+    assert 200 < document["steps"] < 220
+    assert document["system_error"]["measured"] > 0
+
+
+@pytest.mark.parametrize(("topic", "field"), [("truth", "states"), ("state", "published")])
+def test_one_of_the_two_topics_is_missing(record: Record, topic: str, field: str) -> None:
+    found = read_bag(record(lambda messages: [m for m in messages if not m[0].endswith(topic)]))
+    assert found.completeness.missing == 3 * 301
+    assert np.isnan(getattr(found, field)).all()
+    assert compare(found).verdict == "incomplete"
+
+
+def test_without_the_experiment(record: Record) -> None:
+    """Nobody knows what run it is of: no comparison, but `info` says what is there."""
+    bag = record(lambda messages: [m for m in messages if m[0] != "/experiment"])
+    with pytest.raises(BagError, match="without the latched topic `experiment`"):
+        read_bag(bag)
+    document = describe_bag(bag)
+    assert "latched topic" in document["problem"]
+    assert document["run"] is None
+    assert {topic["name"]: topic["messages"] for topic in document["topics"]}["/agent_1/state"] == 301
+    (file,) = (file for file in document["files"] if file["name"] != "metadata.yaml")
+    assert file["start"] == WALL
+    assert file["messages"] == sum(topic["messages"] for topic in document["topics"])
+
+
+def test_without_the_graph(record: Record) -> None:
+    found = read_bag(record(lambda messages: [m for m in messages if m[0] != "/graph"]))
+    assert found.completeness.missing_modes == 300
+    assert compare(found).verdict == "incomplete"
+
+
+def test_compressed_message_by_message(record: Record) -> None:
+    """With metadata.yaml and without: the same reason."""
+    bag = record(compression=CompressionMode.MESSAGE)
+    for path in (bag, *bag.glob("*.mcap")):
+        with pytest.raises(BagError, match="every message in it is compressed by itself"):
+            read_bag(path)
+
+
+def test_sqlite(record: Record) -> None:
+    bag = record(storage=StoragePlugin.SQLITE3)
+    for function in (read_bag, describe_bag):
+        with pytest.raises(BagError, match="storage is sqlite3, expected mcap: record with `ros2 bag record -s mcap`"):
+            function(bag)
+    (file,) = bag.glob("*.db3")
+    with pytest.raises(BagError, match="is no MCAP file"):
+        read_bag(file)
+
+
+def test_split_without_metadata_and_with_a_lost_file(run: Trajectory, record: Record, tmp_path: Path) -> None:
+    """Files of one recording, the one in the middle lost, one that was just begun when the machine went off."""
+    whole = tmp_path / "split"
+    whole.mkdir()
+    for number in range(11):
+        part = record(lambda messages, n=number: messages[n * 180 : (n + 1) * 180], f"part_{number}")
+        (file,) = part.glob("*.mcap")
+        file.rename(whole / f"split_{number}.mcap")
+    _same(read_bag(whole), run)
+    (whole / "split_5.mcap").rename(tmp_path / "lost")
+    (whole / "split_11.mcap").touch()
+    found = read_bag(whole)
+    assert found.completeness.refused == {"unreadable file": 1}
+    assert 0 < found.completeness.missing <= 180
+    present = found.present
+    assert np.array_equal(found.states[present], run.states[present])
+    report = salvage(whole, tmp_path / "saved")
+    assert report.dropped_files == 1
+    again = read_bag(tmp_path / "saved")
+    assert again.completeness.refused == {}
+    assert again.completeness.received == found.completeness.received
+
+
+def test_torn_file_that_is_compressed_as_a_whole(
+    run: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cut or flipped: what could be unpacked up to there counts."""
+    monkeypatch.setattr("msg_analysis.bags.writer.CHUNK_SIZE", 3000)
+    write_trajectory(run, tmp_path / "bag", Storage("none"))
+    whole = (tmp_path / "bag" / "bag_0.mcap").read_bytes()
+    frames = [whole[start : start + 10_000] for start in range(0, len(whole), 10_000)]
+    data = b"".join(zstandard.ZstdCompressor(write_checksum=True).compress(frame) for frame in frames)
+    torn, rng = tmp_path / "torn_0.mcap.zstd", random.Random(4)
+    torn.write_bytes(data)
+    _same(read_bag(torn), run)
+    received = []
+    for number in range(40):
+        place = rng.randrange(len(data))
+        flipped = bytes([data[place] ^ 0x55]) + data[place + 1 :]
+        torn.write_bytes(data[:place] + (flipped if number % 2 else b""))
+        try:
+            found = read_bag(torn)
+        except BagError:
+            assert place < 20_000  # in the run record
+            continue
+        present = found.present
+        assert np.array_equal(found.states[present], run.states[present])
+        assert found.completeness.refused["torn file"] == 1
+        received.append(found.completeness.received)
+    assert min(received) < max(received)

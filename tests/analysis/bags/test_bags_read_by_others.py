@@ -1,0 +1,159 @@
+"""Bags of ours in every combination of options, read by rosbags and by mcap's own reader with CRCs validated."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
+from msg_analysis.bags.format.storage_options import COMPRESSIONS, Compression, Storage
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.errors import InputError
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.twin.simulate import simulate
+
+AGENTS, STEPS, REPLICAS = 3, 120, 4
+NOISE: dict[str, dict[str, float]] = {
+    "none": {},
+    "broadcast": {"broadcast": 0.3},
+    "loss": {"loss": 0.2},
+    "both": {"broadcast": 0.3, "loss": 0.2},
+}
+
+
+@pytest.fixture(scope="module", params=NOISE)
+def run(request: pytest.FixtureRequest) -> Trajectory:
+    """A run of the twin, with a second topic of states where they are published with noise."""
+    experiment = {
+        "name": "peers",
+        "graphs": {"line": {"path": [1, 2, 3]}, "all": {"cycle": [1, 2, 3]}},
+        "switching": {"generator": [[-2, 2], [2, -2]]},
+        "noise": NOISE[request.param],
+        "run": {"dt": 0.05, "duration": STEPS * 0.05, "replicas": REPLICAS, "seed": 5, "start": "zero"},
+    }
+    return simulate(Experiment.parse(experiment))
+
+
+@pytest.mark.parametrize("split", [None, 3])
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_every_peer_reads_every_bag(
+    run: Trajectory, compression: Compression, split: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every message, in the order of time, with the right counts and values, in one file or in several."""
+    monkeypatch.setattr("msg_analysis.bags.writer.CHUNK_SIZE", 3000)
+    bag = tmp_path / "bag"
+    if split is not None:  # so many files
+        write_trajectory(run, tmp_path / "one", Storage(compression))
+        split = (tmp_path / "one" / "one_0.mcap").stat().st_size // split
+    write_trajectory(run, bag, Storage(compression, split))
+    files = sorted(bag.glob("*.mcap"), key=lambda file: int(file.stem.removeprefix("bag_")))
+    assert [file.name for file in files] == [f"bag_{i}.mcap" for i in range(len(files))]
+    assert len(files) in ((1,) if split is None else (2, 3))
+    topics = _values(run, bag)
+    _files(bag, files, compression, topics, split)
+    assert {"metadata.yaml", *(file.name for file in files)} == {file.name for file in bag.iterdir()}
+    found = read_bag(bag)
+    assert np.array_equal(found.states, run.states)
+    assert found.completeness == run.completeness
+    assert found.lost is None or np.array_equal(found.lost, run.lost)
+
+
+def _values(run: Trajectory, bag: Path) -> Counter[str]:
+    """All messages by rosbags, with the definitions in the bag: right values; their numbers by topic."""
+    expected = {"state": run.states if run.published is None else run.published, "truth": run.states}
+    found = {kind: np.full_like(states, np.nan) for kind, states in expected.items()}
+    count: Counter[str] = Counter()
+    modes = np.full_like(run.modes, -1)
+    with AnyReader([bag]) as reader:
+        last = 0
+        for connection, time, raw in reader.messages():
+            assert time >= last
+            last = time
+            count[connection.topic] += 1
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            if connection.topic == "/graph":
+                modes[message.first_step : message.last_step + 1] = message.mode - 1
+            elif connection.topic == "/experiment":
+                assert message.data == run.record.to_json()
+            else:
+                assert connection.topic.startswith(f"/agent_{message.agent}/")
+                found[connection.topic.rsplit("/", 1)[1]][message.step, message.agent - 1] = message.state
+                if run.lost is not None and message.step:
+                    gone = run.lost[message.step - 1, message.agent - 1].sum()
+                    assert (message.heard == 2**64 - 1).sum() == gone
+        assert reader.message_count == count.total()
+        assert {topic: info.msgcount for topic, info in reader.topics.items()} == count
+        assert reader.duration == STEPS * 50_000_000 + 1
+    with Reader(bag) as plain:
+        assert Counter(connection.topic for connection, _, _ in plain.messages()) == count
+        for connection in plain.connections:
+            assert connection.ext.offered_qos_profiles  # type: ignore[union-attr]
+    assert np.array_equal(modes, run.modes)
+    assert np.array_equal(found["state"], expected["state"])
+    noisy = run.published is not None
+    assert np.array_equal(found["truth"], run.states) if noisy else np.isnan(found["truth"]).all()
+    kinds = ("state", "truth") if noisy else ("state",)
+    states = {f"/agent_{i + 1}/{kind}": STEPS + 1 for i in range(AGENTS) for kind in kinds}
+    assert count == states | {"/experiment": 1, "/graph": count["/graph"]}
+    return count
+
+
+def _files(bag: Path, files: list[Path], compression: Compression, topics: Counter[str], split: int | None) -> None:
+    """Each file by mcap's reader, and what metadata.yaml says of it."""
+    information = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert information["message_count"] == topics.total()
+    assert information["relative_file_paths"] == [file.name for file in files]
+    counted: Counter[str] = Counter()
+    sequences: dict[str, list[int]] = {}
+    for file, entry in zip(files, information["files"], strict=True):
+        with file.open("rb") as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            summary = reader.get_summary()
+            assert summary is not None
+            assert summary.statistics is not None
+            kinds = {index.compression for index in summary.chunk_indexes}
+            assert kinds == {"" if compression == "none" else compression}
+            sizes = [index.chunk_length + index.message_index_length for index in summary.chunk_indexes]
+            assert sum(sizes[:-1]) < (split or 10**9)  # the last one made it too large
+            messages = [(channel.topic, message) for _, channel, message in reader.iter_messages()]
+            for topic, message in messages:
+                sequences.setdefault(topic, []).append(message.sequence)
+            times = [message.log_time for _, message in messages]
+            metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+        assert summary.statistics.message_count == len(messages) == entry["message_count"]
+        assert summary.statistics.chunk_count == len(summary.chunk_indexes)
+        assert {channel.topic for channel in summary.channels.values()} == set(topics)
+        assert entry["path"] == file.name
+        assert entry["starting_time"]["nanoseconds_since_epoch"] == min(times)
+        assert entry["duration"]["nanoseconds"] == max(times) - min(times)
+        counted.update(topic for topic, _ in messages)
+        # Each file says what run it is of, with which software, and what the bag was when it was closed.
+        record = json.loads(metadata["msg_agents"]["record"])
+        assert record["experiment"]["name"] == "peers"
+        assert set(record["versions"]) >= {"msg_analysis", "python", "numpy"}
+        closing = yaml.safe_load(metadata["rosbag2"]["serialized_metadata"])
+        assert closing["message_count"] == counted.total()
+        alone = read_bag(file)
+        assert str(alone.record.run) == record["run"]
+        if len(messages) > 30:  # more than a step; not the rest in the last file
+            assert alone.stretch is not None
+            assert alone.stretch[0] >= min(times) // 50_000_000
+    assert counted == topics
+    assert all(numbers == list(range(len(numbers))) for numbers in sequences.values())  # a gap would tell of a loss
+
+
+def test_storage_refuses_nonsense() -> None:
+    with pytest.raises(InputError, match="one of none, zstd, lz4"):
+        Storage("zip")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="more than 0"):
+        Storage(split_size=0)

@@ -1,0 +1,322 @@
+"""The command line: what is printed where, and the exit codes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from msg_analysis.cli import main as cli
+from msg_analysis.model.experiment import experiment as experiments
+
+ROOT = Path(__file__).parents[3]
+GOLDEN = ROOT / "tests/data/golden"
+LINE_RING = str(GOLDEN / "line_ring.yaml")
+HEAVY = ["numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich", "dask", "distributed", "pyarrow"]
+COMMANDS = ["compare", "facts", "info", "predict", "salvage", "schema", "simulate", "sweep", "transient"]
+
+
+def call(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli.main, [str(argument) for argument in arguments])
+
+
+def process(*arguments: str, code: str = "from msg_analysis.cli.main import main; main()", **options: Any) -> Any:
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "analysis"), "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, **options)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("bags") / "twin"
+    result = call("simulate", LINE_RING, "--duration", "50", "--seed", "3", "--out", directory)
+    assert result.exit_code == 0, result.output
+    assert result.stdout == f"{directory}\n"
+    return directory
+
+
+def test_help_and_version() -> None:
+    overview = call("--help")
+    assert overview.exit_code == 0
+    for command in COMMANDS:
+        assert command in overview.stdout
+        details = call(command, "--help")
+        assert details.exit_code == 0
+        assert "Examples:" in details.stdout
+    assert call("--version").stdout.startswith("msg-analysis, version ")
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys\nfrom msg_analysis.cli.main import main\nmain(['--help'], standalone_mode=False)\n"
+        f"print([name for name in {HEAVY} if name in sys.modules])"
+    )
+    assert process(code=code).stdout.endswith("[]\n")
+
+
+@pytest.mark.parametrize("name", ["line_ring", "tracking", "discrete", "air"])
+def test_predict_json_is_the_golden_document(name: str) -> None:
+    result = call("predict", GOLDEN / f"{name}.yaml", "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert_contains(json.loads(result.stdout), json.loads((GOLDEN / f"{name}.predict.json").read_text()))
+
+
+def assert_contains(document: Any, golden: Any) -> None:
+    if isinstance(golden, dict):
+        for key, value in golden.items():
+            assert_contains(document[key], value)
+    elif isinstance(golden, list):
+        assert len(document) == len(golden)
+        for value, expected in zip(document, golden, strict=True):
+            assert_contains(value, expected)
+    elif isinstance(golden, float):
+        assert document == pytest.approx(golden, rel=1e-8, abs=1e-12)
+    else:
+        assert document == golden
+
+
+def test_predict_table() -> None:
+    result = call("predict", LINE_RING)
+    assert result.exit_code == 0
+    assert "1.41159" in result.stdout  # the golden system error of the run's steps
+
+
+@pytest.mark.parametrize("command", ["predict", "simulate", "info"])
+def test_bad_files_are_errors_of_the_user(command: str, tmp_path: Path) -> None:
+    file = tmp_path / "bad.yaml"
+    file.write_text("name: bad\ngraphs: {line: {path: [1, 2]}}\nrun: {dt: 0, sed: 1}\n")
+    result = call(command, file)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith(f"error: {file}: 2 problems\n")
+    assert "did you mean 'seed'?" in result.stderr
+    missing = call(command, tmp_path / "nope.yaml")
+    assert (missing.exit_code, missing.stdout) == (2, "")
+    assert "nope.yaml: no such file" in missing.stderr
+
+
+def test_what_is_not_available_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "file.yaml"
+    file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nnoise: {delay: 2}\n")
+    late = call("simulate", file, "--out", tmp_path / "out")
+    assert late.exit_code == 2
+    assert "noise.delay: 2: not available" in late.stderr
+    assert not (tmp_path / "out").exists()
+    file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nnoise: {loss: 0.1}\nrun: {pace: realtime}\n")
+    assert "noise.loss: 0.1: not available in real time yet" in call("predict", file).stderr
+
+
+def test_real_time_is_predicted_in_turn(tmp_path: Path) -> None:
+    file = tmp_path / "file.yaml"
+    file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nrun: {pace: realtime}\n")
+    assert "steps in turn" in call("predict", file).stdout
+    document = json.loads(call("predict", file, "--json").stdout)
+    assert document["emulated"]["law"] == "sequential"
+
+
+def test_simulate_writes_a_bag_and_never_overwrites(bag: Path) -> None:
+    before = {file: file.read_bytes() for file in bag.iterdir()}
+    result = call("simulate", LINE_RING, "--out", bag)
+    assert result.exit_code == 2
+    assert f"{bag}: exists already" in result.stderr
+    assert {file: file.read_bytes() for file in bag.iterdir()} == before
+
+
+def test_simulate_names_the_bag_after_the_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert call("simulate", LINE_RING, "--duration", "1").stdout == "line_ring_twin\n"
+    assert (tmp_path / "line_ring_twin/metadata.yaml").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--seed", "-1"], "run.seed: -1: expected a number >= 0"),
+        (["--duration", "0.01"], "run.duration: 0.01: expected a whole number of steps"),
+        (["--duration", "nan"], "run.duration: .nan: expected a finite number"),
+        (["--seed", "x"], "'x' is not a valid integer"),
+    ],
+)
+def test_simulate_checks_its_options(options: list[str], expected: str) -> None:
+    result = call("simulate", LINE_RING, *options)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+
+
+def test_compare(bag: Path) -> None:
+    """The seed is fixed; a fresh one would disagree with probability 0.01 (level of the family of tests)."""
+    result = call("compare", bag, "--json")
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["verdict"], document["steps"]) == (0, "agrees", 1000)
+    table = call("compare", bag)
+    assert table.exit_code == 0
+    assert table.stdout.startswith("The run agrees with the prediction.")
+
+
+@pytest.mark.parametrize(("verdict", "code"), [("agrees", 0), ("disagrees", 1), ("incomplete", 3)])
+def test_the_exit_code_is_the_verdict(
+    verdict: str, code: int, bag: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from msg_analysis import api
+
+    class Comparison:
+        exit_code = code
+
+        def to_json(self) -> dict[str, Any]:
+            return {"verdict": verdict, "z": math.nan, "interval": (math.inf, 1.0)}
+
+    monkeypatch.setattr(api, "compare", lambda _, level: Comparison())
+    result = call("compare", bag, "--json")
+    assert result.exit_code == code
+    assert json.loads(result.stdout) == {"verdict": verdict, "z": None, "interval": [None, 1.0]}
+
+
+def test_compare_writes_a_report(bag: Path, tmp_path: Path) -> None:
+    result = call("compare", bag, "--json", "--report", tmp_path / "report.html")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["verdict"] == "agrees"
+    assert "<html" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    nowhere = call("compare", bag, "--report", tmp_path / "nowhere/report.html")
+    assert nowhere.exit_code == 2
+    assert "no such directory" in nowhere.stderr
+
+
+def test_info_of_an_experiment() -> None:
+    result = call("info", LINE_RING, "--json")
+    document = json.loads(result.stdout)
+    assert result.exit_code == 0
+    assert document["stability_limit"] == pytest.approx(2 / (2 - 2 * math.cos(4 * math.pi / 5)))
+    assert [graph["name"] for graph in document["graphs"]] == ["line", "ring"]
+    assert "consensus of 5 agents" in call("info", LINE_RING).stdout
+
+
+def test_info_of_a_bag(bag: Path) -> None:
+    document = json.loads(call("info", bag, "--json").stdout)
+    assert (document["experiment"], document["seed"], document["steps"]) == ("line_ring", 3, 1000)
+    assert document["completeness"]["complete"]
+    assert document["files"]
+    (mcap,) = bag.glob("*.mcap")
+    assert json.loads(call("info", mcap, "--json").stdout)["run"] == document["run"]
+    assert "complete: 5005 of 5005" in call("info", bag).stdout
+
+
+def test_simulate_compresses_and_splits(tmp_path: Path) -> None:
+    result = call(
+        *("simulate", LINE_RING, "--duration", "50", "--out", tmp_path / "bag", "--compression", "lz4"),
+        *("--split-size", "0.1"),
+    )
+    assert result.exit_code == 0, result.output
+    document = json.loads(call("info", tmp_path / "bag", "--json").stdout)
+    bags = [file for file in document["files"] if file["name"].endswith(".mcap")]
+    assert len(bags) > 1
+    assert {file["compression"] for file in bags} == {"lz4"}
+    assert sum(file["messages"] for file in bags) == sum(topic["messages"] for topic in document["topics"])
+
+
+@pytest.mark.parametrize(
+    "options", [["--compression", "zip"], ["--split-size", "0"], ["--split-size", "nan"], ["--split-size", "inf"]]
+)
+def test_storage_options_are_checked(options: list[str], tmp_path: Path) -> None:
+    result = call("simulate", LINE_RING, "--duration", "1", "--out", tmp_path / "bag", *options)
+    assert result.exit_code == 2
+    assert options[0].removeprefix("--") in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_salvage_of_a_torn_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is dropped is counted, nothing is overwritten, and what comes out is compared as incomplete."""
+    monkeypatch.setattr("msg_analysis.bags.writer.CHUNK_SIZE", 20_000)
+    call("simulate", LINE_RING, "--duration", "50", "--seed", "3", "--out", tmp_path / "bag")
+    (mcap,) = (tmp_path / "bag").glob("*.mcap")
+    torn, out = tmp_path / "torn.mcap", tmp_path / "out"
+    data = mcap.read_bytes()
+    torn.write_bytes(data[: len(data) // 2])
+    told = json.loads(call("info", torn, "--json").stdout)
+    assert told["problem"] is None
+    assert told["files"][0]["torn"]
+    result = call("salvage", torn, out, "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert document["kept_bytes"] + document["dropped_bytes"] == len(data) // 2
+    assert document["kept_messages"] == told["files"][0]["messages"] > 0
+    assert document["completeness"]["missing"] == told["completeness"]["missing"] > 0
+    first = {file.name: file.read_bytes() for file in out.iterdir()}
+    again = call("salvage", torn, out)
+    assert (again.exit_code, again.stdout) == (2, "")
+    assert "exists already" in again.stderr
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == first
+    compared = call("compare", out, "--json")
+    assert compared.exit_code == 3
+    verdict = json.loads(compared.stdout)
+    assert verdict["verdict"] == "incomplete"
+    assert verdict["steps"] == document["prefix"] > 100
+    assert verdict["system_error"]["measured"] > 0
+    assert f"All states are there up to step {verdict['completeness']['stretch'][1]}" in call("compare", out).stdout
+    shown = " ".join(call("salvage", torn, tmp_path / "two").stdout.split())
+    assert f"kept {document['kept_messages']} messages" in shown
+    assert "behind the last whole record" in shown
+
+
+def test_salvage_of_nothing(bag: Path, tmp_path: Path) -> None:
+    (mcap,) = bag.glob("*.mcap")
+    head = tmp_path / "head.mcap"
+    head.write_bytes(mcap.read_bytes()[:3000])
+    for path, reason in ((head, "no whole message"), (tmp_path / "nope", "not found"), (LINE_RING, "no MCAP file")):
+        result = call("salvage", path, tmp_path / "out")
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert reason in result.stderr
+        assert [file.name for file in tmp_path.iterdir()] == ["head.mcap"]
+
+
+def test_schema_is_the_committed_file() -> None:
+    assert call("schema").stdout == (ROOT / "docs/experiment.schema.json").read_text(encoding="utf-8")
+
+
+def test_exit_codes_of_the_process() -> None:
+    assert process("predict", LINE_RING, "--json").returncode == 0
+    assert process("predict", "nope.yaml").returncode == 2
+    assert process("predict").returncode == 2
+    assert process("nonsense").returncode == 2
+
+
+def test_interrupt_is_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(path: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(experiments, "read_yaml", interrupt)
+    result = call("predict", LINE_RING)
+    assert (result.exit_code, result.output) == (130, "")
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "analysis")}
+    command = [sys.executable, "-m", "msg_analysis.cli.main", "schema"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, env=environment, timeout=60)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_bugs_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    def bug(path: Path) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(experiments, "read_yaml", bug)
+    assert isinstance(call("predict", LINE_RING).exception, ZeroDivisionError)
+
+
+def test_files_that_cannot_be_written_are_errors_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path) -> None:
+        raise OSError(28, "No space left on device", "some/file")
+
+    monkeypatch.setattr(experiments, "read_yaml", full)
+    result = call("predict", LINE_RING)
+    assert result.exit_code == 2
+    assert result.stderr == "error: some/file: No space left on device\n"

@@ -1,0 +1,142 @@
+"""``msg-analysis compare`` of several bags, and ``tabulate``, as a user calls them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from msg_analysis.cli.main import main
+
+EXPERIMENT = Path(__file__).parents[3] / "ros_ws/src/msg_agents_bringup/experiments/leader_smallest.yaml"
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two runs with leader 1, one with leader 2."""
+    directory = tmp_path_factory.mktemp("bags")
+    other = directory / "other.yaml"
+    other.write_text(EXPERIMENT.read_text(encoding="utf-8").replace("agents: [1]", "agents: [2]"), encoding="utf-8")
+    made = []
+    for seed, experiment in ((1, EXPERIMENT), (2, EXPERIMENT), (3, other)):
+        made.append(directory / f"bag_{seed}")
+        assert call("simulate", experiment, "--seed", seed, "--duration", 20, "--out", made[-1]).exit_code == 0
+    return made
+
+
+@pytest.fixture(scope="module")
+def results(bags: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    directory = tmp_path_factory.mktemp("results")
+    saved = []
+    for bag in bags:
+        saved.append(directory / f"{bag.name}.json")
+        saved[-1].write_text(call("compare", bag, "--json").stdout, encoding="utf-8")
+    return saved
+
+
+def test_several_bags_get_one_verdict(bags: list[Path], tmp_path: Path) -> None:
+    result = call("compare", *bags[:2], "--json", "--report", tmp_path / "report.html")
+    document = json.loads(result.stdout)
+    assert result.exit_code == {"agrees": 0, "disagrees": 1}[document["verdict"]]
+    assert [bag["bag"] for bag in document["bags"]] == [str(bag) for bag in bags[:2]]
+    assert document["simulated_time"] == pytest.approx(40.0)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<h2>Runs</h2>" in page
+    assert str(bags[1]) in page
+    assert "2 runs" in call("compare", *bags[:2]).stdout
+
+
+def test_bags_that_do_not_go_together(bags: list[Path], tmp_path: Path) -> None:
+    for arguments, expected in (
+        ((bags[0], bags[0]), "the same run as in"),
+        ((bags[0], bags[2]), "leaders.agents: [2], but [1]"),
+        ((bags[0], tmp_path / "nope", tmp_path / "nada"), f"{tmp_path / 'nope'}, {tmp_path / 'nada'}: not found"),
+    ):
+        result = call("compare", *arguments)
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert expected in result.stderr
+    assert call("compare", tmp_path / "nope").exit_code == 2
+    assert call("compare").exit_code == 2
+
+
+@pytest.mark.parametrize("level", ["0", "0.6", "-1", "nan", "x"])
+def test_levels_that_are_none(bags: list[Path], level: str) -> None:
+    assert call("compare", bags[0], "--level", level).exit_code == 2
+
+
+def test_the_level_is_that_of_the_verdict(bags: list[Path]) -> None:
+    """At the level of the least adjusted p-value, the verdict turns over."""
+    least = min(test["p_adjusted"] for test in json.loads(call("compare", bags[0], "--json").stdout)["tests"])
+    if least < 0.49:
+        document = json.loads(call("compare", bags[0], "--json", "--level", least * 1.01).stdout)
+        assert (document["verdict"], document["level"]) == ("disagrees", pytest.approx(least * 1.01))
+        assert document["blame"]
+    assert json.loads(call("compare", bags[0], "--json", "--level", least / 2).stdout)["verdict"] == "agrees"
+
+
+def test_tabulate(results: list[Path], bags: list[Path]) -> None:
+    rows = list(csv.DictReader(call("tabulate", *results, "--format", "csv").stdout.splitlines()))
+    assert [row["leaders"] for row in rows] == ["1", "1", "2"]
+    saved: dict[str, Any] = json.loads(results[1].read_text(encoding="utf-8"))
+    assert float(rows[1]["measured"]) == saved["system_error"]["measured"]
+    assert float(rows[1]["low"]) == saved["system_error"]["interval"][0]
+    assert rows[1]["seeds"] == "2"
+    document = json.loads(call("tabulate", *results, "--format", "json").stdout)
+    assert [row["verdict"] for row in document["results"]] == [row["verdict"] for row in rows]
+    (merged,) = document["merged"]
+    pooled = json.loads(call("compare", *bags[:2], "--json").stdout)["system_error"]
+    assert merged["files"] == [str(path) for path in results[:2]]
+    assert {key: merged[key] for key in ("measured", "standard_error", "predicted", "z", "p")} == pytest.approx(
+        {key: pooled[key] for key in ("measured", "standard_error", "predicted", "z", "p")}
+    )
+    order = document["order"]
+    assert {(pair["better"], pair["worse"], pair["predicted"]) for pair in order["distinctions"]} == {
+        (1, 3, True),
+        (2, 3, True),
+    }
+    twice = json.loads(call("tabulate", results[0], results[0], "--format", "json").stdout)
+    assert twice["merged"] == []
+    table = call("tabulate", *results)
+    assert table.exit_code == 0
+    assert "has a smaller system error than" in " ".join(table.stdout.split())
+    markdown = call("tabulate", *results, "--format", "markdown").stdout.splitlines()
+    assert len(markdown) == 5
+    assert len({line.count("|") for line in markdown}) == 1
+
+
+def test_tabulate_takes_the_directory_of_a_run(results: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "result.json").write_text(results[0].read_text(encoding="utf-8"), encoding="utf-8")
+    assert call("tabulate", tmp_path, "--format", "csv").stdout.splitlines()[1].startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "not JSON"),
+        ("[]", "no JSON object"),
+        ("{}", "system_error: None"),
+        ('{"system_error": {"interval": 3}}', "system_error.interval: 3"),
+        ('{"system_error": {"interval": [1, "x"]}, "experiment": "a", "verdict": "agrees"}', "interval: 'x'"),
+        ('{"system_error": {"interval": [1, 2]}, "verdict": "agrees"}', "experiment: None"),
+    ],
+)
+def test_files_that_are_no_results(text: str, expected: str, tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    path.write_text(text, encoding="utf-8")
+    result = call("tabulate", path)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert expected in result.stderr
+    assert str(path) in result.stderr
+
+
+def test_tabulate_of_nothing(tmp_path: Path) -> None:
+    assert call("tabulate").exit_code == 2
+    assert "No such file" in call("tabulate", tmp_path / "nope.json").stderr

@@ -1,0 +1,181 @@
+"""The command: files, texts, exit codes; interrupted and resumed. Real workers."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet
+import pytest
+import yaml
+
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.simulate import simulate
+
+PROGRAM = Path(sys.executable).with_name("msg-analysis")
+EXPERIMENT: dict[str, Any] = {
+    "name": "two",
+    "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
+    "switching": {"rates": {"line": {"ring": 1.0}, "ring": {"line": 1.0}}},
+    "run": {"dt": 0.05, "duration": 50},
+}
+
+
+def file(directory: Path, **sweep: Any) -> Path:
+    path = directory / "rates.yaml"
+    path.write_text(yaml.safe_dump({"experiment": EXPERIMENT, **sweep}, sort_keys=False))
+    return path
+
+
+def start(*arguments: str | Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [PROGRAM, "sweep", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1"},
+    )
+
+
+def call(*arguments: str | Path) -> tuple[int, str, str]:
+    process = start(*arguments)
+    stdout, stderr = process.communicate(timeout=100)
+    return process.returncode, stdout, stderr
+
+
+def closed_form(rate: float, agents: int = 5) -> float:
+    """System error of line and ring in continuous time, by the Kronecker formula of the paper, all from numpy."""
+    import numpy as np
+
+    line = np.diag([1.0, 2, 2, 2, 1]) - np.eye(5, k=1) - np.eye(5, k=-1)
+    ring = line.copy()
+    ring[0, 0] = ring[4, 4] = 2
+    ring[0, 4] = ring[4, 0] = -1
+    projector = np.eye(agents) - 1 / agents
+    one = np.eye(agents)
+    generator = rate * np.array([[-1.0, 1], [1, -1]])
+    blocks = [np.kron(z, one) + np.kron(one, z) for z in (line, ring)]
+    zero = np.zeros_like(blocks[0])
+    matrix = np.block([[blocks[0], zero], [zero, blocks[1]]]) - np.kron(generator.T, np.eye(agents**2))
+    noise = np.concatenate([projector.ravel() / 2, projector.ravel() / 2])
+    solution = (np.linalg.pinv(matrix) @ noise).reshape(2, agents, agents).sum(axis=0)
+    return float(np.trace(projector @ solution @ projector))
+
+
+def test_tables_hold_what_theory_says_and_nothing_is_done_again(tmp_path: Path) -> None:
+    over = {"switching.scale": {"from": 0.1, "to": 10, "count": 5, "spacing": "log"}, "run.dt": [0.05, 0.1]}
+    path, out = file(tmp_path, over=over), tmp_path / "out"
+    code, stdout, stderr = call(path, "--out", out, "--json")
+    assert code == 0, stderr
+    document = json.loads(stdout)
+    assert (document["done"], document["failed"], document["kept"], document["verdict"]) == (10, 0, 0, None)
+    names = ["results.parquet", "results.csv", "results.json", "figure.svg", "figure.png"]
+    assert [Path(name).name for name in document["files"]] == names
+    with (out / "results.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert pyarrow.parquet.read_table(out / "results.parquet").num_rows == 10
+    columns = pyarrow.parquet.read_table(out / "results.parquet").to_pydict()
+    for number, point in enumerate(document["points"]):
+        expected = closed_form(point["switching.scale"])
+        assert point["continuous.system_error"] == pytest.approx(expected, rel=1e-9)
+        assert float(rows[number]["continuous.system_error"]) == point["continuous.system_error"]
+        assert columns["continuous.system_error"][number] == point["continuous.system_error"]
+        assert point["emulated.system_error"] > expected
+    assert json.loads((out / "results.json").read_text())["points"] == document["points"]
+
+    journal = (out / "points.jsonl").read_bytes()
+    # A changed file: what is new is done, the rest kept.
+    over["run.dt"] = [0.05, 0.1, 0.2]
+    code, stdout, stderr = call(file(tmp_path, over=over), "--out", out, "--workers", "1")
+    assert "15 predictions, 10 of them before." in " ".join(stdout.split())
+    assert (out / "points.jsonl").read_bytes().startswith(journal)
+
+
+def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path) -> None:
+    """Runs of a fixed seed: the same numbers to the last digit, and nothing computed twice."""
+    over = {"switching.scale": {"from": 0.1, "to": 10, "count": 9, "spacing": "log"}}
+    experiment = EXPERIMENT | {"run": {"dt": 0.05, "duration": 400}}
+    path, out = file(tmp_path, experiment=experiment, kind="simulate", over=over), tmp_path / "out"
+    journal = out / "points.jsonl"
+    process = start(path, "--out", out)
+    deadline = time.monotonic() + 60
+    while not (journal.exists() and journal.read_bytes().count(b"\n") >= 2):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    time.sleep(0.3)
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGINT)  # the impatient user
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert stdout == ""
+    assert "Traceback" not in stderr
+    before = journal.read_bytes()
+    kept = before.count(b"\n")
+    assert f"interrupted: {kept} of 9 points are kept" in stderr
+    code, stdout, _ = call(path, "--out", out, "--json")
+    document = json.loads(stdout)
+    assert (code, document["kept"], document["done"], document["verdict"]) == (0, kept, 9, "agrees")
+    assert journal.read_bytes().startswith(before)
+    assert journal.read_bytes().count(b"\n") == 9
+    for row in document["points"][::4]:
+        switching = EXPERIMENT["switching"] | {"scale": row["switching.scale"]}
+        run = experiment["run"] | {"seed": row["seed"]}
+        measured = compare(simulate(Experiment.parse(experiment | {"switching": switching, "run": run})))
+        assert row["system_error.measured"] == measured.system_error.measured
+
+
+def test_failures_are_told_and_the_exit_code_says_so(tmp_path: Path) -> None:
+    """With a delay, some steps are unstable, which only the prediction can find out."""
+    experiment = EXPERIMENT | {"noise": {"delay": 3}, "run": {"duration": 55}}
+    path = file(tmp_path, experiment=experiment, over={"run.dt": [0.05, 0.55]})
+    code, stdout, stderr = call(path, "--out", tmp_path / "out", "--workers", "1")
+    assert code == 3, stderr
+    assert "point 2: no result: " in stdout
+    assert "2 predictions; 1 without a result." in " ".join(stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--scheduler", "tcp://127.0.0.1:9"], "--scheduler tcp://127.0.0.1:9: nobody answers there"),
+        (["--scheduler", "nonsense://1"], "--scheduler nonsense://1: "),
+        (["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"], "give one of them"),
+        (["--out", "/proc/nothing"], "choose another place with --out"),
+    ],
+)
+def test_bad_usage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str) -> None:
+    monkeypatch.setattr("msg_analysis.sweep.jobs.workers._CONNECT", 1.0)
+    monkeypatch.chdir(tmp_path)
+    from click.testing import CliRunner
+
+    from msg_analysis.cli.main import main
+
+    result = CliRunner().invoke(main, ["sweep", str(file(tmp_path, over={"run.dt": [0.05]})), *arguments])
+    assert result.exit_code == 2
+    assert words in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_without_msg_agents_networks_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from msg_analysis.errors import InputError
+    from msg_analysis.sweep.jobs import network_run
+
+    monkeypatch.setattr(network_run.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match="msg-agents: not found"):
+        network_run.find_program()
+    program = tmp_path / "msg-agents"
+    program.write_text("#!/usr/bin/python3\n")
+    with pytest.raises(InputError, match="there is no rclpy"):
+        network_run.find_program()

@@ -1,0 +1,148 @@
+"""The commands transient and facts: what is printed where, and what is refused."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from msg_analysis.cli import main as cli
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.theory.prediction import predict
+
+GOLDEN = Path(__file__).parents[2] / "data/golden"
+LINE_RING = str(GOLDEN / "line_ring.yaml")
+
+
+def call(*arguments):
+    return CliRunner().invoke(cli.main, [str(argument) for argument in arguments])
+
+
+def document_of(*arguments):
+    result = call(*arguments, "--json")
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.fixture
+def from_zero(tmp_path):
+    """The line and the ring, started at zero."""
+    file = tmp_path / "zero.yaml"
+    file.write_text(Path(LINE_RING).read_text().replace("seed: 7", "seed: 7, start: zero"))
+    return str(file)
+
+
+def test_transient_tends_to_the_prediction(from_zero):
+    prediction = predict(Experiment.load(from_zero))
+    for law, moments in {"emulated": prediction.emulated, "continuous": prediction.continuous}.items():
+        document = document_of("transient", from_zero, "--times", "0:50:0.5", "--law", law)
+        assert document["law"] == law
+        assert document["times"] == pytest.approx(np.arange(0.0, 50.1, 0.5).tolist())
+        assert document["system_error"][0] == 0.0
+        assert document["system_error"][-1] == pytest.approx(moments.system_error, rel=1e-12)
+        assert document["node_errors"][-1] == pytest.approx(moments.node_errors.tolist())
+        assert document["steady_system_error"] == pytest.approx(moments.system_error)
+        assert document["graph_law"] == [pytest.approx([0.5, 0.5])] * 101
+        assert document["settling"]["from_start"] == document["settling"]["from_zero"]
+        assert 1.7 < document["settling"]["from_zero"] < 2.0
+        assert document["rates"]["graph"] == pytest.approx(1.0)
+        assert "mode_means" not in document
+
+
+def test_transient_with_moments_and_unreduced():
+    document = document_of("transient", LINE_RING, "--times", "0,1", "--moments")
+    second = np.array(document["mode_second_moments"])
+    assert second.shape == (2, 2, 5, 5)
+    assert np.trace(second[0].sum(axis=0)) == pytest.approx(document["system_error"][0])
+    assert np.array(document["mode_means"]).shape == (2, 2, 5)
+    for law in ("emulated", "continuous"):
+        reduced = document_of("transient", LINE_RING, "--times", "0,1,100", "--law", law)
+        grown = document_of("transient", LINE_RING, "--times", "0,1,100", "--law", law, "--unreduced")
+        assert "system_error" not in grown
+        # The agents' mean is a random walk of variance t / m, and is uncorrelated with what they disagree.
+        expected = np.add(reduced["system_error"], [0.0, 1.0, 100.0])
+        assert grown["system_second_moment"] == pytest.approx(expected.tolist(), rel=1e-10)
+
+
+def test_transient_tables(tmp_path, from_zero):
+    file = tmp_path / "table.csv"
+    result = call("transient", from_zero, "--times", "0:5:1", "--csv", file)
+    assert result.exit_code == 0
+    assert "from zero" in result.stdout
+    with file.open() as lines:
+        rows = list(csv.DictReader(lines))
+    assert len(rows) == 6
+    assert list(rows[0])[:3] == ["time", "probability of line", "probability of ring"]
+    assert float(rows[0]["system error"]) == 0.0
+    assert float(rows[5]["node error of agent 3"]) > 0.2
+    assert list(tmp_path.glob("*.part")) == []
+
+
+def test_without_noise_nothing_settles(tmp_path):
+    file = tmp_path / "quiet.yaml"
+    file.write_text(
+        Path(LINE_RING).read_text().replace("process: 1.0", "process: 0.0").replace("seed: 7", "start: zero")
+    )
+    document = document_of("transient", str(file), "--times", "0,1")
+    assert document["settling"] == {"fraction": 0.05, "from_start": None, "from_zero": None}
+    assert document["system_error"] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "message"),
+    [
+        ("line_ring", ["--times", "soon"], "expected START:STOP:STEP"),
+        ("line_ring", ["--times", "0:1"], "expected START:STOP:STEP"),
+        ("line_ring", ["--times", "1:0:0.5"], "expected START:STOP:STEP"),
+        ("line_ring", ["--times", "0,nan"], "expected START:STOP:STEP"),
+        ("line_ring", ["--times", "2,1"], "ascending"),
+        ("line_ring", ["--times", "0.51"], "0.51 is no whole number of steps of 0.05"),
+        ("line_ring", ["--times", "1", "--fraction", "2"], "settling fraction"),
+        ("line_ring", ["--times", "1", "--csv", "/nowhere/file.csv"], "no such directory /nowhere"),
+        ("air", ["--times", "1", "--law", "continuous"], "belong to steps"),
+        ("discrete", ["--times", "1", "--law", "continuous"], "expected an experiment in continuous time"),
+        ("tracking", ["--times", "1", "--unreduced"], "tracking reduces nothing"),
+    ],
+)
+def test_transient_refuses(file, options, message):
+    result = call("transient", GOLDEN / f"{file}.yaml", *options)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stdout == ""
+
+
+def test_facts_of_a_large_network(tmp_path):
+    """The lemmas are left out, with the reason; what scales is there."""
+    file = tmp_path / "large.yaml"
+    labels = str(list(range(1, 41)))
+    text = Path(LINE_RING).read_text().replace("[1, 2, 3, 4, 5]", labels)
+    file.write_text(text)
+    document = document_of("facts", file)
+    assert document["facts"] is None
+    assert "3200 rows" in document["notes"][0]
+    assert document["bounds"]["lower"] < document["two_topology"]["continuous"]["system"]["error"]
+    assert len(document["graphs"][0]["information_centrality"]) == 40
+    assert "3200" in call("facts", file).stdout
+
+
+@pytest.mark.parametrize("name", ["line_ring", "discrete", "tracking", "air"])
+def test_facts(name):
+    document = document_of("facts", GOLDEN / f"{name}.yaml")
+    assert all(fact["holds"] for fact in document["facts"])
+    assert set(document) == {"modes", "facts", "bounds", "graphs", "two_topology", "notes"}
+    prediction = predict(Experiment.load(GOLDEN / f"{name}.yaml"))
+    if name in ("line_ring", "discrete"):
+        law = "emulated" if name == "line_ring" else "discrete"
+        form = document["two_topology"][law]
+        assert form["system"]["error"] == pytest.approx(prediction.emulated.system_error, rel=1e-11)
+        assert form["nodes"]["error"] == pytest.approx(prediction.emulated.node_errors.tolist(), rel=1e-11)
+        assert document["bounds"]["upper"] is not None
+    else:
+        assert document["two_topology"] is None
+        assert document["bounds"]["upper"] is None
+    result = call("facts", GOLDEN / f"{name}.yaml")
+    assert result.exit_code == 0
+    assert "does not hold" not in result.stdout
+    assert ("Two graphs in closed form" in result.stdout) == (document["two_topology"] is not None)

@@ -1,0 +1,258 @@
+"""Comparisons of runs with noise and loss on the air."""
+
+import dataclasses
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
+from msg_analysis.inference.hypothesis_tests.innovations import innovation_tests, innovations
+from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import broadcast_p, loss_test
+from msg_analysis.inference.observed.heard_values import Reception
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.theory.prediction import predict
+from msg_analysis.twin.simulate import simulate
+
+AIR = {"broadcast": 0.3, "link": 0.2, "loss": 0.2}
+CORRELATED = [[1.0, 0.3, 0.0], [0.0, 0.5, 0.2], [0.0, 0.0, 2.0]]
+SEEDS = range(40)
+
+
+def experiment(noise=AIR, **changes):
+    run = {"dt": 0.1, "duration": 40, "replicas": 2, "seed": 3} | changes.pop("run", {})
+    document = {
+        "name": "air",
+        "graphs": {"a": {"path": [1, 2, 3]}, "b": {"arcs": [[1, 2], [2, 3, 2.0], [3, 1], [1, 3]]}},
+        "switching": {"generator": [[-1.0, 1.0], [2.0, -2.0]]},
+        "noise": noise,
+        "run": run,
+    }
+    return Experiment.parse(document | changes)
+
+
+TRACKING = {"problem": "tracking", "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0}}
+CASES = {
+    "all": experiment(),
+    "correlated": experiment(noise=AIR | {"process": CORRELATED}, **TRACKING),
+    "loss alone, start at zero": experiment(noise={"loss": 0.4}, run={"start": "zero"}),
+    "no process noise": experiment(noise={"process": 0.0, "link": 0.3, "loss": 0.3}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_calibration(case):
+    """p-values of 40 true runs of 400 steps are even, intervals cover, verdicts agree.
+
+    Kolmogorov-Smirnov at 2e-4 for each of at most 11 tests, coverage and verdicts at 1e-4 by the binomial law: a right
+    program fails a case with probability below 0.3 %.
+    """
+    results = [compare(simulate(CASES[case].with_run(seed=seed))) for seed in SEEDS]
+    collected = [{test.name: test.p for test in result.tests} for result in results]
+    names = {"system error", "covariance", "innovations: covariance", "innovations: gains", "loss"}
+    assert names <= set(collected[0])
+    assert ("innovations: whiteness" in collected[0]) == (case != "no process noise")
+    assert ("broadcast" in collected[0]) == (case in ("all", "correlated"))
+    for name in collected[0]:
+        assert stats.kstest([p[name] for p in collected], "uniform").pvalue > 2e-4, name
+    covered = sum(r.system_error.interval[0] <= r.system_error.predicted <= r.system_error.interval[1] for r in results)
+    assert covered >= stats.binom.ppf(1e-4, len(results), 0.95)
+    alarms = sum(result.verdict == "disagrees" for result in results)
+    assert alarms <= stats.binom.isf(1e-4, len(results), 0.01)
+
+
+def test_many_second_moments_of_a_short_run():
+    """28 second moments from 150 squares, 40 runs: few enough p-values below 5 %, by the binomial law at 1e-4.
+
+    The chi-square law would put one in eight there; that of Hotelling errs on the other side.
+    """
+    graphs = {"line": {"path": list(range(1, 9))}, "ring": {"cycle": list(range(1, 9))}}
+    what = experiment(graphs=graphs, run={"duration": 15}, switching={"generator": [[-20.0, 20.0], [20.0, -20.0]]})
+    tests = [compare(simulate(what.with_run(seed=seed))).covariance for seed in range(40)]
+    assert {test.dof for test in tests} == {28}
+    assert sum(test.p < 0.05 for test in tests) <= stats.binom.isf(1e-4, 40, 0.05)
+    assert all(test.p > stats.chi2.sf(test.chi2, test.dof) for test in tests if test.chi2 > test.dof)
+
+
+@pytest.mark.parametrize(
+    ("truth", "found_by"),
+    [
+        ({"noise": AIR | {"loss": 0.25}}, "loss"),
+        ({"noise": AIR | {"broadcast": 0.33}}, "broadcast"),
+        ({"noise": AIR | {"link": 4.0}}, "innovations: covariance"),
+        ({"noise": AIR | {"process": 1.1}}, "innovations: covariance"),
+        (
+            {"graphs": {"a": {"path": [1, 2, 3]}, "b": {"arcs": [[1, 2], [2, 3, 1.2], [3, 1], [1, 3]]}}},
+            "innovations: gains",
+        ),
+    ],
+)
+def test_power(truth, found_by):
+    """Runs of a wrong law, 2,000 steps: rejected, and by the test that should."""
+    run = {"duration": 200, "replicas": 8}
+    claimed, trajectory = experiment(run=run), simulate(experiment(**({"run": run} | truth)))
+    record = RunRecord(trajectory.record.run, claimed, trajectory.record.start)
+    result = compare(dataclasses.replace(trajectory, record=record))
+    assert result.verdict == "disagrees"
+    assert min(result.tests, key=lambda test: test.p).name == found_by
+
+
+def observe(what):
+    return Observation.of(simulate(what), predict(what))
+
+
+def nominal(what):
+    """W of the graphs, link by link."""
+    gains = np.diag(np.where(np.isfinite(what.leader_gains), what.leader_gains, 0.0))
+    return [np.eye(3) - what.run.dt * (graph.laplacian + gains) for graph in what.graph_list]
+
+
+@pytest.mark.parametrize("what", [CASES["all"], CASES["correlated"]])
+def test_innovations_are_what_is_left_of_each_step(what):
+    observation, trajectory, weights = observe(what), simulate(what), nominal(what)
+    found = innovations(observation, 0, 400, Reception.of(observation, 0, 400))
+    for k, g in enumerate(trajectory.modes):
+        for i in range(3):
+            rest = trajectory.states[k + 1, i] - weights[g][i, i] * trajectory.states[k, i]
+            rest -= what.reference * (1 - weights[g][i].sum())
+            neighbours = [j for j in range(3) if j != i and weights[g][i, j]]
+            for j, lost in zip(neighbours, trajectory.lost[k, i], strict=False):
+                rest -= weights[g][i, j] * (trajectory.states[k, i] if lost else trajectory.published[k, j])
+            np.testing.assert_allclose(found[k, i], rest, atol=1e-12)
+
+
+@pytest.mark.parametrize("most", [400, 12, 8])
+def test_regression_against_a_loop(most):
+    """Each difference of each graph; the pull of each agent in each graph; in both graphs together."""
+    what = CASES["correlated"]
+    observation, trajectory, weights = observe(what), simulate(what), nominal(what)
+    regression = HeardRegression(observation, most)
+    for first, last in ((0, 150), (150, 400)):
+        reception = Reception.of(observation, first, last)
+        regression.add(reception, innovations(observation, first, last, reception))
+    e = innovations(observation, 0, 400, Reception.of(observation, 0, 400))
+    process = what.run.dt * np.array(CORRELATED) @ np.array(CORRELATED).T
+    links = [(i, j) for g in (0, 1) for i in range(3) for j in range(3) if j != i and weights[g][i, j]]
+    size = {400: 3 + len(links) + 2, 12: 9, 8: 6}[most]
+    assert len(regression.statistic()[0]) == size
+    score, covariance = 0.0, 0.0
+    for k, g in enumerate(trajectory.modes):
+        noise = process.copy()
+        phi, rows = np.zeros((size, 2)), np.zeros(size, dtype=int)
+        phi[:3], rows[:3] = 1.0, range(3)
+        place = 3 if most == 400 else 0
+        pulls = np.zeros((3, 2))
+        for graph in (0, 1):
+            leaders = []
+            for i in range(3):
+                which = 0
+                for j in range(3):
+                    if j == i or not weights[graph][i, j]:
+                        continue
+                    came = graph == g and not trajectory.lost[k, i, which]
+                    which += 1
+                    difference = came * (trajectory.published[k, j] - trajectory.states[k, i])
+                    pulls[i] += weights[graph][i, j] * difference
+                    noise[i, i] += came * (what.noise.link * weights[graph][i, j]) ** 2
+                    if most == 400:
+                        phi[place], rows[place] = difference, i
+                        place += 1
+                if what.leader_gains[i]:
+                    leaders.append((i, (graph == g) * (trajectory.states[k, i] - 2.0)))
+                    pulls[i] -= (graph == g) * what.run.dt * what.leader_gains[i] * (trajectory.states[k, i] - 2.0)
+            for i, own in leaders:
+                if most == 400:
+                    phi[place], rows[place] = own, i
+                    place += 1
+        if most == 12:
+            rows[3:] = [0, 1, 2, 0, 1, 2]
+            phi[3 + 3 * g : 6 + 3 * g] = pulls
+        elif most == 8:
+            rows[3:], phi[3:] = range(3), pulls
+        score = score + (e[k, rows] * phi).sum(axis=1)
+        covariance = covariance + noise[np.ix_(rows, rows)] * (phi @ phi.T)
+    np.testing.assert_allclose(regression.statistic()[0], score, atol=1e-9)
+    np.testing.assert_allclose(regression.statistic()[1], covariance, atol=1e-9)
+
+
+def test_blocks_change_nothing(monkeypatch):
+    observation = observe(CASES["correlated"])
+    whole = innovation_tests(observation), loss_test(observation), broadcast_p(observation)
+    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 70)
+    split = innovation_tests(observation), loss_test(observation), broadcast_p(observation)
+    for one, other in zip(whole[:2], split[:2], strict=True):
+        for ours, theirs in zip(dataclasses.astuple(other), dataclasses.astuple(one), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+    assert split[2] == pytest.approx(whole[2])
+
+
+def test_agents_that_moved_without_having_heard_anything():
+    """Without process noise, who has lost everything stays where he is."""
+    what = CASES["no process noise"]
+    trajectory = simulate(what)
+    step = int(np.flatnonzero((trajectory.modes == 0) & trajectory.lost[:, 0, 0])[3])
+    assert compare(trajectory).verdict == "agrees"
+    moved = trajectory.states.copy()
+    moved[step + 1 :] += np.array([1e-4, 0.0, 0.0])[:, None]
+    result = innovation_tests(Observation.of(dataclasses.replace(trajectory, states=moved), predict(what)))
+    assert result.p_covariance == 0.0
+
+
+def test_losses_by_hand():
+    """Links of graph a: 12, 21, 23, 32; of b: 13, 21, 31, 32 (receiver, sender); counts, chi-squares of them."""
+    what = experiment(run={"duration": 100})
+    observation, p = observe(what), 0.2
+    receivers = ([(1, 2), (2, 1), (2, 3), (3, 2)], [(1, 3), (2, 1), (3, 1), (3, 2)])
+    places = ([0, 0, 1, 0], [0, 0, 0, 1])
+    xi = [
+        {link: float(lost[link[0] - 1, place]) - p for link, place in zip(receivers[g], places[g], strict=True)}
+        for g, lost in zip(observation.modes, observation.lost, strict=True)
+    ]
+    v = p * (1 - p)
+    links = sorted({link for step in xi for link in step})
+    sums = {link: [step[link] for step in xi if link in step] for link in links}
+    chi2 = sum(sum(values) ** 2 / (len(values) * v) for values in sums.values())
+    after = [a[link] * b[link] for a, b in pairwise(xi) for link in links if link in a and link in b]
+    beside = [step[a] * step[b] for step in xi for a in step for b in step if a < b]
+    chi2 += sum(sum(products) ** 2 / (len(products) * v * v) for products in (after, beside))
+    test = loss_test(observation)
+    assert test.lost == sum(value > 0 for values in sums.values() for value in values)
+    assert test.expected == pytest.approx(p * sum(map(len, sums.values())))
+    assert test.p == pytest.approx(stats.chi2.sf(chi2, len(links) + 2))
+
+
+def test_losses_that_are_not_independent():
+    """The right number on each link, but in bursts, or of all messages of a step together."""
+    what = experiment(noise={"loss": 0.25}, run={"duration": 200, "start": "zero"})
+    observation = observe(what)
+    random = np.random.default_rng(1)
+    shape = observation.lost.shape
+    assert loss_test(observation).p > 1e-3
+    bursts = np.repeat(random.random((shape[0] // 2, *shape[1:])) < 0.25, 2, axis=0)
+    together = np.broadcast_to(random.random((shape[0], 1, 1)) < 0.25, shape)
+    for lost in (bursts, together):
+        assert loss_test(dataclasses.replace(observation, lost=lost)).p < 1e-6
+
+
+@pytest.mark.parametrize("lost", [0, 3, 40])
+def test_rare_losses_have_their_binomial_law(lost):
+    """One loss in a thousand, 400 steps of 4 messages."""
+    what = experiment(noise={"loss": 0.001}, run={"start": "zero"})
+    observation = observe(what)
+    logged = np.zeros_like(observation.lost)
+    logged[10 : 10 + lost, 0, 0] = True
+    test = loss_test(dataclasses.replace(observation, lost=logged))
+    assert test.lost == lost
+    assert test.expected == pytest.approx(1.6)
+    assert test.p == pytest.approx(stats.binomtest(lost, 1600, 0.001).pvalue, rel=1e-6)
+
+
+def test_broadcast_noise_that_is_repeated():
+    observation = observe(experiment(run={"duration": 20}))
+    assert broadcast_p(observation) > 1e-3
+    same = observation.states + (observation.published - observation.states)[:, :1]
+    assert broadcast_p(dataclasses.replace(observation, published=same)) < 1e-6

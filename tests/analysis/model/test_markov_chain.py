@@ -1,0 +1,171 @@
+"""Chain, path and step model against scipy and direct formulas."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+
+import networkx as nx
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.validation import connection_problems
+from msg_analysis.model.network.graphs import Graph, hops
+from msg_analysis.model.network.markov_chain import MarkovChain, stationary_law
+from msg_analysis.model.run.graph_path import mode_path, sojourns
+from msg_analysis.model.step.step_model import build_step_model
+
+
+def generator_of(seed: int, n: int) -> np.ndarray:
+    rates = np.random.default_rng(seed).uniform(0.1, 2.0, (n, n))
+    np.fill_diagonal(rates, 0.0)
+    return rates - np.diag(rates.sum(axis=1))
+
+
+@given(st.integers(0, 10_000), st.integers(1, 6))
+def test_stationary_law_is_the_left_null_vector(seed: int, n: int) -> None:
+    gamma = generator_of(seed, n)
+    law = stationary_law(gamma)
+    null = scipy.linalg.null_space(gamma.T)[:, 0] if n > 1 else np.ones(1)
+    np.testing.assert_allclose(law, null / null.sum(), rtol=1e-10)
+
+
+def test_stationary_law_keeps_its_digits_at_any_rate() -> None:
+    """Three graphs in a row, rates over 30 orders of magnitude: detailed balance gives the law by hand."""
+    up, down = (1e-15, 1e15), (1.0, 1e-10)
+    gamma = np.array([[-up[0], up[0], 0], [down[0], -down[0] - up[1], up[1]], [0, down[1], -down[1]]])
+    weights = np.array([1.0, up[0] / down[0], up[0] / down[0] * up[1] / down[1]])
+    np.testing.assert_allclose(stationary_law(gamma), weights / weights.sum(), rtol=1e-14)
+
+
+def test_ergodicity() -> None:
+    assert not MarkovChain("continuous", np.array([[-1.0, 1.0], [0.0, 0.0]])).ergodic
+    flip = np.array([[0.0, 1.0], [1.0, 0.0]])
+    assert MarkovChain("discrete", flip).irreducible
+    assert not MarkovChain("discrete", flip).ergodic
+    assert MarkovChain("continuous", np.zeros((1, 1))).ergodic
+
+
+@given(st.integers(0, 10_000), st.integers(1, 7), st.floats(0.05, 0.9))
+def test_reachability_and_period_against_networkx(seed: int, n: int, density: float) -> None:
+    jumps = np.random.default_rng(seed).random((n, n)) < density
+    digraph = nx.from_numpy_array(jumps, create_using=nx.DiGraph)
+    level = hops(jumps, [0])
+    assert {v: d for v, d in enumerate(level.tolist()) if d >= 0} == nx.single_source_shortest_path_length(digraph, 0)
+    chain = MarkovChain("discrete", jumps / np.maximum(jumps.sum(axis=1, keepdims=True), 1))
+    assert chain.irreducible == nx.is_strongly_connected(digraph)
+    if chain.irreducible and jumps.any():
+        assert chain.period == math.gcd(*(len(cycle) for cycle in nx.simple_cycles(digraph)))
+
+
+@given(st.integers(0, 10_000), st.integers(2, 8), st.floats(0.05, 0.4))
+def test_whom_nothing_connects_against_networkx(seed: int, agents: int, density: float) -> None:
+    hears = np.random.default_rng(seed).random((agents, agents)) < density
+    np.fill_diagonal(hears, False)
+    digraph = nx.from_numpy_array(hears.T, create_using=nx.DiGraph)
+    reached = max(len(nx.descendants(digraph, v)) + 1 for v in digraph)
+    found = connection_problems([Graph("graph", hears.astype(float))], None)
+    assert bool(found) == (reached < agents)
+    if found:
+        lost, sources = re.fullmatch(
+            r".*: agents? (.*) cannot be reached from agents? ([\d, ]*) in.*", found[0]
+        ).groups()  # type: ignore[union-attr]
+        unreached, roots = ({int(label) - 1 for label in text.split(", ")} for text in (lost, sources))
+        for root in roots:
+            assert set(digraph) - nx.descendants(digraph, root) - {root} == unreached
+        assert len(unreached) == agents - reached
+        assert roots in list(nx.strongly_connected_components(digraph))
+
+
+def setup(time: str, matrix: np.ndarray, steps: int, dt: float = 0.3, **switching: object) -> Experiment:
+    n = len(matrix)
+    key = "generator" if time == "continuous" else "transition"
+    return Experiment.parse(
+        {
+            "name": "chain",
+            "time": time,
+            "graphs": {f"g{i}": {"edges": [[1, 2, 0.1 + i]]} for i in range(n)},
+            "switching": {key: matrix.tolist()} | switching,
+            "run": {"dt": dt, "duration": steps * dt, "seed": 11},
+        }
+    )
+
+
+@pytest.mark.parametrize("time", ["continuous", "discrete"])
+def test_path_has_the_transition_probabilities(time: str) -> None:
+    """Transition counts of 40,000 steps against expm(Gamma dt), Pearson chi-square per row, p > 1e-5 each.
+
+    dt is a third of a mean holding time, so many sojourns fall between two steps. False-alarm rate 6e-5.
+    """
+    gamma = generator_of(1, 3)
+    matrix = gamma if time == "continuous" else scipy.linalg.expm(gamma * 0.3)
+    case = setup(time, matrix, 40_000, 0.3 if time == "continuous" else 1.0)
+    modes = mode_path(case, case.chain.stationary)
+    expected = scipy.linalg.expm(gamma * 0.3)
+    for i in range(3):
+        following = modes[1:][modes[:-1] == i]
+        counts = np.bincount(following, minlength=3)
+        assert scipy.stats.chisquare(counts, expected[i] * len(following)).pvalue > 1e-5
+
+
+def test_holding_times_are_exponential() -> None:
+    """Kolmogorov-Smirnov on 5,000 holding times, p > 1e-4: the false-alarm rate."""
+    chain = MarkovChain("continuous", generator_of(2, 2))
+    path = chain.sojourns(chain.stationary, np.random.default_rng(3))
+    held = [time for mode, time in (next(path) for _ in range(10_000)) if mode == 0]
+    assert scipy.stats.kstest(held, "expon", args=(0, -1 / chain.matrix[0, 0])).pvalue > 1e-4
+
+
+def test_sojourns_cover_every_step_once() -> None:
+    case = setup("continuous", 5 * generator_of(4, 3), 500)
+    found = list(sojourns(case, case.chain.stationary))
+    assert [s.sequence for s in found] == list(range(len(found)))
+    assert found[0].first_step == 0
+    assert found[-1].last_step == 499
+    assert all(a.last_step + 1 == b.first_step for a, b in itertools.pairwise(found))
+    assert all(s.first_step <= s.last_step for s in found)
+
+
+def test_first_graph_can_be_given() -> None:
+    case = setup("continuous", generator_of(4, 3), 5, initial="g2")
+    model = build_step_model(case)
+    assert model.initial.tolist() == [0, 0, 1]
+    assert mode_path(case, model.initial)[0] == 2
+
+
+def test_one_graph_never_switches() -> None:
+    case = setup("continuous", np.zeros((1, 1)), 7)
+    assert mode_path(case, np.ones(1)).tolist() == [0] * 7
+
+
+def test_step_of_grounded_leaders() -> None:
+    """Euler: the leader's row vanishes and the reference moves into the offset; discrete time: followers forget it."""
+    document = {
+        "name": "grounded",
+        "problem": "tracking",
+        "graphs": {"a": {"path": [1, 2, 3]}},
+        "leaders": {"agents": [1], "gain": float("inf"), "reference": 3.0},
+        "noise": {"process": 2.0},
+        "run": {"dt": 0.1, "duration": 1},
+    }
+    model = build_step_model(Experiment.parse(document))
+    np.testing.assert_allclose(model.weights[0], [[0, 0, 0], [0.1, 0.8, 0.1], [0, 0.1, 0.9]])
+    np.testing.assert_allclose(model.offsets[0], [3.0, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(model.noise[0], np.diag([0, 0.4, 0.4]))
+    document |= {"time": "discrete", "run": {"duration": 5}}
+    model = build_step_model(Experiment.parse(document))
+    followers = scipy.linalg.expm(-np.array([[2.0, -1.0], [-1.0, 1.0]]))
+    np.testing.assert_allclose(model.weights[0][1:, 1:], followers)
+    assert not model.weights[0][0].any()
+    assert not model.weights[0][:, 0].any()
+    # The limit of a large gain.
+    laplacian = np.array([[1.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
+    limit = scipy.linalg.expm(-(laplacian + np.diag([1e9, 0, 0])))
+    np.testing.assert_allclose(model.weights[0], limit, atol=1e-8)
+    np.testing.assert_allclose(model.noise[0], 4 * np.eye(3))

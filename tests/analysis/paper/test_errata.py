@@ -1,0 +1,54 @@
+"""The corrections of the paper: each is borne out by its numbers, and stands in the docs."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.theory.prediction import predict
+
+ROOT = Path(__file__).parents[3]
+SCRIPT = ROOT / "benchmarks/errata.py"
+spec = importlib.util.spec_from_file_location("errata", SCRIPT)
+assert spec is not None
+assert spec.loader is not None
+errata = importlib.util.module_from_spec(spec)
+sys.modules["errata"] = errata
+spec.loader.exec_module(errata)
+
+
+@pytest.mark.parametrize("number", range(1, len(errata.ERRATA) + 1))
+def test_correction(number):
+    finding = errata.ERRATA[number - 1]()
+    assert finding.holds
+    page = (ROOT / "docs/errata.md").read_text(encoding="utf-8")
+    assert f"## {number}. " in page
+    assert f"errata.py {number}\n" in page
+
+
+def test_what_is_printed():
+    result = subprocess.run([sys.executable, SCRIPT, "6"], capture_output=True, text=True, timeout=60, check=True)
+    assert result.stdout.startswith("6. The paper: Switching never hurts")
+    assert "E = 0.202898, static 0.201800" in result.stdout
+    assert subprocess.run([sys.executable, SCRIPT, "99"], capture_output=True, check=False).returncode == 2
+
+
+@pytest.mark.parametrize("noise", [[1.0] * 5, np.sqrt([0.001, 0.001, 0.001, 1.0, 0.001]).tolist()])
+def test_the_script_and_the_package_agree(noise):
+    pairs = [[1, 4], [1, 5], [2, 3], [3, 4]], [[1, 3], [2, 4], [2, 5], [3, 4]]
+    document = {
+        "name": "pairs",
+        "graphs": {"first": {"edges": pairs[0]}, "second": {"edges": pairs[1]}},
+        "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
+        "noise": {"process": noise},
+        "run": {"dt": 0.05, "duration": 1},
+    }
+    pi = np.array([0.5, 0.5])
+    graphs = [errata.laplacian(pair, 5) for pair in pairs]
+    expected = errata.continuous(graphs, pi, errata.generator(pi, 1.0), np.diag(np.square(noise)))
+    prediction = predict(Experiment.parse(document))
+    np.testing.assert_allclose(prediction.continuous.node_errors, expected, rtol=1e-10)

@@ -1,0 +1,272 @@
+"""The paper's examples: numbers against brute-force Kronecker algebra and known digits, and the files."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import networkx as nx
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from msg_analysis.errors import InputError
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.paper import examples as paper
+from msg_analysis.paper import figures
+from msg_analysis.paper.examples import CENTRALITY, NODE, SYSTEM, Curve, Example
+
+ROOT = Path(__file__).parents[3]
+EXPERIMENTS = ROOT / "ros_ws/src/msg_agents_bringup/experiments"
+
+GRAPHS = {
+    "line_ring": (["12", "23", "34", "45"], ["12", "23", "34", "45", "15"]),
+    "three_lines": (["23", "34", "45", "15"], ["12", "23", "34", "45"], ["15", "12", "23", "34"]),
+    "knife_edge": (["12", "13", "15", "34", "45"], ["13", "15", "23", "24", "34", "45"]),
+    "smallest": (["12", "13", "14", "35"], ["12", "13", "34", "35", "45"]),
+}
+"""The edges as they are known, written again."""
+
+
+@pytest.fixture(scope="module")
+def examples() -> dict[int, Example]:
+    return {number: example(12) for number, example in paper.EXAMPLES.items()}
+
+
+def laplacians(network: str) -> list[np.ndarray]:
+    found = []
+    for edges in GRAPHS[network]:
+        graph = nx.Graph([(int(a), int(b)) for a, b in edges])
+        found.append(nx.laplacian_matrix(graph, nodelist=range(1, 6)).toarray().astype(float))
+    return found
+
+
+def generator(network: str, epsilon: float, r12: float, r21: float) -> np.ndarray:
+    if network != "three_lines":
+        return epsilon * np.array([[-r12, r12], [r21, -r21]])
+    return epsilon * np.array([[-r12, r12, 0], [r21, -2 * r21, r21], [0, r12, -r12]])
+
+
+def covariance(drifts: list[np.ndarray], noise: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """The paper's steady-state formula with its pseudo-inverse; F = I."""
+    n, d = len(drifts), len(noise)
+    share = scipy.linalg.null_space(rates.T)[:, 0]
+    share /= share.sum()
+    matrix = scipy.linalg.block_diag(*[np.kron(z, np.eye(d)) + np.kron(np.eye(d), z) for z in drifts])
+    matrix -= np.kron(rates.T, np.kron(noise, noise))
+    right = np.kron(share, noise.ravel())
+    return (np.linalg.pinv(matrix, rcond=1e-11) @ right).reshape(n, d, d).sum(axis=0)
+
+
+def brute_force(curve: Curve, point: int) -> float:
+    rates = generator(curve.network, curve.epsilon[point], curve.r12[point], curve.r21[point])
+    if curve.quantity == CENTRALITY:
+        follows = [agent for agent in range(5) if agent != curve.agent]
+        drifts = [lap[np.ix_(follows, follows)] for lap in laplacians(curve.network)]
+        return 1.0 / float(np.trace(covariance(drifts, np.eye(4), rates)))
+    projector = np.eye(5) - 0.2
+    steady = covariance([projector @ lap @ projector for lap in laplacians(curve.network)], projector, rates)
+    return 1.0 / float(np.trace(steady) if curve.agent is None else steady[curve.agent, curve.agent])
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_curves_against_kronecker_algebra(examples: dict[int, Example], number: int) -> None:
+    random = np.random.default_rng(number)
+    for curve in examples[number].curves:
+        for point in random.integers(len(curve.value), size=2):
+            assert curve.value[point] == pytest.approx(brute_force(curve, point), rel=1e-9)
+
+
+def at(curves: list[Curve], **rates: float) -> dict[int | None, float]:
+    """Values by agent at the point with these rates."""
+    found: dict[int | None, float] = {}
+    for curve in curves:
+        fits = np.all([np.isclose(getattr(curve, key), value, rtol=1e-12) for key, value in rates.items()], axis=0)
+        if fits.any():
+            found[curve.agent] = float(curve.value[fits.argmax()])
+    return found
+
+
+def test_known_digits_of_example_1(examples: dict[int, Example]) -> None:
+    system = examples[1].select("line_ring", SYSTEM)
+    for (r12, r21), digits in {(1.0, 1.0): 0.73561, (0.1, 1.0): 0.53439, (1.0, 0.1): 0.94031}.items():
+        assert round(at(system, r12=r12, r21=r21)[None], 5) == digits
+    nodes = at(examples[1].select("line_ring", NODE), r12=1.0, r21=1.0)
+    assert [round(nodes[agent], 5) for agent in range(5)] == [2.90277, 4.25156, 5.0, 4.25156, 2.90277]
+    for curve in system:
+        assert np.all((curve.value > 0.5) & (curve.value < 1.0))  # between the line and the ring held
+    assert len(system) == 2 * len(paper.LEVELS)
+
+
+def test_known_digits_of_example_2(examples: dict[int, Example]) -> None:
+    """The digits are those at r12 = 0.5, 0.5, 0.2 and 0.2; the largest values are a little above them."""
+    digits = {0.5: (0.5, 0.51760), 1.0: (0.5, 0.53075), 5.0: (0.2, 0.59339), 10.0: (0.2, 0.63129)}
+    for curve in examples[2].select("three_lines", SYSTEM):
+        r12, value = digits[curve.epsilon[0]]
+        assert round(at([curve], r12=r12)[None], 5) == value
+        assert value <= curve.value[curve.peak] < value + 0.002
+        assert 0 < curve.peak < len(curve.value) - 1
+        assert np.all(np.diff(curve.value[: curve.peak + 1]) > 0)
+        assert np.all(np.diff(curve.value[curve.peak :]) < 0)
+        near = [brute_force_at(curve, factor * curve.r12[curve.peak]) for factor in (0.98, 1.02)]
+        assert max(near) < curve.value[curve.peak]
+
+
+def brute_force_at(curve: Curve, r12: float) -> float:
+    moved = Curve(curve.network, SYSTEM, None, curve.epsilon[:1], np.array([r12]), curve.r21[:1], curve.value[:1])
+    return brute_force(moved, 0)
+
+
+def orders(curves: list[Curve], *scales: float) -> list[str]:
+    points = [int(np.abs(curves[0].epsilon - scale).argmin()) for scale in scales]
+    return ["-".join(str(agent + 1) for agent in paper.order(curves, point)) for point in points]
+
+
+def test_orders_of_example_3(examples: dict[int, Example]) -> None:
+    knife = examples[3].select("knife_edge", CENTRALITY)
+    assert orders(knife, 0.1, 1.0, 10.0) == ["1-3-4-5-2", "3-1-4-5-2", "1-3-4-5-2"]
+    errors = {agent: 1.0 / value for agent, value in at(knife, epsilon=1.0).items()}
+    assert (round(errors[2], 5), round(errors[0], 5)) == (1.63896, 1.63912)
+    central, certain = (examples[3].select("smallest", quantity) for quantity in (CENTRALITY, NODE))
+    assert set(orders(central, *central[0].epsilon)) == {"1-3-4-5-2"}
+    assert set(orders(certain, *certain[0].epsilon)) == {"3-1-4-5-2"}
+
+
+@pytest.mark.parametrize(
+    ("name", "network", "rates"),
+    [
+        ("three_lines", "three_lines", (5.0, 0.2, 0.05)),
+        ("leader_knife_edge", "knife_edge", (1.0, 1.0, 1.0)),
+        ("leader_smallest", "smallest", (1.0, 1.0, 1.0)),
+        ("line_ring", "line_ring", (0.5, 1.0, 1.0)),
+    ],
+)
+def test_shipped_experiments_are_the_examples(
+    examples: dict[int, Example], name: str, network: str, rates: tuple[float, float, float]
+) -> None:
+    experiment = Experiment.load(EXPERIMENTS / f"{name}.yaml")
+    assert experiment.name == name
+    expected = laplacians(network)
+    drawn = next(example.networks[network] for example in examples.values() if network in example.networks)
+    assert len(expected) == len(experiment.graph_list) == len(drawn)
+    for graph, picture, laplacian in zip(experiment.graph_list, drawn, expected, strict=True):
+        np.testing.assert_array_equal(graph.laplacian, laplacian)
+        np.testing.assert_array_equal(picture.laplacian, laplacian)
+    np.testing.assert_allclose(experiment.chain.matrix, generator(network, *rates), rtol=1e-15)
+    assert ("reconstruction" in (EXPERIMENTS / f"{name}.yaml").read_text()) == (network != "line_ring")
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_table(examples: dict[int, Example], number: int) -> None:
+    example = examples[number]
+    lines = figures.csv_text(example).splitlines()
+    comments = [line for line in lines if line.startswith("# ")]
+    assert lines[: len(comments)] == comments
+    assert any("reconstructed" in line for line in comments) == (number != 1) == example.reconstructed
+    rows = list(csv.DictReader(lines[len(comments) :]))
+    assert tuple(rows[0]) == paper.COLUMNS
+    assert len(rows) == sum(len(curve.value) for curve in example.curves)
+    for row in rows:
+        epsilon, r12, r21 = float(row["epsilon [1/time]"]), float(row["r12"]), float(row["r21"])
+        assert float(row["q12 [1/time]"]) == epsilon * r12
+        assert float(row["q21 [1/time]"]) == epsilon * r21
+        assert (row["agent"] == "0") == (row["quantity"] == SYSTEM)
+    values = np.concatenate([curve.value for curve in example.curves])
+    np.testing.assert_array_equal([float(row["value [1/variance]"]) for row in rows], values)
+
+
+def texts(figure: Figure) -> str:
+    return "\n".join(text.get_text() for text in figure.findobj(Text))
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_figure_shows_graphs_and_says_what_is_reconstructed(examples: dict[int, Example], number: int) -> None:
+    example = examples[number]
+    with mpl.rc_context(figures._STYLE):
+        figure = figures.draw(example)
+        shown = texts(figure)
+    assert ("reconstructed" in shown) == (number != 1)
+    graphs = sum(len(graphs) for graphs in example.networks.values())
+    assert len([axes for axes in figure.axes if not axes.axison]) == graphs
+    for axes in figure.axes:
+        if axes.axison:
+            assert axes.get_xlabel() or axes.get_shared_x_axes().get_siblings(axes)
+            assert "1/E" in axes.get_ylabel() or "%" in axes.get_ylabel()
+            styles = {(line.get_color(), str(line.get_linestyle()), line.get_marker()) for line in axes.lines}
+            curves = [line for line in axes.lines if len(line.get_xdata()) > 2]
+            assert len(styles) >= len(curves)  # each its own colour, dashes and marker
+
+
+def test_labels_do_not_overlap_and_keep_their_order() -> None:
+    @given(st.lists(st.floats(0, 1), min_size=1, max_size=6), st.floats(0.01, 0.15))
+    def check(heights: list[float], gap: float) -> None:
+        moved = figures._apart(heights, gap)
+        order = sorted(range(len(heights)), key=lambda i: heights[i])
+        assert all(moved[b] - moved[a] >= gap * (1 - 1e-9) for a, b in pairwise(order))
+        assert sum(moved) == pytest.approx(sum(heights), abs=1e-9)
+        if all(heights[b] - heights[a] >= gap for a, b in pairwise(order)):
+            assert moved == heights
+
+    check()
+
+
+def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    for number, example in list(paper.EXAMPLES.items()):
+        monkeypatch.setitem(paper.EXAMPLES, number, lambda example=example: example(6))
+
+
+def test_files_are_reproducible_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few_points(monkeypatch)
+    (tmp_path / "example_1.svg").write_text("old")
+    (tmp_path / "mine.txt").write_text("mine")
+    written = figures.write_figures([1], tmp_path)
+    assert [path.name for path in written] == [f"example_1.{kind}" for kind in ("png", "svg", "pdf", "csv")]
+    first = {path: path.read_bytes() for path in written}
+    assert figures.write_figures([1], tmp_path) == written
+    assert {path: path.read_bytes() for path in written} == first
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 5  # nothing temporary is left
+    png, svg, pdf, _ = first.values()
+    assert png.startswith(b"\x89PNG")
+    assert svg.rstrip().endswith(b"</svg>")
+    assert not re.search(rb"<dc:date>", svg)
+    assert pdf.startswith(b"%PDF")
+    assert not re.search(rb"/CreationDate|/FontType 3|/Type3", pdf)
+    assert (tmp_path / "example_1.png").stat().st_mode & 0o777 == 0o666 & ~umask()
+
+
+def umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def test_formats_and_places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few_points(monkeypatch)
+    written = figures.write_figures([2], tmp_path / "new" / "deep", ["svg"])
+    assert [path.name for path in written] == ["example_2.svg", "example_2.csv"]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file: cannot be written .*--out"):
+        figures.write_figures([2], tmp_path / "file", ["svg"])
+    (tmp_path / "taken" / "example_2.svg").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"example_2\.svg.*cannot be written"):
+        figures.write_figures([2], tmp_path / "taken", ["svg"])
+    assert [path.name for path in (tmp_path / "taken").iterdir()] == ["example_2.svg"]
+
+
+def test_no_global_state_of_pyplot() -> None:
+    code = "import sys, msg_analysis.paper.figures; print('matplotlib.pyplot' in sys.modules)"
+    environment: dict[str, Any] = {"PYTHONPATH": str(ROOT / "analysis"), "PATH": "/usr/bin:/bin"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,235 @@
+"""The report: valid, self-contained, complete, and safe with any name."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import uuid
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from msg_analysis.errors import InputError
+from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate
+from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
+from msg_analysis.inference.hypothesis_tests.switching import SwitchingTest
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.inference.verdict.comparison import Comparison
+from msg_analysis.inference.verdict.comparison import Test as FamilyTest
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Completeness, Trajectory
+from msg_analysis.report.html.report_page import write_report
+from msg_analysis.twin.simulate import simulate
+
+VOID = {"meta", "img", "link", "br", "hr", "input"}
+MakeComparison = Callable[..., Comparison]
+
+
+class Page(HTMLParser):
+    """Checks the nesting and keeps what tests ask for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.references: list[str] = []
+        self.classes: list[str] = []
+        self.text = ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.references += [value or "" for name, value in attrs if name in ("src", "href", "action", "data")]
+        self.classes += (dict(attrs).get("class") or "").split()
+        if tag == "svg" or "plot" in (dict(attrs).get("class") or "").split():
+            assert dict(attrs)["aria-label"]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] not in ("style", "script"):
+            self.text += data
+
+
+def _trajectory(agents: int, steps: int, **names: str) -> Trajectory:
+    everybody = list(range(1, agents + 1))
+    experiment = Experiment.parse(
+        {
+            "name": "small",
+            "problem": "consensus",
+            "time": "continuous",
+            "graphs": {
+                "line": {"path": everybody},
+                "ring": {"cycle": everybody} if agents > 2 else {"path": everybody},
+            },
+            "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
+            "run": {"dt": 0.1, "duration": steps * 0.1, "replicas": 2, "start": "zero"},
+        }
+    )
+    if names:
+        graphs = tuple(dataclasses.replace(g, name=names.get(g.name, g.name)) for g in experiment.graph_list)
+        experiment = dataclasses.replace(experiment, graph_list=graphs)
+    rng = np.random.default_rng(0)
+    states = rng.standard_normal((steps + 1, agents, 2))
+    record = RunRecord(uuid.UUID(int=5), experiment, states[0])
+    modes = np.repeat(rng.integers(0, 2, steps // 4 + 1), 4)[:steps]
+    expected = (steps + 1) * agents
+    return Trajectory(record, states, modes, Completeness(expected, expected, 0))
+
+
+def _comparison(trajectory: Trajectory) -> Comparison:
+    """Made-up numbers, all of them there."""
+    agents = trajectory.states.shape[1]
+    rng = np.random.default_rng(1)
+    covariance = np.cov(rng.standard_normal((agents, 4 * agents)))
+    nodes = [Estimate(0.3 + i / 100, 0.31, 0.01, 0.5, 0.6, 1.0) for i in range(agents)]
+    tests = [FamilyTest("system error", 0.4, 1.0, rejected=False)]
+    tests += [FamilyTest(f"error of agent {i + 1}", 0.6, 1.0, rejected=False) for i in range(agents)]
+    time = np.linspace(0.1, 20, 50)
+    return Comparison(
+        trajectory=trajectory,
+        level=0.01,
+        steps=len(trajectory.modes),
+        system_error=Estimate(1.234567, 1.3, 0.05, -1.31, 0.19),
+        node_errors=nodes,
+        covariance=CovarianceTest(covariance, covariance * 1.01, 9.0, 10, 0.53),
+        innovations=InnovationTests(0.5, 0.5, None),
+        switching=SwitchingTest(np.array([[7, 1], [2, 9]]), np.array([[6.5, 1.5], [2.5, 8.5]]), 0.7),
+        continuous_error=1.25,
+        batch=(1.1, 1.4),
+        tests=tests,
+        running={"time": time, "system_error": 1.3 + 1 / time, "standard_error": 0.3 / np.sqrt(time)},
+    )
+
+
+def _page(comparison: Comparison, path: Path) -> Page:
+    write_report(comparison, comparison.trajectory, path)
+    text = path.read_text(encoding="utf-8")
+    assert len(text.encode()) < 5_000_000
+    page = Page(text)
+    assert all(reference.startswith("#") for reference in page.references)
+    assert "default-src 'none'" in text
+    own = re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
+    assert not re.search(r"url\(|@import", own)
+    for drawing in re.findall(r"<svg.*?</svg>", own, flags=re.DOTALL):
+        ElementTree.fromstring(drawing)
+    return page
+
+
+def _plots(page: Page) -> int:
+    return page.classes.count("plot")
+
+
+@pytest.mark.parametrize("agents", [2, 5, 100])
+def test_report(tmp_path: Path, agents: int) -> None:
+    comparison = _comparison(_trajectory(agents, 60))
+    page = _page(comparison, tmp_path / "report.html")
+    assert "The run agrees with the prediction." in page.text
+    assert str(comparison.trajectory.record.run) in page.text
+    assert "1.235" in page.text
+    assert "z = −1.31" in page.text
+    for i in range(agents):
+        assert f"{0.3 + i / 100:#.4g}" in page.text
+    assert _plots(page) == 6
+    assert page.tags.count("svg") == 3  # two graphs and the chain
+    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_report_of_a_real_comparison(tmp_path: Path) -> None:
+    trajectory = _trajectory(3, 400)  # white noise is not what the law gives
+    page = _page(compare(trajectory), tmp_path / "report.html")
+    assert "The run disagrees with the prediction." in page.text
+    assert "reject the predicted law" in page.text
+    assert "p < 0.0001" in page.text
+
+
+@pytest.mark.parametrize("first_gap", [5, 250])
+def test_incomplete(tmp_path: Path, first_gap: int) -> None:
+    trajectory = _trajectory(3, 400)
+    trajectory.states[first_gap, 1] = np.nan
+    count = Completeness(expected=1203, received=1202, missing=1, refused={"torn file": 1})
+    trajectory = dataclasses.replace(trajectory, completeness=count)
+    page = _page(compare(trajectory), tmp_path / "report.html")
+    assert "No verdict: the data are incomplete." in page.text
+    assert "Missing: 1 of 1203 states" in page.text
+    assert ("Too little came" in page.text) == (first_gap == 5)
+    assert "set aside: torn file" in page.text
+
+
+def test_what_became_of_the_network(tmp_path: Path) -> None:
+    """Only where something did; texts from outside are texts."""
+    comparison = _comparison(_trajectory(2, 60))
+    assert "Network" not in _page(comparison, tmp_path / "quiet.html").text
+    stranger = {"node": "agent_1", "topic": "<b>graph", "reason": "other run", "count": 1234}
+    path = tmp_path / "report.html"
+    restarts = ["agent_2: killed by SIGKILL after step 7, started again"]
+    write_report(comparison, comparison.trajectory, path, restarts=restarts, strangers=[stranger])
+    page = Page(path.read_text(encoding="utf-8"))
+    for words in (*restarts, "<b>graph", "other run", "1234"):
+        assert words in page.text
+
+
+def test_hostile_names(tmp_path: Path) -> None:
+    evil = "<script>alert(1)</script>$\\frac$&\"'"
+    trajectory = _trajectory(3, 60, line=evil)
+    trajectory.record.versions["<b>numpy"] = "</pre><img src=http://x>"
+    page = _page(_comparison(trajectory), tmp_path / "report.html")
+    assert evil in page.text
+    assert page.tags.count("script") == 3
+    assert page.tags.count("img") == 0
+
+
+def test_replaces_and_leaves_nothing_half_written(tmp_path: Path) -> None:
+    comparison = _comparison(_trajectory(2, 60))
+    (tmp_path / "report.html").write_text("old")
+    _page(comparison, tmp_path / "report.html")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(comparison, comparison.trajectory, tmp_path / "nowhere" / "report.html")
+    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
+
+
+def in_real_time(late: int) -> Comparison:
+    """Every step of every agent is late by so many ns of simulated time."""
+    document = {
+        "name": "timers",
+        "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
+        "switching": {"generator": [[-1, 1], [1, -1]]},
+        "run": {"dt": 0.1, "duration": 20, "replicas": 2, "pace": "realtime", "speed": 10},
+    }
+    trajectory = simulate(Experiment.parse(document))
+    assert trajectory.made is not None
+    made = trajectory.made.copy()
+    made[1:] += late
+    return compare(dataclasses.replace(trajectory, made=made))
+
+
+def test_real_time_has_its_sections(tmp_path: Path) -> None:
+    comparison = in_real_time(150_000_000)
+    write_report(comparison, comparison.trajectory, tmp_path / "report.html")
+    page = Page((tmp_path / "report.html").read_text())
+    assert "The run agrees with the prediction; 100 % of the deadlines were missed." in page.text
+    for text in ("Real time", "late by [ms]", "600 of 600 (100 %)", "Laws", "logged pattern", "for what the log says"):
+        assert text in page.text
+    assert _plots(page) == 9
+    on_time = in_real_time(0)
+    write_report(on_time, on_time.trajectory, tmp_path / "report.html")
+    text = Page((tmp_path / "report.html").read_text()).text
+    assert "The run agrees with the prediction." in text
+    assert "600 of 600 (0 %)" not in text
+    assert "0 of 600 (0 %)" in text
+
+
+def test_lockstep_has_no_timing(tmp_path: Path) -> None:
+    page = _page(_comparison(_trajectory(3, 200)), tmp_path / "report.html")
+    assert "Real time" not in page.text
+    assert "for these steps" in page.text

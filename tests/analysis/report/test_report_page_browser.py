@@ -1,0 +1,186 @@
+"""The report in a browser: no complaint, no request, figures that answer, and all of it on paper."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import Log, chromium
+
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.inference.verdict.pool import compare_pooled
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.trajectory import Completeness, Trajectory
+from msg_analysis.report.html.report_page import write_report
+from msg_analysis.twin.simulate import simulate
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+def _document(agents: int, **run: Any) -> dict[str, Any]:
+    numbers = list(range(1, agents + 1))
+    return {
+        "name": "seen",
+        "graphs": {"line": {"path": numbers}, "ring $$x$$": {"cycle": numbers}},
+        "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
+        "run": {"dt": 0.05, "duration": 20, "replicas": 2, "seed": 7} | run,
+    }
+
+
+def _trajectory(agents: int, **run: Any) -> Trajectory:
+    return simulate(Experiment.parse(_document(agents, **run)))
+
+
+def _open(browser: Any, path: Path) -> tuple[Any, Log]:
+    page = browser.new_page(viewport={"width": 1000, "height": 900})
+    log = Log(page)
+    page.goto(path.as_uri())
+    page.wait_for_selector("body[data-ready=yes]")
+    return page, log
+
+
+def _check(page: Any, log: Log, path: Path) -> None:
+    assert log.complaints == []
+    assert log.requests == [path.as_uri()]
+    # Every figure has been drawn: not all of its pixels are white.
+    blank = page.evaluate(
+        """() => [...window.Bokeh.index.roots].filter((view) => view.el.closest(".plot")).filter((view) => {
+            const canvas = view.export("png", false).canvas;
+            const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+            return !data.some((value, place) => place % 4 < 3 && value < 128 && data[place | 3] > 0);
+        }).length"""
+    )
+    assert blank == 0
+    assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+@pytest.mark.parametrize("agents", [5, 100])
+def test_small_and_large(browser: Any, tmp_path: Path, agents: int) -> None:
+    """Hover shows values; agents are chosen by numbers and by a click; paper has everything."""
+    trajectory = _trajectory(agents, duration=20 if agents == 5 else 6)
+    path = tmp_path / "report.html"
+    write_report(compare(trajectory), trajectory, path)
+    assert path.stat().st_size < 5_000_000
+    page, log = _open(browser, path)
+    _check(page, log, path)
+
+    rows = page.locator("#node-table tbody tr:visible")
+    page.fill("#agents", "2, 4-5")
+    assert rows.count() == 3
+    assert page.evaluate("Bokeh.documents[0].get_model_by_name('lines').data.agent") == [
+        "agent 2",
+        "agent 4",
+        "agent 5",
+    ]
+    assert page.evaluate("Bokeh.documents[0].get_model_by_name('bands').data.xs.length") == 3
+    page.fill("#agents", f"{agents + 1}")
+    assert f"expected numbers from 1 to {agents}" in page.inner_text("#chosen")
+    page.click("#all-agents")
+    assert rows.count() == agents
+
+    # The point of an agent, where the figure has it on the screen.
+    x, y = page.evaluate(
+        """() => {
+            const view = [...Bokeh.index.roots].find((view) => view.model.renderers?.some(
+                (one) => one.data_source.name == "nodes" && one.glyph.type == "Scatter"));
+            view.el.scrollIntoView({block: "center"});
+            const data = Bokeh.documents[0].get_model_by_name("nodes").data;
+            const at = view.canvas_view.el.getBoundingClientRect();
+            const {x_scale, y_scale} = view.frame;
+            return [at.x + x_scale.compute(data.agent[2]), at.y + y_scale.compute(data.measured[2])];
+        }"""
+    )
+    page.mouse.move(x, y)
+    page.locator(".bk-Tooltip", has_text=re.compile(r"agent:?\s*3.*z:?\s*[+\-−]\d", re.DOTALL)).first.wait_for()
+    page.mouse.click(x, y)
+    page.locator("#chosen", has_text=f"1 of {agents} agents").wait_for()
+    assert rows.count() == 1
+    assert page.input_value("#agents") == "3"
+    page.click("#all-agents")
+
+    page.locator("details").last.evaluate("one => one.open = false")
+    paper = page.pdf(format="A4")
+    assert paper.startswith(b"%PDF")
+    assert paper.count(b"/Subtype /Image") >= 5
+    assert page.locator(".plot.pictured").count() == 0  # as before
+    assert page.locator("details[open]").count() == 1
+    assert log.complaints == []
+    page.close()
+
+
+def _in_real_time() -> tuple[Any, Trajectory]:
+    trajectory = _trajectory(3, pace="realtime", speed=5.0)
+    assert trajectory.made is not None
+    made = trajectory.made.copy()
+    made[1:] += 60_000_000
+    late = dataclasses.replace(trajectory, made=made)
+    return compare(late), late
+
+
+def _disagreeing() -> tuple[Any, Trajectory]:
+    document = _document(4)
+    wrong = document | {"graphs": document["graphs"] | {"ring $$x$$": {"edges": [[1, 2], [2, 3], [3, 4], [1, 4, 0.3]]}}}
+    said, did = Experiment.parse(document), simulate(Experiment.parse(wrong).with_run(duration=100))
+    said = said.with_run(duration=100)
+    trajectory = dataclasses.replace(did, record=dataclasses.replace(did.record, experiment=said))
+    return compare(trajectory), trajectory
+
+
+def _incomplete() -> tuple[Any, Trajectory]:
+    trajectory = _trajectory(3)
+    trajectory.states[5, 1] = np.nan
+    count = Completeness(expected=1203, received=1202, missing=1)
+    trajectory = dataclasses.replace(trajectory, completeness=count)
+    return compare(trajectory), trajectory
+
+
+def _pooled() -> tuple[Any, Trajectory]:
+    comparison = compare_pooled([(f"bag_{seed}", _trajectory(3, seed=seed)) for seed in (1, 2, 3)])
+    return comparison, comparison.trajectory
+
+
+def _tracking() -> tuple[Any, Trajectory]:
+    document = {
+        "name": "led",
+        "problem": "tracking",
+        "time": "discrete",
+        "agents": 4,
+        "graphs": {"</script>": {"arcs": [[1, 2], [2, 3], [3, 4], [4, 1]]}, "star": {"star": {"center": 1}}},
+        "switching": {"transition": [[0.9, 0.1], [0.2, 0.8]]},
+        "leaders": {"agents": [2], "gain": "inf", "reference": 3.0},
+        "noise": {"process": 0.5, "loss": 0.1},
+        "run": {"duration": 300},
+    }
+    trajectory = simulate(Experiment.parse(document))
+    return compare(trajectory), trajectory
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (_in_real_time, ["age of the values used", "Real time"]),
+        (_disagreeing, ["The gain of the edge 1-4"]),
+        (_incomplete, ["Too little came"]),
+        (_pooled, ["bag_2", "1, 2, 3"]),
+        (_tracking, ["the leader, agent 2, knows the reference 3", "Probabilities"]),
+    ],
+)
+def test_every_kind(browser: Any, tmp_path: Path, make: Any, words: list[str]) -> None:
+    comparison, trajectory = make()
+    path = tmp_path / "report.html"
+    write_report(comparison, trajectory, path)
+    page, log = _open(browser, path)
+    _check(page, log, path)
+    text = page.inner_text("body")
+    for word in words:
+        assert word in text
+    page.close()

@@ -1,0 +1,255 @@
+"""Tables for a terminal: they show the numbers of the document, also where some are missing."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.report.documents.info import algebraic_connectivity, describe_experiment
+from msg_analysis.report.terminal import bag_text, result_text
+
+
+def shown(function: Any, document: dict[str, Any], width: int = 120) -> str:
+    stream = io.StringIO()
+    function(document, Console(file=stream, width=width, color_system=None, highlight=False))
+    return stream.getvalue()
+
+
+def estimate(measured: float | None) -> dict[str, Any]:
+    known = measured is not None
+    return {
+        "measured": measured,
+        "standard_error": 0.5 if known else None,
+        "predicted": 1.25,
+        "z": 3.14159 if known else None,
+        "interval": [1.5, 2.5] if known else [None, None],
+    }
+
+
+def comparison(verdict: str, agents: int, measured: float | None) -> dict[str, Any]:
+    test = {"name": "switching", "p": 0.0001, "p_adjusted": 0.001, "rejected": True}
+    untested = {"name": "covariance [m > 20]", "p": None, "p_adjusted": None, "rejected": False}
+    return {
+        "verdict": verdict,
+        "completeness": {"expected": 12, "received": 11, "missing": 1, "duplicates": 2, "out_of_order": 3},
+        "steps": 3,
+        "simulated_time": 0.75,
+        "system_error": estimate(measured),
+        "node_errors": [estimate(measured) for _ in range(agents)],
+        "continuous": {"system_error": None},
+        "batch_means": {"interval": [None, None] if measured is None else [1.0, 3.0]},
+        "tests": [untested, test],
+        "level": 0.01,
+    }
+
+
+def test_comparison() -> None:
+    output = shown(result_text.print_comparison, comparison("disagrees", 3, 2.0))
+    assert output.startswith("The run disagrees with the prediction.")
+    assert "11 of 12 states in 3 steps (0.75 units of time): 1 missing, 2 twice, 3 out of order" in output
+    assert output.count("1.5 .. 2.5") == 4
+    assert "+3.14" in output
+    assert "agent 3" in output
+    lines = [line for line in output.splitlines() if "0.0001" in line]
+    assert "rejected" in lines[0]
+    assert "covariance [m > 20]" in output
+    assert "not done" in output
+
+
+def test_strangers() -> None:
+    entry = {"node": "agent_1", "topic": "[red]graph", "reason": "other run", "count": 1234}
+    output = shown(result_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": [entry]})
+    (line,) = (line for line in output.splitlines() if "1234" in line)
+    assert line.split() == ["agent_1", "[red]graph", "other", "run", "1234"]
+    assert "refused" not in shown(result_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": []})
+
+
+def test_comparison_without_numbers() -> None:
+    output = shown(result_text.print_comparison, comparison("incomplete", 2, None))
+    assert output.startswith("No verdict: the data are incomplete.")
+    assert "nan" not in output.lower()
+
+
+def test_many_agents_are_cut_and_it_says_so() -> None:
+    output = shown(result_text.print_comparison, comparison("agrees", 100, 2.0))
+    assert "agent 30" in output
+    assert "agent 31" not in output
+    assert "70 more agents: use --json" in output
+
+
+def test_prediction() -> None:
+    law = {
+        "system_error": 3.5,
+        "node_errors": [1.5, 2.0],
+        "system_certainty": 2 / 7,
+        "node_certainty": [2 / 3, 0.5],
+    }
+    document = {
+        "agents": 2,
+        "modes": ["[red]", "b"],
+        "stationary": [0.25, 0.75],
+        "continuous": law,
+        "emulated": law,
+        "static": None,
+    }
+    output = shown(result_text.print_prediction, document)
+    assert "[red]" in output
+    for part in (
+        "continuous time",
+        "steps of the run",
+        "3.5",
+        "0.285714",
+        "0.25",
+        "graphs held for ever: not",
+    ):
+        assert part in output
+
+
+DOCUMENT: dict[str, Any] = {
+    "name": "walk",
+    "problem": "tracking",
+    "graphs": {
+        "line": {"path": [1, 2, 3, 4]},
+        "arcs": {"arcs": [[1, 2, 0.5], [2, 3], [3, 1]]},
+        "ring": {"cycle": [1, 2, 3, 4]},
+    },
+    "switching": {"generator": [[-1, 0.5, 0.5], [2, -2, 0], [4, 0, -4]]},
+    "leaders": {"agents": [4], "gain": "inf"},
+    "run": {"dt": 0.05, "duration": 50, "replicas": 2},
+}
+
+
+def test_experiment_explained() -> None:
+    document = describe_experiment(Experiment.parse(DOCUMENT))
+    line, arcs, ring = document["graphs"]
+    assert (document["agents"], document["run"]["steps"], document["unavailable"]) == (4, 1000, [])
+    assert [tuple(edge) for edge in line["edges"]] == [(1, 2, 1.0), (2, 3, 1.0), (3, 4, 1.0)]
+    assert arcs["edges"] is None
+    assert sorted(tuple(arc) for arc in arcs["arcs"]) == [(1, 2, 0.5), (2, 3, 1.0), (3, 1, 1.0)]
+    assert [graph["mean_holding_time"] for graph in document["graphs"]] == [1.0, 0.5, 0.25]
+    assert line["algebraic_connectivity"] == pytest.approx(2 - 2**0.5)  # of a path of four
+    assert ring["algebraic_connectivity"] == pytest.approx(2.0)  # of a ring of four
+    shares = [1, 0.25, 0.125]  # detailed balance: share times rate is equal both ways
+    assert [graph["stationary"] for graph in document["graphs"]] == pytest.approx([s / sum(shares) for s in shares])
+    assert document["memory"]["states"] == 1001 * 4 * 2 * 8
+    output = shown(result_text.print_experiment, document)
+    for part in (
+        "tracking of 4 agents in continuous time",
+        "gain inf",
+        "1000 of 0.05",
+        "1>2 (0.5)",
+        "1-2, 2-3, 3-4",
+    ):
+        assert part in output
+
+
+def test_experiment_that_cannot_be_run_yet() -> None:
+    document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"delay": 1}}))
+    assert document["predicted_system_error"] > 0
+    assert "noise.delay: 1: not available in runs yet" in shown(result_text.print_experiment, document)
+
+
+def test_noise_by_graph_and_delay_explained() -> None:
+    """Limits of the graphs alone would say nothing about steps with a delay."""
+    gains = {"line": 1.0, "ring": [0.5, 1.0, 1.0, 2.0], "arcs": [[1.0, 0.0, 0.0, 0.5]] * 4}
+    document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"process": gains, "delay": 2}}))
+    assert document["stability_limit"] is None
+    assert document["predicted_system_error"] > 0
+    output = " ".join(shown(result_text.print_experiment, document).split())
+    assert "line: 1.0; ring: [0.5, 1.0, 1.0, 2.0]; arcs: matrix 4 x 4" in output
+    assert "delay 2" in output
+
+
+def test_one_graph_that_is_never_left() -> None:
+    plain = {"name": "one", "graphs": {"line": {"path": [1, 2]}}}
+    (graph,) = describe_experiment(Experiment.parse(plain))["graphs"]
+    assert graph["mean_holding_time"] is None
+    assert graph["stationary"] == 1.0
+
+
+def test_algebraic_connectivity_against_networkx() -> None:
+    import networkx as nx
+
+    network = nx.connected_watts_strogatz_graph(12, 4, 0.3, seed=1)
+    links = [[i + 1, j + 1] for i, j in network.edges]
+    experiment = Experiment.parse({"name": "net", "graphs": {"net": {"edges": links}}})
+    expected = nx.algebraic_connectivity(network, method="lanczos", seed=1)
+    assert algebraic_connectivity(experiment.graph_list[0]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_bag() -> None:
+    completeness = {"expected": 4, "received": 3, "missing": 1, "duplicates": 0, "out_of_order": 0}
+    document = {
+        "bag": "[bold]bag",
+        "run": "d3ba43f6",
+        "experiment": "small",
+        "seed": 1,
+        "agents": 2,
+        "replicas": 1,
+        "steps": 1,
+        "simulated_time": 0.05,
+        "completeness": completeness
+        | {"missing_modes": 0, "refused": {"other run": 5}, "complete": False, "stretch": [1, 1]},
+        "recording": 4711,
+        "problem": None,
+        "topics": [{"name": f"/[red]{i}", "type": "pkg/msg/Kind", "messages": i} for i in range(14)],
+        "files": [
+            {"name": "log.txt", "size": 1234567},
+            {
+                "name": "bag_0.mcap",
+                "size": 3,
+                "messages": 8,
+                "compression": "lz4",
+                "torn": "cut off",
+                "damaged_chunks": 2,
+                "lost_messages": 77,
+                "problem": None,
+            },
+        ],
+        "versions": {"numpy": "2.0"},
+    }
+    output = " ".join(shown(bag_text.print_bag, document).split())
+    for part in (
+        *("[bold]bag", "d3ba43f6", "incomplete: 3 of 4, 1 missing", "5: other run", "1.23 MB", "2.0"),
+        *("process 4711", "steps 1 to 1; numbers need one from step 0", "/[red]11, 11 messages, pkg/msg/Kind"),
+        *("and 2 more with 25 messages", "8 messages, lz4, torn: cut off", "2 damaged chunks, 77 messages"),
+    ):
+        assert part in output
+    nothing = dict.fromkeys(document) | {
+        "bag": "b",
+        "problem": "no [run]",
+        "topics": [],
+        "files": [],
+        "versions": {},
+    }
+    assert "no [run]" in shown(bag_text.print_bag, nothing)
+
+
+def test_real_time() -> None:
+    """Timing and laws are shown; missed deadlines stand in the line of the verdict."""
+    quantiles = {"p50": 0.1, "p95": 2.0, "p99": 30.0, "max": None}
+    error = estimate(2.0)
+    law = {"system_error": error, "supported": None, "why": "because"}
+    timing = {
+        "period_ms": 10.0,
+        **dict.fromkeys(("lateness_ms", "jitter_ms", "staleness_ms", "staleness_steps"), quantiles),
+        "deadlines": {"steps": 1000, "missed": 73, "share": 0.073},
+        "ideal_uses": {"uses": 400, "ideal": 300, "share": 0.75},
+        "outdated_graph": {"steps": 1, "share": 0.00001},
+        "never_heard": 4,
+    }
+    laws = {"pattern": law | {"supported": True}, "sequential": law, "continuous": law | {"supported": False}}
+    document = comparison("agrees", 3, 2.0) | {"timing": timing, "laws": laws | {"why": "the reasons"}}
+    output = shown(result_text.print_comparison, document)
+    assert output.startswith("The run agrees with the prediction; 7.3 % of the deadlines were missed.")
+    for part in ("late by [ms]", "73 of 1000 (7.3 %)", "300 of 400 (75 %)", "1 of 1000 (less than 0.01 %)"):
+        assert part in output
+    assert "neighbours not heard of yet" in output
+    assert output.count("supported") == 2
+    assert "not decided" in output
+    assert "the reasons" in output
+    assert "Timing" not in shown(result_text.print_comparison, comparison("agrees", 3, 2.0))

@@ -1,0 +1,113 @@
+"""The comparison with the twin finds what was changed, and says where."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import simulate
+from msg_analysis.types import FloatArray, IntArray
+
+
+@pytest.fixture(scope="module")
+def twin() -> Trajectory:
+    experiment = Experiment.parse(
+        {
+            "name": "checked",
+            "problem": "consensus",
+            "time": "continuous",
+            "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
+            "switching": {"generator": [[-1, 1], [1, -1]]},
+            "run": {"dt": 0.05, "duration": 20, "replicas": 2, "seed": 5},
+        }
+    )
+    return simulate(experiment)
+
+
+@pytest.fixture
+def stored(twin: Trajectory, tmp_path: Path) -> Callable[..., Trajectory]:
+    """The twin with other states or modes, written to a bag and read again."""
+
+    def store(states: FloatArray | None = None, modes: IntArray | None = None) -> Trajectory:
+        changed = dataclasses.replace(
+            twin,
+            states=twin.states if states is None else states,
+            modes=twin.modes if modes is None else modes,
+        )
+        write_trajectory(changed, tmp_path / "bag")
+        return read_bag(tmp_path / "bag")
+
+    return store
+
+
+def flip(states: FloatArray, *where: int) -> FloatArray:
+    """The last bit of one number turned over."""
+    changed = states.copy()
+    bits = changed.view(np.uint64)
+    bits[where] ^= np.uint64(1)
+    return changed
+
+
+def test_equal(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+    outcome = check(stored())
+    assert outcome.difference is None
+    assert outcome.compared == twin.states.shape[0] * 3
+    assert outcome.missing == 0
+
+
+@pytest.mark.parametrize("where", [(0, 0, 0), (17, 2, 1), (400, 1, 0)])
+def test_one_bit(twin: Trajectory, stored: Callable[..., Trajectory], where: tuple[int, int, int]) -> None:
+    step, agent, replica = where
+    changed = flip(twin.states, *where)
+    difference = check(stored(changed)).difference
+    assert difference == (
+        f"agent {agent + 1} at step {step}, replica {replica + 1}: logged {float(changed[where])!r}, "
+        f"the law gives {float(twin.states[where])!r}"
+    )
+
+
+def test_the_first_of_several_is_named(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+    changed = flip(flip(flip(twin.states, 30, 0, 1), 29, 2, 0), 29, 1, 1)
+    assert str(check(stored(changed)).difference).startswith("agent 2 at step 29, replica 2:")
+
+
+def test_wrong_graph(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+    modes = twin.modes.copy()
+    modes[40:50] = 1 - modes[40:50]
+    names = ["line", "ring"]
+    expected = f"graph of step 40: logged {names[modes[40]]}, the seed gives {names[twin.modes[40]]}"
+    assert check(stored(modes=modes)).difference == expected
+
+
+@pytest.mark.parametrize(("state_step", "first"), [(40, "agent 1"), (41, "graph")])
+def test_state_or_graph_whichever_came_first(
+    twin: Trajectory, stored: Callable[..., Trajectory], state_step: int, first: str
+) -> None:
+    """x(40) is older than the choice of g(40), x(41) comes out of it."""
+    modes = twin.modes.copy()
+    modes[40] = 1 - modes[40]
+    outcome = check(stored(flip(twin.states, state_step, 0, 0), modes))
+    assert str(outcome.difference).startswith(first)
+
+
+def test_missing_states_are_counted_and_do_not_differ(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+    states = twin.states.copy()
+    states[100:, 1] = np.nan
+    outcome = check(stored(states))
+    assert outcome.difference is None
+    assert outcome.missing == len(states) - 100
+    assert outcome.compared == states.shape[0] * 3 - outcome.missing
+
+
+def test_another_seed_differs_at_once(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+    other = simulate(twin.record.experiment.with_run(seed=6))
+    assert str(check(stored(other.states)).difference).startswith("agent 1 at step 0")

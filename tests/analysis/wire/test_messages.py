@@ -1,0 +1,241 @@
+"""The codec against hand-made bytes and against rosbags' independent serializer."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from msg_analysis.wire.cdr_fields import CdrError
+from msg_analysis.wire.messages import (
+    ActiveGraph,
+    AgentState,
+    Progress,
+    StateCodec,
+    StateFrame,
+    decode_string,
+    encode_string,
+    stamp_ns,
+    with_state,
+)
+
+RUN = bytes(range(16))
+U32, U64 = st.integers(0, 2**32 - 1), st.integers(0, 2**64 - 1)
+TEXT = st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=9)
+REAL = st.floats(allow_nan=False)
+quick = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def _header(typestore: Any, stamp: int, frame_id: str) -> Any:
+    time = typestore.types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return typestore.types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id)
+
+
+def _oracle(typestore: Any, message: AgentState | ActiveGraph | Progress, little: bool = True) -> bytes:
+    """The bytes that rosbags makes of the same message."""
+    name = f"msg_agents_interfaces/msg/{type(message).__name__}"
+    fields: dict[str, Any] = {"header": _header(typestore, message.stamp, message.frame_id)}
+    fields["run"] = np.frombuffer(message.run, np.uint8)
+    if isinstance(message, ActiveGraph):
+        source, target, weight = zip(*message.arcs, strict=True) if message.arcs else ((), (), ())
+        fields |= {
+            "sequence": message.sequence,
+            "mode": message.mode,
+            "name": message.name,
+            "first_step": message.first_step,
+            "last_step": message.last_step,
+            "source": np.array(source, np.uint32),
+            "target": np.array(target, np.uint32),
+            "weight": np.array(weight, np.float64),
+        }
+    else:
+        fields |= {"agent": message.agent, "step": message.step}
+    if isinstance(message, AgentState):
+        fields |= {"mode": message.mode, "heard": message.heard, "state": message.state}
+    return bytes(typestore.serialize_cdr(typestore.types[name](**fields), name, little_endian=little))
+
+
+def _same(one: Any, other: Any) -> None:
+    for name in one.__slots__:
+        a, b = getattr(one, name), getattr(other, name)
+        assert np.array_equal(a, b), name
+
+
+def test_state_by_hand() -> None:
+    data = StateCodec(RUN, 3, 2, 0.05).encode(30, 2, np.array([1.0, -2.0]))
+    assert data == (
+        b"\x00\x01\x00\x00"
+        + struct.pack("<iI", 1, 500_000_000)  # 30 * 0.05
+        + b"\x01\x00\x00\x00\x00"  # frame_id: its NUL
+        + RUN
+        + b"\x00\x00\x00"  # 29 -> 32
+        + b"\x03\x00\x00\x00"
+        + b"\x00\x00\x00\x00"  # 36 -> 40
+        + struct.pack("<QI", 30, 2)
+        + struct.pack("<I", 0)  # heard
+        + struct.pack("<I", 2)
+        + b"\x00\x00\x00\x00"  # 60 -> 64
+        + struct.pack("<2d", 1.0, -2.0)
+    )
+    assert stamp_ns(data) == 1_500_000_000
+
+
+@pytest.mark.parametrize("replicas", [1, 16])
+def test_fast_codec_is_the_general_one(typestore: Any, replicas: int) -> None:
+    state = np.random.default_rng(1).standard_normal(replicas)
+    data = StateCodec(RUN, 7, replicas, 0.25).encode(9, 1, state)
+    message = AgentState(2_250_000_000, RUN, 7, 9, 1, state)
+    assert data == message.encode()
+    assert data == _oracle(typestore, message)
+    assert StateFrame(RUN, replicas).unwrap(data) == (7, 9, 1, struct.pack(f"<{replicas}d", *state))
+
+
+@quick
+@given(U64, U32, U32, TEXT, st.lists(U64, max_size=4), st.lists(REAL, min_size=1, max_size=4), st.booleans())
+def test_state_against_rosbags(
+    typestore: Any,
+    step: int,
+    agent: int,
+    mode: int,
+    frame: str,
+    heard: list[int],
+    state: list[float],
+    little: bool,
+) -> None:
+    message = AgentState(step % 10**15, RUN, agent, step, mode, np.array(state), np.array(heard, np.uint64), frame)
+    _same(AgentState.decode(_oracle(typestore, message, little)), message)
+    if little:
+        assert message.encode() == _oracle(typestore, message)
+    _same(AgentState.decode(message.encode()), message)
+
+
+@quick
+@given(U32, TEXT, TEXT, U64, U64, st.lists(st.tuples(U32, U32, REAL), min_size=1, max_size=4), st.booleans())
+def test_graph_against_rosbags(
+    typestore: Any, mode: int, frame: str, name: str, first: int, last: int, arcs: list[Any], little: bool
+) -> None:
+    message = ActiveGraph(5 * 10**9 + 3, RUN, 4, mode, name, first, last, tuple(arcs), frame)
+    assert ActiveGraph.decode(_oracle(typestore, message, little)) is not None
+    _same(ActiveGraph.decode(_oracle(typestore, message, little)), message)
+    if little:
+        assert message.encode() == _oracle(typestore, message)
+
+
+@quick
+@given(U32, U64, TEXT)
+def test_progress_against_rosbags(typestore: Any, agent: int, step: int, frame: str) -> None:
+    message = Progress(17, RUN, agent, step, frame)
+    assert message.encode() == _oracle(typestore, message)
+    assert Progress.decode(message.encode()) == message
+
+
+@quick
+@given(TEXT)
+def test_string_against_rosbags(typestore: Any, text: str) -> None:
+    name = "std_msgs/msg/String"
+    data = bytes(typestore.serialize_cdr(typestore.types[name](data=text), name))
+    assert encode_string(text) == data
+    assert decode_string(data) == text
+    assert decode_string(data + b"\x00\x00") == text  # middleware may pad
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        AgentState(5, RUN, 1, 2, 1, np.ones(3), np.array([1, 2], np.uint64), "base"),
+        ActiveGraph(5, RUN, 0, 1, "line", 0, 9, ((1, 2, 0.5), (2, 1, 0.5)), "base"),
+        Progress(5, RUN, 1, 2),
+    ],
+    ids=["AgentState", "ActiveGraph", "Progress"],
+)
+def test_damaged_bytes_are_refused_and_cost_no_memory(message: AgentState | ActiveGraph | Progress) -> None:
+    decode, data = type(message).decode, message.encode()
+    for length in range(len(data)):
+        with pytest.raises(CdrError):
+            decode(data[:length])
+    with pytest.raises(CdrError, match="too many"):
+        decode(data + bytes(8))
+    rng = random.Random(3)
+    for _ in range(300):
+        garbage = bytearray(data)
+        for _ in range(4):
+            garbage[rng.randrange(len(garbage))] = rng.choice([0, 1, 0x7F, 0xFF])
+        with contextlib.suppress(CdrError):  # any other exception fails the test
+            decode(bytes(garbage))
+
+
+def test_messages_name_the_field() -> None:
+    data = AgentState(5, RUN, 1, 2, 1, np.ones(1)).encode()
+    with pytest.raises(CdrError, match=r"AgentState\.state: needs"):
+        AgentState.decode(data[:-1])
+    huge = bytearray(data)
+    huge[60:64] = b"\xff\xff\xff\xff"  # four thousand million numbers
+    with pytest.raises(CdrError, match=r"AgentState\.state"):
+        AgentState.decode(bytes(huge))
+    with pytest.raises(CdrError, match="CDR header"):
+        AgentState.decode(b"\x00\x07" + data[2:])
+    with pytest.raises(CdrError, match="UTF-8"):
+        decode_string(b"\x00\x01\x00\x00\x02\x00\x00\x00\xff\x00")
+    with pytest.raises(CdrError, match="NUL"):
+        decode_string(b"\x00\x01\x00\x00\x02\x00\x00\x00ab")
+    with pytest.raises(CdrError, match="stamp"):
+        stamp_ns(b"\x00\x01")
+
+
+def test_frame_refuses_what_is_not_its_own() -> None:
+    frame, good = StateFrame(RUN, 2), AgentState(5, RUN, 1, 2, 1, np.ones(2))
+    assert frame.unwrap(good.encode()) is not None
+    others = [
+        AgentState(5, RUN[::-1], 1, 2, 1, np.ones(2)),
+        AgentState(5, RUN, 1, 2, 1, np.ones(3)),
+        AgentState(5, RUN, 1, 2, 1, np.ones(2), frame_id="x"),
+        AgentState(5, RUN, 1, 2, 1, np.ones(1), np.array([1], np.uint64)),  # as long as the expected one
+    ]
+    assert all(frame.unwrap(other.encode()) is None for other in others)
+    assert frame.unwrap(b"") is None
+
+
+@pytest.mark.parametrize("replicas", [1, 16])
+@pytest.mark.parametrize("heard", [[8], [8, 2**64 - 1, 8]])
+def test_fast_codec_with_heard_is_the_general_one(typestore: Any, replicas: int, heard: list[int]) -> None:
+    payload = struct.pack(f"<{replicas}d", *range(replicas))
+    data = StateCodec(RUN, 7, replicas, 0.25).wrap(9, 1, payload, heard)
+    state = np.arange(replicas, dtype=float)
+    message = AgentState(2_250_000_000, RUN, 7, 9, 1, state, np.array(heard, np.uint64))
+    assert data == _oracle(typestore, message)
+    frame = StateFrame(RUN, replicas, 3)
+    assert frame.unwrap(data) == (7, 9, 1, payload)
+    assert len(data) <= frame.size
+    other = struct.pack(f"<{replicas}d", *range(1, replicas + 1))
+    assert frame.unwrap(with_state(data, other)) == (7, 9, 1, other)
+    assert AgentState.decode(with_state(data, other)).heard.tolist() == heard
+    for length in (1, 5):
+        decoded = AgentState.decode(with_state(data, bytes(8 * length), len(other)))
+        assert (decoded.state.tolist(), decoded.heard.tolist(), decoded.step) == ([0.0] * length, heard, 9)
+    assert StateFrame(RUN, replicas).unwrap(data) is None  # of a run in which nothing can be lost
+    if len(heard) > 1:
+        assert StateFrame(RUN, replicas, len(heard) - 1).unwrap(data) is None
+
+
+def test_frame_with_heard_refuses_what_is_not_its_own() -> None:
+    """Every length, every byte before the state changed: refused or, where the field may be anything, another one."""
+    frame, good = StateFrame(RUN, 2, 3), StateCodec(RUN, 1, 2, 0.1).wrap(2, 1, bytes(16), [1, 1])
+    assert frame.unwrap(good) == (1, 2, 1, bytes(16))
+    assert all(frame.unwrap(good[:length]) is None for length in range(len(good)))
+    for place in [*range(4), *range(12, 33), *range(56, 60), *range(76, 80)]:  # header, frame_id, run, both lengths
+        assert frame.unwrap(good[:place] + bytes([good[place] ^ 0xFF]) + good[place + 1 :]) is None, place
+
+
+def test_codec_refuses_a_state_that_would_be_another_message() -> None:
+    codec = StateCodec(RUN, 1, 2, 0.1)
+    for state in (np.ones(3), np.ones((2, 1)), np.ones(2, np.float32)):
+        with pytest.raises(ValueError, match="state"):
+            codec.encode(0, 0, state)
+    with pytest.raises(ValueError, match="run"):
+        StateCodec(b"short", 1, 2, 0.1)
