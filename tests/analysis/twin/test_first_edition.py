@@ -11,8 +11,8 @@ import pytest
 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.twin import simulate
 from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import simulate
 
 
 def approximately(value: Any) -> Any:

@@ -54,10 +54,8 @@ WRITE = """
 import sys
 from pathlib import Path
 from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import Experiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.twin import simulate
+from msg_analysis.twin.simulate import simulate
 for file in map(Path, sys.argv[1:]):
     write_trajectory(simulate(Experiment.load(file)), file.with_suffix(""))
 """
