@@ -1,5 +1,5 @@
 #!/bin/bash
-# Makes ROS 2 and this software known, then runs what it is told to.
+# Set the paths of ROS 2 and of this software, then run the given command.
 set -e
 source /opt/ros/jazzy/setup.bash
 source /opt/msg_agents/setup.bash

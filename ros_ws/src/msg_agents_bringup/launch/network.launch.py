@@ -2,7 +2,7 @@
 
     ros2 launch msg_agents_bringup network.launch.py experiment:=line_ring duration:=50.0
 
-What there is to decide is decided in msg_agents.running.launch_support; here it is only said to launch.
+All decisions are made in msg_agents.running.launch_support; this file only passes them to launch.
 """
 
 from pathlib import Path
@@ -35,7 +35,7 @@ def generate_launch_description():
 
 
 def start(context):
-    """The nodes, and what is to be done when they end. An exception, here or there, ends the launch: exit code 1."""
+    """The nodes, and the actions when they end. An exception in any of them ends the launch with exit code 1."""
     arguments = {name: LaunchConfiguration(name).perform(context) for name in NETWORK_ARGUMENTS}
     network = LaunchedNetwork(arguments, Path(get_package_share_directory("msg_agents_bringup")))
     actions = [RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: network.close()))]
@@ -57,7 +57,7 @@ def start(context):
 
 
 def ending(network, name):
-    """What is to be done when a process of this name has ended."""
+    """The action when the process of this name has ended."""
 
     def on_exit(event, context):
         return after(network) if network.ended(name, event.returncode) else None
@@ -66,7 +66,7 @@ def ending(network, name):
 
 
 def after(network):
-    """What comes after a complete run."""
+    """The actions after a complete run."""
     done = EmitEvent(event=Shutdown(reason="the run is complete"))
     if network.analysis is None:
         return [done]

@@ -22,7 +22,7 @@ def generate_launch_description():
 
 
 def start(context):
-    """The player, and the watcher where one is wanted; the launch ends with the one of them that ends last."""
+    """The player and, if requested, `live`; the launch ends when both have ended."""
     arguments = {name: LaunchConfiguration(name).perform(context) for name in REPLAY_ARGUMENTS}
     commands = replay_commands(arguments)
     running = {executable for executable, _ in commands}
