@@ -52,7 +52,7 @@ class LeaderProblem:
 
     @cached_property
     def doubt(self) -> str | None:
-        """Why supermodularity is not known; None where it is (docs/leaders.md, "Why greedy choice works").
+        """Why supermodularity is not known; None where it is (docs/leaders.md, "Supermodularity").
 
         E(S) sums, over pairs of walkers that start at one agent and see the same graphs, the noise covariance between
         the agents where they are, until a leader absorbs one of them. With entries >= 0 in every factor this is a
@@ -233,7 +233,7 @@ def select_leaders(
     top: int = 10,
     watch: Watch = ignore,
 ) -> Selection:
-    """The set of leaders with the least system error, or a good one (docs/leaders.md, "How it searches").
+    """The set of leaders with the least system error, or a good one (docs/leaders.md, "Search methods").
 
     Parameters
     ----------

@@ -88,7 +88,7 @@ class JumpSystem:
 
 
 def emulated(step: StepModel, problem: str) -> JumpSystem:
-    """What the steps of a run do, exactly (docs/theory.md, "What the network does" and "Beyond the paper").
+    """What the steps of a run do, exactly (docs/theory.md, "The law of the steps" and "Beyond the paper").
 
     "consensus": the disagreement, in a Helmert basis of the vectors whose entries sum to zero; exact for every W with
     W 1 = 1. "tracking": the deviation from the reference, all agents (a start may put grounded leaders elsewhere).
