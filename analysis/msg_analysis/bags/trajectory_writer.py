@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_analysis.bags.format.storage_options import DEFAULT, Storage
+from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
 from msg_analysis.model.arithmetic.payload import to_payload
@@ -23,7 +23,7 @@ from msg_analysis.wire.messages import ActiveGraph, StateCodec, encode_string
 from msg_analysis.wire.schemas import network_topics, state_topic, truth_topic
 
 
-def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT) -> None:
+def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT_STORAGE) -> None:
     """Write a bag, whole or not at all; BagError where the directory exists or cannot be written."""
     directory = Path(directory).absolute()
     if directory.exists():

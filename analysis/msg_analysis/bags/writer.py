@@ -17,7 +17,7 @@ from typing import BinaryIO, Self
 from mcap.writer import CompressionType, Writer
 
 from msg_analysis.bags.format.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
-from msg_analysis.bags.format.storage_options import DEFAULT, Compression, Storage
+from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Compression, Storage
 from msg_analysis.errors import BagError
 from msg_analysis.wire.schemas import Topic
 
@@ -52,7 +52,7 @@ class BagWriter:
     """
 
     def __init__(
-        self, directory: Path, topics: Sequence[Topic], *, record: str | None = None, storage: Storage = DEFAULT
+        self, directory: Path, topics: Sequence[Topic], *, record: str | None = None, storage: Storage = DEFAULT_STORAGE
     ) -> None:
         self.directory = Path(directory).absolute()
         self._topics, self._record = tuple(topics), record

@@ -15,7 +15,7 @@ from msg_analysis.model.experiment.problems import show
 from msg_analysis.sweep.plan import Sweep
 from msg_analysis.sweep.table import Row, column_names
 
-DEFAULT = "system_error"
+DEFAULT_COLUMN = "system_error"
 HALF = 1.959963984540054  # standard errors on each side of a 95 % interval
 
 
@@ -55,7 +55,7 @@ def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None) -> Pic
 
     ``column`` may be the beginning of a name: ``system_error`` stands for what is measured or predicted of it.
     """
-    wanted = column or DEFAULT
+    wanted = column or DEFAULT_COLUMN
     names = _columns(rows, wanted)
     if not names["value"]:
         if column is None:  # nothing but failures

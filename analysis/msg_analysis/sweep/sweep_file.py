@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator
 
 from msg_analysis.model.experiment.spec import Count, expected, is_number
-from msg_analysis.sweep.jobs.job import Kind
+from msg_analysis.sweep.jobs.job import JobKind
 
 MOST_POINTS = 20_000  # of a sweep: the experiments of all are held in memory
 
@@ -93,7 +93,7 @@ class SweepSpec(BaseModel):
     ] = Field(
         description="an experiment file, relative to this file, or the experiment itself", examples=["line_ring.yaml"]
     )
-    kind: Kind = Field(
+    kind: JobKind = Field(
         "predict",
         description="at every point: predict the errors; simulate a run with the offline twin and compare it; or run a "
         "network of ROS 2 processes and compare it",

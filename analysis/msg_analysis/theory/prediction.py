@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from msg_analysis.model.experiment.experiment import Experiment
 
 
-ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding
+ERROR_ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding
 SHOWN_AGENTS = 30  # most agents in a notebook's table; the arrays have all of them
 WEAK_NOISE = 1e-6  # directions with less noise, relative to the noisiest one, do not show whether steps are stable
 
@@ -63,7 +63,7 @@ class Moments:
     def node_errors(self) -> FloatArray:
         """(m,) E_i."""
         errors = np.diag(self.covariance)
-        return np.where(errors > ROUNDING * errors.max(initial=0.0), errors, 0.0)
+        return np.where(errors > ERROR_ROUNDING * errors.max(initial=0.0), errors, 0.0)
 
     @property
     def system_error(self) -> float:

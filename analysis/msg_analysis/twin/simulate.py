@@ -14,7 +14,7 @@ from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.model.step.air import LOST
-from msg_analysis.model.step.air_reception import Reception
+from msg_analysis.model.step.air_reception import AirReception
 from msg_analysis.model.step.step_model import StepMatrices, StepModel, build_model
 from msg_analysis.twin.ideal_timers import IdealTimers
 from msg_analysis.twin.network_steps import states as states_of_all
@@ -75,7 +75,7 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
         whole = Completeness(states.shape[0] * states.shape[1], states.shape[0] * states.shape[1], 0)
         return Trajectory(record, states, modes, whole, agent_modes, used=used, made=made)
     on_air = experiment.noise.on_air
-    published, lost = Reception(experiment, model).log(states, modes) if on_air else (None, None)
+    published, lost = AirReception(experiment, model).log(states, modes) if on_air else (None, None)
     expected = states.shape[0] * states.shape[1] * (1 if published is None else 2)
     return Trajectory(record, states, modes, Completeness(expected, expected, 0), published=published, lost=lost)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from msg_analysis.inference.blame.causes import Accused, Cause, find_causes
 from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate, covariance_test, estimates
-from msg_analysis.inference.errors.ranking import order_of_nodes
+from msg_analysis.inference.errors.ranking import rank_agents
 from msg_analysis.inference.errors.time_means import TimeMeans
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
 from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import loss_test
@@ -109,7 +109,7 @@ def judge(
         timing=evidence.timing,
         laws=evidence.laws,
         given=evidence.given,
-        order=order_of_nodes(means, level),
+        order=rank_agents(means, level),
         blame=blame,
     )
 

@@ -195,7 +195,7 @@ def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
     return array
 
 
-def installed() -> dict[str, list[EntryPoint]]:
+def installed_protocols() -> dict[str, list[EntryPoint]]:
     """Entry points of the installed protocols, by name; several where packages offer the same name."""
     found: dict[str, list[EntryPoint]] = {}
     for point in entry_points(group=ENTRY_POINTS):
@@ -219,7 +219,7 @@ def _absent(recorded: ProtocolInfo, problems: list[str]) -> ChosenProtocol:
 
 
 def _find(spec: ProtocolSpec) -> tuple[ChosenProtocol | None, list[str]]:
-    offers = installed()
+    offers = installed_protocols()
     points = offers.get(spec.name, [])
     if len(points) != 1:
         known = ", ".join(f"{name} ({_package(point)})" for name in offers for point in offers[name])

@@ -22,7 +22,7 @@ def padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
     return columns, there
 
 
-class Reception:
+class AirReception:
     """The values that go into ``law.step``, step after step, and what is logged of them."""
 
     def __init__(self, experiment: Experiment, model: StepModel) -> None:

@@ -27,7 +27,7 @@ def require_libraries() -> None:
 
 
 @functools.cache
-def installed() -> str:
+def installed_software() -> str:
     """Versions of msg_analysis, numpy and scipy in one line, with a digest of the code that results depend on.
 
     The digest covers ``model``, ``theory``, ``inference``, the twin and ``sweep/point.py``.

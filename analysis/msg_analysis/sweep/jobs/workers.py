@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from msg_analysis.errors import InputError
-from msg_analysis.sweep.jobs.software import installed
+from msg_analysis.sweep.jobs.software import installed_software
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -197,7 +197,7 @@ class Workers:
 
     def _submit(self, function: Function[T, R], batch: list[T], running: dict[Future, list[T]], done: Any) -> None:
         assert self._client is not None
-        future = self._client.submit(_do, function, batch, self._stop_name, installed(), pure=False)
+        future = self._client.submit(_do, function, batch, self._stop_name, installed_software(), pure=False)
         running[future] = batch
         done.add(future)
 
@@ -237,16 +237,16 @@ class Workers:
         """Refuse workers with other software; those that join later refuse themselves in ``_do``."""
         assert self._client is not None
         try:
-            found = self._client.run(installed)
+            found = self._client.run(installed_software)
         except ModuleNotFoundError as error:
             raise InputError(
                 f"--scheduler {self._scheduler}: {error}: install the same software on its workers"
             ) from error
         for worker, software in found.items():
-            if software != installed():
+            if software != installed_software():
                 raise InputError(
-                    f"--scheduler {self._scheduler}: worker {worker} has {software}: expected {installed()}: install "
-                    "the same software there"
+                    f"--scheduler {self._scheduler}: worker {worker} has {software}: expected "
+                    f"{installed_software()}: install the same software there"
                 )
 
 
@@ -261,8 +261,8 @@ def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: 
     """On a worker: do a batch, and time it [s]; one thread of linear algebra, since there is a worker for every CPU."""
     from threadpoolctl import threadpool_limits
 
-    if installed() != software:
-        raise InputError(f"it has {installed()}: expected {software}")
+    if installed_software() != software:
+        raise InputError(f"it has {installed_software()}: expected {software}")
     stopping = _Stopping(stop_name)
     begin = time.perf_counter()
     results = []
