@@ -17,16 +17,22 @@ from msg_analysis.types import FloatArray, IntArray
 
 
 def states(
-    experiment: Experiment, model: StepModel, modes: IntArray, start: FloatArray, first: int = 0
+    experiment: Experiment,
+    model: StepModel,
+    modes: IntArray,
+    start: FloatArray,
+    first: int = 0,
+    reception: AirReception | None = None,
 ) -> Iterator[FloatArray]:
     """x(first + 1), x(first + 2), ..., each (m, R), from x(first) under the graphs ``modes`` from there on.
 
-    ``first`` is a multiple of STEPS_PER_BLOCK; the steps before a run are negative.
+    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``reception``: one that keeps a log.
     """
     drives = _drives(experiment, model, modes, first)
     if experiment.run.pace == "realtime":
         return IdealTimers(experiment, model).states(modes, start, drives)
-    reception = AirReception(experiment, model) if experiment.noise.on_air else None
+    if experiment.noise.on_air and reception is None:
+        reception = AirReception(experiment, model)
     return _synchronous(model, modes, start, drives, reception, first)
 
 

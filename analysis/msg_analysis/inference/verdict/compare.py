@@ -45,7 +45,7 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     unpredicted = protocol.unpredictable() if protocol else None
     if unpredicted:
         return _measured(trajectory, level, unpredicted)
-    prediction = predict(trajectory.record.experiment)
+    prediction = predict(trajectory.record.experiment, trajectory.record.step_model)
     if trajectory.prefix < MIN_STEPS and not trajectory.completeness.complete:
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
     observation = Observation.of(trajectory, prediction)

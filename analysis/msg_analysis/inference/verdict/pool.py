@@ -41,7 +41,7 @@ def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.0
         _require_another(members, name, run.record)
         if prediction is None:
             _require_prediction(name, run.record.experiment)
-            prediction, trajectory = predict(run.record.experiment), _without_data(run)
+            prediction, trajectory = predict(run.record.experiment, run.record.step_model), _without_data(run)
         member, evidence = _examine(name, run, prediction, level)
         members.append(member)
         if evidence:

@@ -25,6 +25,13 @@ def _adapter(key: str) -> TypeAdapter[Any]:
     return TypeAdapter(annotation)
 
 
+def _section(key: str, mapping: Mapping[Any, Any]) -> Any:
+    """One valid section of a document with mistakes in others."""
+    if key in mapping:
+        return _adapter(key).validate_python(mapping[key])
+    return ExperimentSpec.model_fields[key].get_default(call_default_factory=True, validated_data={})
+
+
 class Sections:
     """A document that is being checked: a section is None as long as it is not known to be valid.
 
@@ -35,20 +42,12 @@ class Sections:
         self.problems: list[str] = []
         bad: set[str] = set()
         try:
-            ExperimentSpec.model_validate(dict(mapping))
+            spec = ExperimentSpec.model_validate(dict(mapping))
+            self.values = {key: getattr(spec, key) for key in ExperimentSpec.model_fields}
         except ValidationError as error:
             self.problems += [translate(detail) for detail in error.errors(include_url=False)]
             bad = {str(detail["loc"][0]) for detail in error.errors(include_url=False)}
-
-        def section(key: str) -> Any:
-            if key in bad:
-                return None
-            info = ExperimentSpec.model_fields[key]
-            if key not in mapping:
-                return info.get_default(call_default_factory=True, validated_data={})
-            return _adapter(key).validate_python(mapping[key])
-
-        self.values = {key: section(key) for key in ExperimentSpec.model_fields}
+            self.values = {key: None if key in bad else _section(key, mapping) for key in ExperimentSpec.model_fields}
         self.known = set(self.values) - bad
         run = self.values["run"]
         if run is not None and self.values["time"] == "discrete" and "dt" not in run.model_fields_set:
