@@ -321,7 +321,7 @@ def compare(*runs: Trajectory | str | Path, level: float = 0.01) -> Comparison:
     if not runs:
         raise InputError("no run: give at least one, or the path of its bag")
     if not 0.0 < level <= 0.5:
-        raise InputError(f"level: {level:g}: expected a chance above 0, 0.5 at most")
+        raise InputError(f"level: {level:g}: expected a probability above 0, at most 0.5")
     if len(runs) == 1:
         return compare_trajectory(_read(runs[0]), level=level)
     absent = [str(path) for path in runs if not isinstance(path, Trajectory) and not Path(path).exists()]

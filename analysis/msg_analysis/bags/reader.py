@@ -74,7 +74,7 @@ def bag_files(path: Path) -> list[Path]:
     if information is None:
         files = [file for suffix in ("mcap", "mcap.zstd") for file in path.glob(f"*.{suffix}")]
         if not files:
-            raise BagError(f"{path}: no bag: expected metadata.yaml or .mcap files in this directory")
+            raise BagError(f"{path}: not a bag: expected metadata.yaml or .mcap files in this directory")
         return sorted(files, key=_file_number)
     storage = information.get("storage_identifier")
     if storage != "mcap":

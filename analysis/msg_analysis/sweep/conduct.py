@@ -87,7 +87,7 @@ def _todo(jobs: Sequence[Job], store: OutcomeStore, other_software: OtherSoftwar
     if others and other_software == "refuse":
         was = " and ".join(sorted(set(others.values())))
         raise InputError(
-            f"{store.directory}: {len(others)} results were made with other software ({was}), here is "
+            f"{store.directory}: {len(others)} results were made with other software ({was}), not "
             f"{installed_software()}: choose another --out, or use --other-software redo or keep"
         )
     return todo

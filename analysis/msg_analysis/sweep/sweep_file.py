@@ -34,7 +34,7 @@ def _axis(value: object) -> Axis:
     if "values" in value:
         listed = value["values"]
         if len(value) > 1 or not isinstance(listed, list) or not listed:
-            raise expected("values to be a list with at least one entry, and nothing beside it")
+            raise expected("values to be a list with at least one entry, and no other key")
         return Axis(listed)
     first, last = value.get("from"), value.get("to")
     if not is_number(first) or not is_number(last) or ("count" in value) == ("step" in value):
@@ -121,7 +121,7 @@ class SweepSpec(BaseModel):
         examples=["independent"],
     )
     level: Annotated[float, Field(strict=True, gt=0, le=0.5)] = Field(
-        0.01, description="chance of a false 'disagrees', all runs together", examples=[0.01]
+        0.01, description="probability of a false 'disagrees', all runs together", examples=[0.01]
     )
 
 

@@ -86,6 +86,13 @@ def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[T
     every agent (1, which finds a wrong reference or offset). Where these are more than ``most``: the whole pull (W_g x
     - x)_i of a row instead of each of its terms; where that is still too many, without distinguishing graphs.
 
+    Parameters
+    ----------
+    step
+        step model of the run
+    most
+        largest number K
+
     Returns
     -------
     tuple[IntArray, FloatArray, list[Term]]

@@ -21,6 +21,8 @@ class HeardRegression:
 
     Parameters
     ----------
+    observation
+        of a run with noise or loss on the air, or in real time
     most
         largest number of regressors K; beyond it, fewer kinds of them are tested
     position

@@ -110,7 +110,7 @@ def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
     Returns
     -------
     FloatArray
-        (...)
+        (..., ) one G for each matrix of counts
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = counts * np.log(counts / (counts.sum(axis=-1, keepdims=True) * transition))

@@ -63,6 +63,13 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
 def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
     """Time means of the sampled states, with expectation and standard errors given the log.
 
+    Parameters
+    ----------
+    observation
+        of a run in real time
+    order
+        of its events
+
     Raises
     ------
     PatternUnavailableError

@@ -36,6 +36,13 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     time, the family has only tests that are exact whatever the timing was. Where the law has no prediction (a protocol
     that is not linear, or is not installed), only graphs and losses are tested.
 
+    Parameters
+    ----------
+    trajectory
+        of a bag or of the twin
+    level
+        probability of a false "disagrees", all tests together
+
     Raises
     ------
     InputError

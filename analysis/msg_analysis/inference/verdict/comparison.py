@@ -105,7 +105,7 @@ class Comparison:
         the family, in the order of the report
     running
         "time" [units of simulated time], and the mean of the system error up to then with its standard error (0 without
-        a prediction): "system_error", "standard_error"; arrays of the same length, at most 400
+        a prediction): "system_error", "standard_error"; (T,) each, T at most 400
     loss
         test of the lost messages; None where none can be lost
     p_broadcast

@@ -134,14 +134,14 @@ class Sections:
             return
         untold = all(spec.complete or spec.star for spec in graphs.values())
         if declared is None and (untold or largest < 2):
-            wanted = "expected the number of agents, since no graph tells it"
+            wanted = "expected the number of agents, since the graphs do not give it"
             self.problems.append(problem("agents", "missing", wanted, "for example agents: 5"))
         else:
             self.agents = declared or largest
 
     def _fits(self, run: RunSpec | None) -> bool:
         assert self.agents is not None
-        steps = round(run.duration / run.dt) if run else 1
+        steps = run.steps if run else 1
         replicas = run.replicas if run else 1
         noise = self.values["noise"]
         delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)

@@ -48,7 +48,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a job."""
+    """The result of a job, or why it failed."""
 
     id: str  # of the job
     status: str  # ``DONE`` or ``FAILED``

@@ -109,7 +109,7 @@ class Workers:
             try:
                 self._client = distributed.Client(self._scheduler, timeout=_CONNECT, name="msg-analysis")
             except (OSError, ValueError, TypeError) as error:
-                reason = str(error).partition(":")[0] if isinstance(error, ValueError) else "nobody answers there"
+                reason = str(error).partition(":")[0] if isinstance(error, ValueError) else "no answer"
                 wanted = "expected the address of a Dask scheduler: for example tcp://127.0.0.1:8786"
                 raise InputError(f"--scheduler {self._scheduler}: {reason}: {wanted}") from error
             self._compare_software()
@@ -155,12 +155,10 @@ class Workers:
     def outcomes(
         self, function: Function[T, R], items: Sequence[T], *, patience: float = 2 * NOTICE
     ) -> Generator[list[tuple[T, R | Lost]], None, None]:
-        """Do something with every item, by a function at the top of a module that the workers can import.
+        """Results of ``function`` (at the top of a module) for all items, in batches, as they are ready.
 
-        Results come in batches, as they are ready. A batch whose workers died more often than Dask allows (3 times by
-        default) is tried again item by item; an item that kills its workers again is ``Lost``. If this is interrupted,
-        running work has ``patience`` seconds to end. WorkersLostError: the scheduler has gone; InputError: other
-        software on a worker.
+        An item that kills its workers again when tried alone is ``Lost``. If interrupted, running work has ``patience``
+        [s] to end. WorkersLostError: the scheduler is gone; InputError: other software on a worker.
         """
         from distributed import as_completed
 

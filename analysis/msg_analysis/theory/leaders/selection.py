@@ -62,8 +62,8 @@ class LeaderProblem:
         if step.noise.min() < -1e-12 * np.abs(step.noise).max():
             return "the noise of some agents is negatively correlated"
         if self.experiment.protocol:
-            everybody = self._system(frozenset(range(self.agents)), self.gain if math.isfinite(self.gain) else 0.0)
-            if everybody.matrices.min() < 0.0:
+            all_agents = self._system(frozenset(range(self.agents)), self.gain if math.isfinite(self.gain) else 0.0)
+            if all_agents.matrices.min() < 0.0:
                 return "some weights of the protocol are negative"
         elif self.law == "emulated":
             pull = self.gain if math.isfinite(self.gain) else 0.0
@@ -260,14 +260,14 @@ def select_leaders(
         impossible count, gain or law; no set of this size reaches all agents; too many sets
     """
     _check(method in get_args(SearchMethod), f"method {method}: expected one of {', '.join(get_args(SearchMethod))}")
-    _check(gain > 0.0, f"--gain {gain}: expected a number > 0, or inf for leaders held at the reference")
+    _check(gain > 0.0, f"gain {gain}: expected a number > 0, or inf for leaders held at the reference")
     most = experiment.agents - (1 if math.isinf(gain) else 0)
     _check(
         1 <= count <= most,
-        f"--count {count}: expected 1 to {most}, since {experiment.source} has {experiment.agents} agents"
-        + (" and somebody has to follow" if math.isinf(gain) else ""),
+        f"count {count}: expected 1 to {most}, since {experiment.source} has {experiment.agents} agents"
+        + (" and at least one agent must follow" if math.isinf(gain) else ""),
     )
-    _check(top >= 1, f"--top {top}: expected a number >= 1")
+    _check(top >= 1, f"top {top}: expected a number >= 1")
     problem = LeaderProblem(experiment, resolve_law(experiment, law), gain)
     sets = math.comb(experiment.agents, count)
     chosen_method = method if method != "auto" else "exhaustive" if sets <= AUTO_SETS else "swap"
@@ -275,7 +275,7 @@ def select_leaders(
     order: list[int] = []
     bound: float | None = None
     if chosen_method == "exhaustive":
-        _check(sets <= MOST_SETS, f"--method exhaustive: {sets} sets of {count} leaders: use swap")
+        _check(sets <= MOST_SETS, f"method exhaustive: {sets} sets of {count} leaders: use swap")
         found = search.exhaustive(count, top)
     else:
         order = search.greedy(count) if chosen_method == "greedy" else search.swap(count)
@@ -284,7 +284,7 @@ def select_leaders(
         found = search.evaluated(count, top)
     _check(
         bool(found),
-        f"--count {count}: no set of {count} reaches everybody in the union of all graphs: use more leaders",
+        f"count {count}: no set of {count} reaches all agents in the union of all graphs: use more leaders",
     )
     if chosen_method == "exhaustive" or count == 1:  # a single leader: all of them were evaluated
         bound = found[0][0]
