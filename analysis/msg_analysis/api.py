@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from msg_analysis.bags.format.storage_options import DEFAULT, Storage
+from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.reader import read_bag as read_trajectory
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.common.files import require_place
@@ -27,8 +27,8 @@ from msg_analysis.model.experiment.problems import ExperimentError
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.report.documents.transient_and_facts import TransientLaw, solve_transient
-from msg_analysis.theory.leaders.search import Watch, ignore
-from msg_analysis.theory.leaders.selection import Law, Method, Selection, select_leaders
+from msg_analysis.theory.leaders.search import SearchProgress, ignore
+from msg_analysis.theory.leaders.selection import SearchMethod, Selection, SelectionLaw, select_leaders
 from msg_analysis.theory.prediction import Moments, Prediction, predict
 from msg_analysis.theory.transient import Transient
 from msg_analysis.twin.simulate import simulate
@@ -161,11 +161,11 @@ class Experiment(model.Experiment):
         self,
         count: int,
         *,
-        method: Method = "auto",
-        law: Law | None = None,
+        method: SearchMethod = "auto",
+        law: SelectionLaw | None = None,
         gain: float = math.inf,
         top: int = 10,
-        watch: Watch = ignore,
+        watch: SearchProgress = ignore,
     ) -> Selection:
         """The sets of leaders with the least system error; the experiment's own leaders are ignored.
 
@@ -247,7 +247,7 @@ class Run(Trajectory):
         """
         return compare(self, level=level)
 
-    def save(self, directory: str | Path, storage: Storage = DEFAULT) -> Path:
+    def save(self, directory: str | Path, storage: Storage = DEFAULT_STORAGE) -> Path:
         """Write the run as a bag with the topics and the layout of a network's.
 
         Parameters
@@ -321,7 +321,7 @@ def compare(*runs: Trajectory | str | Path, level: float = 0.01) -> Comparison:
     if not runs:
         raise InputError("no run: give at least one, or the path of its bag")
     if not 0.0 < level <= 0.5:
-        raise InputError(f"level: {level:g}: expected a chance above 0, 0.5 at most")
+        raise InputError(f"level: {level:g}: expected a probability above 0, at most 0.5")
     if len(runs) == 1:
         return compare_trajectory(_read(runs[0]), level=level)
     absent = [str(path) for path in runs if not isinstance(path, Trajectory) and not Path(path).exists()]

@@ -94,5 +94,5 @@ def test_a_protocol_that_fails(network: Any) -> None:
     protocol = trajectory.record.experiment.protocol
     assert protocol is not None
     assert protocol.absent is not None
-    assert "protocol broken (broken_package 0.3) is not here" in protocol.absent
+    assert "protocol broken (broken_package 0.3) is not available here" in protocol.absent
     assert compare(trajectory).verdict == "incomplete"

@@ -7,28 +7,22 @@ are held until nothing earlier can follow: an outline of each file, taken first,
 
 from __future__ import annotations
 
-import io
-import struct
 from bisect import bisect_right
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import yaml
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema, Statistics
+from mcap.records import Channel, Schema
 
+from msg_analysis.bags.format.inventory import offered_profiles
+from msg_analysis.bags.format.mcap_chunks import CHUNK_TIMES, INDEX_HEAD, RECORD, DamageError
 from msg_analysis.bags.format.mcap_file import MAGIC, McapFile
 from msg_analysis.bags.reader import bag_files
 from msg_analysis.errors import BagError
 
 # Bytes of messages held to be put in order. A bag that needs more is played out of order rather than held in memory.
 MOST_HELD = 256 * 2**20
-_RECORD = struct.Struct("<BQ")
-_TIMES = struct.Struct("<QQ")  # of the first and the last message of a chunk, at its beginning
-_EMPTY_INDEX = 6  # bytes of a message index without entries
 _LATCHED = ("transient_local", 1)  # as text, and as the number of older rosbag2
 
 
@@ -90,7 +84,7 @@ class Playback:
     def _add(self, channel: Channel, schema: Schema | None, messages: int) -> None:
         if not messages:
             return
-        latched = _latched(channel.metadata.get("offered_qos_profiles", ""))
+        latched = _latched(channel)
         topic = self.topics.setdefault(
             channel.topic,
             BagTopic(
@@ -180,15 +174,9 @@ class _Lows:
         return self._from[self._next]
 
 
-def _latched(profiles: str) -> bool:
-    """Whether one of the offered profiles (YAML, as rosbag2 writes them) is transient-local."""
-    try:
-        listed: Any = yaml.safe_load(profiles)
-    except yaml.YAMLError:
-        return False
-    if not isinstance(listed, list):
-        return False
-    return any(isinstance(profile, dict) and profile.get("durability") in _LATCHED for profile in listed)
+def _latched(channel: Channel) -> bool:
+    """Whether one of the offered profiles is transient-local."""
+    return any(isinstance(each, dict) and each.get("durability") in _LATCHED for each in offered_profiles(channel))
 
 
 def _quick_outline(path: Path) -> _Outline | None:
@@ -196,51 +184,44 @@ def _quick_outline(path: Path) -> _Outline | None:
 
     It is enough for a file that was closed properly and has all messages in chunks, as most have.
     """
-    outline = _Outline(path)
-    statistics: Statistics | None = None
+    outline, file = _Outline(path), McapFile(path)
     size = path.stat().st_size
     silent = None  # end of a chunk with times 0: its index tells whether it has messages
     with path.open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             return None
-        while len(head := stream.read(_RECORD.size)) == _RECORD.size:
-            opcode, length = _RECORD.unpack(head)
+        while len(head := stream.read(RECORD.size)) == RECORD.size:
+            opcode, length = RECORD.unpack(head)
             end = stream.tell() + length
             if end > size:  # cut off, or damaged
                 return None
             if opcode == Opcode.CHUNK:
-                times = stream.read(_TIMES.size)
-                if len(times) < _TIMES.size:
+                times = stream.read(CHUNK_TIMES.size)
+                if len(times) < CHUNK_TIMES.size:
                     return None
-                first, last = _TIMES.unpack(times)
+                first, last = CHUNK_TIMES.unpack(times)
                 silent = end if first == last == 0 else None
                 if silent is None:
                     outline.lows.append((end, first))
-            elif opcode == Opcode.MESSAGE_INDEX and silent is not None and length > _EMPTY_INDEX:
+            elif opcode == Opcode.MESSAGE_INDEX and silent is not None and length > INDEX_HEAD:
                 outline.lows.append((silent, 0))
                 silent = None
             elif opcode == Opcode.MESSAGE:
                 return None
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
-                content = ReadDataStream(io.BytesIO(stream.read(length)))
                 try:
-                    if opcode == Opcode.SCHEMA:
-                        schema = Schema.read(content)
-                        outline.schemas[schema.id] = schema
-                    elif opcode == Opcode.CHANNEL:
-                        channel = Channel.read(content)
-                        outline.channels[channel.id] = channel
-                    else:
-                        statistics = Statistics.read(content)
-                except Exception:  # the library raises many kinds of errors on damage
+                    file.note(opcode, stream.read(length))
+                except DamageError:
                     return None
             elif opcode == Opcode.FOOTER:
                 break
             stream.seek(end)
         else:
             return None
+    statistics = file.statistics
     if statistics is None or not statistics.message_count:
         return None
+    outline.channels, outline.schemas = file.channels, file.schemas
     outline.counts = dict(statistics.channel_message_counts)
     outline.start, outline.end = statistics.message_start_time, statistics.message_end_time
     whole = outline.counts.keys() <= outline.channels.keys() and statistics.chunk_count >= len(outline.lows)

@@ -48,7 +48,7 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
     or several runs; InputError: the run record is not valid.
     """
     path = Path(path)
-    contents = _Contents()
+    contents = _Contents(path)
     unreadable: list[BagError] = []
     files = bag_files(path)
     for file in files:
@@ -61,8 +61,7 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
     if len(unreadable) == len(files):
         raise unreadable[0]
     contents.refused["unreadable file"] += len(unreadable)
-    record = _choose(contents, path)
-    return _trajectory(contents, record)
+    return _trajectory(contents, _choose(contents))
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -75,7 +74,7 @@ def bag_files(path: Path) -> list[Path]:
     if information is None:
         files = [file for suffix in ("mcap", "mcap.zstd") for file in path.glob(f"*.{suffix}")]
         if not files:
-            raise BagError(f"{path}: no bag: expected metadata.yaml or .mcap files in this directory")
+            raise BagError(f"{path}: not a bag: expected metadata.yaml or .mcap files in this directory")
         return sorted(files, key=_file_number)
     storage = information.get("storage_identifier")
     if storage != "mcap":
@@ -105,11 +104,13 @@ def _file_number(file: Path) -> tuple[int, str]:
 class _Contents:
     """What the files of a bag hold of the network's topics."""
 
+    path: Path
     states: Collector = field(default_factory=Collector)
     truths: Collector = field(default_factory=Collector)
     graphs: list[ActiveGraph] = field(default_factory=list)
-    experiments: dict[str, None] = field(default_factory=dict)  # texts, each once, in order
-    records: dict[str, None] = field(default_factory=dict)  # the same from the metadata of our files
+    # Run records by text, in order, or why a text is not one: from the topic, and from the metadata of our files.
+    experiments: dict[str, RunRecord | InputError] = field(default_factory=dict)
+    metadata: dict[str, None] = field(default_factory=dict)
     refused: Counter[str] = field(default_factory=Counter)
 
     def read(self, file: McapFile, batches: Iterable[Batch]) -> None:
@@ -122,7 +123,7 @@ class _Contents:
                     found = pattern.search(channel.topic) if pattern else None
                     kinds[number] = found[1] if found else None
             self._add(batch, kinds)
-        self.records.update(
+        self.metadata.update(
             (record.metadata["record"], None)
             for record in file.metadata
             if record.name == RECORD_NAME and "record" in record.metadata
@@ -152,13 +153,17 @@ class _Contents:
     def _learn(self, text: str) -> None:
         if text in self.experiments:
             return
-        self.experiments[text] = None
+        self.experiments[text] = record = self.parsed(text)
+        if isinstance(record, RunRecord):
+            for collector, width in zip((self.states, self.truths), _widths(record), strict=True):
+                collector.expect(record, width)
+
+    def parsed(self, text: str) -> RunRecord | InputError:
+        """A run record, or why the text is not one: that matters only if no text is (another program's topic)."""
         try:
-            record = RunRecord.from_json(text, "topic experiment")
-        except InputError:
-            return  # `_choose` reports it if there is no valid record
-        for collector, width in zip((self.states, self.truths), _widths(record), strict=True):
-            collector.expect(record, width)
+            return RunRecord.from_json(text, f"{self.path}: topic experiment")
+        except InputError as error:
+            return error
 
 
 def _widths(record: RunRecord) -> tuple[int, int]:
@@ -167,27 +172,25 @@ def _widths(record: RunRecord) -> tuple[int, int]:
     return (experiment.run.replicas, experiment.width) if experiment.truth else (experiment.width, 0)
 
 
-def _choose(contents: _Contents, path: Path) -> RunRecord:
+def _choose(contents: _Contents) -> RunRecord:
     """The run record of the one run that has states."""
-    texts = contents.experiments | contents.records
-    if not texts and contents.refused[_COMPRESSED]:
+    path = contents.path
+    later = (text for text in contents.metadata if text not in contents.experiments)
+    found = [*contents.experiments.values(), *map(contents.parsed, later)]
+    if not found and contents.refused[_COMPRESSED]:
         raise BagError(f"{path}: {_EACH_COMPRESSED}")
-    if not texts:
+    if not found:
         pid = recording_pid(path)
         hint = f" (process {pid} is still recording it)" if pid else ""
         raise BagError(
-            f"{path}: recorded without the latched topic `experiment`, so nobody knows what run it is "
-            f"of{hint}: record "
-            "that topic too, with durability transient_local (as `ros2 bag record -a` does)"
+            f"{path}: the latched topic `experiment` is missing, so the run is not known{hint}: record that topic too, "
+            "with durability transient_local (as `ros2 bag record -a` does)"
         )
+    errors = [each for each in found if isinstance(each, InputError)]
     records: dict[bytes, RunRecord] = {}
-    errors: list[InputError] = []
-    for text in texts:
-        try:
-            record = RunRecord.from_json(text, f"{path}: topic experiment")
-            records.setdefault(record.run.bytes, record)
-        except InputError as error:  # another program's topic of that name, or an invalid record
-            errors.append(error)
+    for each in found:
+        if isinstance(each, RunRecord):
+            records.setdefault(each.run.bytes, each)
     if not records:
         raise errors[0]
     with_states = [record for run, record in records.items() if contents.states.count(run)]

@@ -20,7 +20,14 @@ from msg_analysis.bags.format.inventory import FileInventory, channel_count
 from msg_analysis.bags.format.mcap_file import Batch, McapFile
 from msg_analysis.bags.format.metadata import METADATA_FILE, FileCount, bag_information, dump, write_metadata
 from msg_analysis.bags.reader import bag_files
-from msg_analysis.bags.writer import CHUNK_SIZE, RECORD_NAME, RECORDING_MARKER, ROSBAG2_RECORD, recording_pid
+from msg_analysis.bags.writer import (
+    CHUNK_SIZE,
+    RECORD_NAME,
+    RECORDING_MARKER,
+    ROSBAG2_RECORD,
+    exists_already,
+    recording_pid,
+)
 from msg_analysis.errors import BagError
 
 
@@ -97,7 +104,7 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
     workshop = out.with_name(f".{out.name}.{os.getpid()}")
     try:
         if out.exists():
-            raise BagError(f"{out}: exists already: choose another name, or move it away first")
+            raise exists_already(out)
         entries, total = _look(files)
         if not total.kept_messages:
             raise BagError(f"{torn}: no whole message is left in it: nothing can be salvaged")
@@ -121,11 +128,10 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
 
 
 def salvage_in_place(directory: str | Path) -> SalvageReport:
-    """Make the directory of a recording that was cut short (no metadata.yaml yet) a bag; whole files stay as they are.
+    """Make a bag of the directory of an interrupted recording (no metadata.yaml yet); whole files stay as they are.
 
-    Each other file is first copied beside itself and replaced when all copies are written; metadata.yaml comes last. If
-    this fails, nothing is lost and it can be repeated. BagError: a bag already, being recorded, or not readable or
-    writable.
+    Other files are replaced when all copies are written: if it fails, nothing is lost. BagError: a bag already, being
+    recorded, or not readable or writable.
     """
     directory = Path(directory).absolute()
     if (directory / METADATA_FILE).exists():

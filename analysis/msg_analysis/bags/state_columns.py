@@ -15,22 +15,9 @@ from msg_analysis.bags.format.mcap_file import Batch
 from msg_analysis.model.arithmetic.step_clock import SECOND
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.wire.cdr_fields import LITTLE_ENDIAN, CdrError
-from msg_analysis.wire.messages import AgentState
+from msg_analysis.wire.messages import STATE_HEAD, STATE_SIZE, AgentState
 
-# The fixed part of an AgentState with empty frame_id; the gaps between the offsets are padding.
-_HEAD = np.dtype(
-    {
-        "names": [
-            *("encapsulation", "seconds", "nanoseconds", "frame_size", "frame_end", "run"),
-            *("agent", "step", "mode", "heard_count"),
-        ],
-        "formats": ["<u4", "<i4", "<u4", "<u4", "u1", ("<u8", (2,)), "<u4", "<u8", "<u4", "<u4"],
-        "offsets": [0, 4, 8, 12, 16, 17, 36, 44, 52, 56],
-        "itemsize": 60,
-    }
-)
 _ENCAPSULATION = struct.unpack("<I", LITTLE_ENDIAN)[0]
-_FIXED_SIZE = 68  # of a message without its ``heard`` and ``state``: the head, the length of ``state``, padding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +26,7 @@ class States:
 
     data: bytes  # messages in the agents' own layout
     start: IntArray  # (messages,) offset of the CDR bytes
-    head: AnyArray  # (messages,) of type ``_HEAD``
+    head: AnyArray  # (messages,) of type ``STATE_HEAD``
     replicas: IntArray  # (messages,) length of ``state``
     position: IntArray  # (messages,) place among the bag's messages of this kind, from 0
 
@@ -86,7 +73,7 @@ class States:
         length = np.minimum(self.heard_count, most)
         for size in np.unique(length[length > 0]).tolist():
             alike = length == size
-            values = gather(self.data, self.start[alike] + _HEAD.itemsize, 8 * size).view("<u8")
+            values = gather(self.data, self.start[alike] + STATE_HEAD.itemsize, 8 * size).view("<u8")
             out[alike, :size] = values.reshape(-1, size)
         return out
 
@@ -94,12 +81,12 @@ class States:
         """(messages, width) of states that all have this length."""
         if not width:
             return np.empty((len(self), 0))
-        values = gather(self.data, self.start + _FIXED_SIZE + 8 * self.heard_count, 8 * width).view("<f8")
+        values = gather(self.data, self.start + STATE_SIZE + 8 * self.heard_count, 8 * width).view("<f8")
         return np.asarray(values.reshape(len(self), width), dtype=np.float64)
 
     def alone(self) -> States:
         """The same with bytes of their own, so that those of the batch can be freed."""
-        size = _FIXED_SIZE + 8 * (self.heard_count + self.replicas)
+        size = STATE_SIZE + 8 * (self.heard_count + self.replicas)
         ranges = zip(self.start.tolist(), (self.start + size).tolist(), strict=True)
         data = b"".join([self.data[first:end] for first, end in ranges])
         return States(data, np.cumsum(size) - size, self.head, self.replicas, self.position)
@@ -136,17 +123,17 @@ def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States
 
 def _fixed(data: bytes, start: IntArray, size: IntArray, position: IntArray) -> tuple[States, BoolArray]:
     """The messages that have the agents' own layout, and (messages,) which ones have it."""
-    fixed = size >= _FIXED_SIZE
+    fixed = size >= STATE_SIZE
     long = start if fixed.all() else np.where(fixed, start, 0)
-    if len(data) < _FIXED_SIZE:
-        return States(data, start[:0], np.empty(0, _HEAD), start[:0], start[:0]), np.zeros(len(start), np.bool_)
-    head = gather(data, long, _HEAD.itemsize).view(_HEAD)
+    if len(data) < STATE_SIZE:
+        return States(data, start[:0], np.empty(0, STATE_HEAD), start[:0], start[:0]), np.zeros(len(start), np.bool_)
+    head = gather(data, long, STATE_HEAD.itemsize).view(STATE_HEAD)
     fixed &= (head["encapsulation"] == _ENCAPSULATION) & (head["frame_size"] == 1) & (head["frame_end"] == 0)
-    numbers, count = size - _FIXED_SIZE, head["heard_count"].astype(np.int64)
+    numbers, count = size - STATE_SIZE, head["heard_count"].astype(np.int64)
     fixed &= numbers & 7 == 0
     replicas = (numbers >> 3) - count
     fixed &= replicas >= 0
-    behind = np.where(fixed, start + _HEAD.itemsize + 8 * count, 0)
+    behind = np.where(fixed, start + STATE_HEAD.itemsize + 8 * count, 0)
     fixed &= gather(data, behind, 4).view("<u4") == replicas
     states = States(data, start, head, replicas, position)
     return states if fixed.all() else states[fixed], fixed
@@ -159,6 +146,6 @@ def _in_own_layout(data: bytes) -> bytes:
         *(message.stamp, message.run, message.agent, message.step, message.mode, message.state, message.heard)
     )
     try:
-        return own.encode().ljust(_FIXED_SIZE + 8 * len(message.heard), b"\x00")  # no padding before an empty state
+        return own.encode().ljust(STATE_SIZE + 8 * len(message.heard), b"\x00")  # no padding before an empty state
     except struct.error as error:
         raise CdrError("AgentState.header: a time out of range") from error

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_analysis.bags.format.storage_options import DEFAULT, Storage
-from msg_analysis.bags.writer import BagWriter
+from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
+from msg_analysis.bags.writer import BagWriter, exists_already
 from msg_analysis.errors import BagError
 from msg_analysis.model.arithmetic.payload import to_payload
 from msg_analysis.model.arithmetic.step_clock import StepClock
@@ -23,11 +23,11 @@ from msg_analysis.wire.messages import ActiveGraph, StateCodec, encode_string
 from msg_analysis.wire.schemas import network_topics, state_topic, truth_topic
 
 
-def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT) -> None:
+def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT_STORAGE) -> None:
     """Write a bag, whole or not at all; BagError where the directory exists or cannot be written."""
     directory = Path(directory).absolute()
     if directory.exists():
-        raise BagError(f"{directory}: exists already: choose another name, or move it away first")
+        raise exists_already(directory)
     record = trajectory.record.to_json()
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)

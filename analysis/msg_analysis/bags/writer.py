@@ -17,7 +17,7 @@ from typing import BinaryIO, Self
 from mcap.writer import CompressionType, Writer
 
 from msg_analysis.bags.format.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
-from msg_analysis.bags.format.storage_options import DEFAULT, Compression, Storage
+from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Compression, Storage
 from msg_analysis.errors import BagError
 from msg_analysis.wire.schemas import Topic
 
@@ -44,15 +44,14 @@ class _Channel:
 
 
 class BagWriter:
-    """A bag being written: its directory has ``.recording`` (locked, with our process id) and no metadata.yaml.
+    """A bag being written: its directory, new or empty, has ``.recording`` (locked) and no metadata.yaml.
 
-    ``directory`` must not exist, or be empty. The run record (JSON) is kept in every file, so that each one names its
-    run. A file is closed and on the disk before the next begins. BagError, here and in the methods: cannot be written;
-    what was written before stays readable.
+    The run record (JSON) is kept in every file. A file is closed and on the disk before the next begins. BagError, here
+    and in the methods: cannot be written; what was written before stays readable.
     """
 
     def __init__(
-        self, directory: Path, topics: Sequence[Topic], *, record: str | None = None, storage: Storage = DEFAULT
+        self, directory: Path, topics: Sequence[Topic], *, record: str | None = None, storage: Storage = DEFAULT_STORAGE
     ) -> None:
         self.directory = Path(directory).absolute()
         self._topics, self._record = tuple(topics), record
@@ -71,7 +70,7 @@ class BagWriter:
             self._stream: BinaryIO = self._next_stream()
             self._marker = (self.directory / RECORDING_MARKER).open("w", encoding="utf-8")
         except FileExistsError as error:
-            raise BagError(f"{directory}: exists already: choose another name, or move it away first") from error
+            raise exists_already(directory) from error
         except OSError as error:
             raise BagError(f"{directory}: cannot be made ({error.strerror}): choose another place") from error
         try:
@@ -196,6 +195,11 @@ class BagWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close(complete=error is None)
+
+
+def exists_already(directory: Path) -> BagError:
+    """The error for the directory of a new bag that is there already."""
+    return BagError(f"{directory}: exists already: choose another name, or move it away first")
 
 
 def recording_pid(directory: Path) -> int | None:

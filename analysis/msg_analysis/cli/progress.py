@@ -67,18 +67,18 @@ class SweepProgress(_Progress):
         self.done(done, total, 0)
 
     def done(self, done: int, total: int, failed: int) -> None:
-        """Show how many points are done, and how many of these failed; a ``Watch`` of ``sweep.conduct``."""
+        """Show how many points are done, and how many of these failed; a ``SweepProgress`` of ``sweep.conduct``."""
         without = f"{failed} without a result" if failed else ""
         self._show(self._title, done, total, without, without)
 
 
 class SolveProgress(_Progress):
-    """Progress of a search: a ``Watch`` of ``msg_analysis.theory.leaders.search``, and a context manager."""
+    """Progress of a search: a ``SearchProgress`` of ``theory.leaders.search``, and a context manager."""
 
     def __init__(self, title: str) -> None:
         super().__init__(title, time_left=False)
 
     def __call__(self, stage: str, done: int, total: int, best: float) -> None:
-        """Show stage, evaluations done and to do, and the least system error so far; see ``Watch``."""
+        """Show stage, evaluations done and to do, and the least system error so far; see ``SearchProgress``."""
         found = f"{best:.6g}"
         self._show(f"{self._title}: {stage}", done, total, f"least system error {found}", f"E {found}")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import click
 
-from msg_analysis.bags.format.storage_options import COMPRESSIONS, DEFAULT, MEGABYTE, Compression, Storage
+from msg_analysis.bags.format.storage_options import COMPRESSIONS, DEFAULT_STORAGE, MEGABYTE, Compression, Storage
 from msg_analysis.errors import InputError
 
 SMALLEST_SPLIT = 0.1  # MB; about the size of a chunk
@@ -18,7 +18,7 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option(
             "--compression",
             type=click.Choice(COMPRESSIONS),
-            default=DEFAULT.compression,
+            default=DEFAULT_STORAGE.compression,
             help="Of the bag, chunk by chunk.",
         ),
         click.option(

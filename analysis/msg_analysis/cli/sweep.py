@@ -19,7 +19,7 @@ from msg_analysis.sweep.jobs.software import require_libraries
 if TYPE_CHECKING:
     from msg_analysis.sweep.conduct import Conducted, OtherSoftware
     from msg_analysis.sweep.jobs.job import Job
-    from msg_analysis.sweep.outcome_store import Store
+    from msg_analysis.sweep.outcome_store import OutcomeStore
 
 DISAGREES, INCOMPLETE = 1, 3
 
@@ -87,10 +87,10 @@ def sweep(
     from msg_analysis.cli.progress import SweepProgress
     from msg_analysis.report.figures.sweep_figure import write_figure
     from msg_analysis.report.terminal.sweep_text import describe_sweep, print_sweep
-    from msg_analysis.sweep.conduct import judge
+    from msg_analysis.sweep.conduct import judge_sweep
     from msg_analysis.sweep.figure_series import picture
     from msg_analysis.sweep.jobs.network_run import options
-    from msg_analysis.sweep.outcome_store import Store
+    from msg_analysis.sweep.outcome_store import OutcomeStore
     from msg_analysis.sweep.plan import load_sweep
     from msg_analysis.sweep.table import rows_of, write_tables
 
@@ -98,7 +98,7 @@ def sweep(
         plan = load_sweep(sweep_file, checking.checked)
     directory = out or Path("sweeps") / plan.name
     network = options(directory, keep_bags, workers or 1) if plan.kind == "network" else None
-    with Store.open(directory) as store:
+    with OutcomeStore.open(directory) as store:
         done = _conduct(
             context,
             plan.name,
@@ -110,7 +110,7 @@ def sweep(
             other_software=other_software,
             retry=retry,
         )
-        judgement = judge(done.outcomes, plan.spec.level)
+        judgement = judge_sweep(done.outcomes, plan.spec.level)
         rows = rows_of(plan, done.outcomes, judgement)
         document = finite(describe_sweep(plan, done, judgement, rows))
         try:
@@ -143,7 +143,7 @@ def _end(number: int, _: object) -> None:
     raise _EndedBySignal(number)
 
 
-def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Store, **how: Any) -> Conducted:
+def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: OutcomeStore, **how: Any) -> Conducted:
     """Do all jobs, with progress on stderr; if interrupted, say what is kept and exit."""
     from msg_analysis.cli.progress import SweepProgress
     from msg_analysis.sweep.conduct import conduct
@@ -184,13 +184,13 @@ def emulate(
     from msg_analysis.paper.figures import write_figures
     from msg_analysis.sweep.jobs.job import FAILED
     from msg_analysis.sweep.jobs.network_run import options
-    from msg_analysis.sweep.outcome_store import Store
+    from msg_analysis.sweep.outcome_store import OutcomeStore
 
     require_libraries()
     runs = [run for number in numbers for run in runs_of(number)]
     directory = out / "emulation"
     network = options(directory, False, 1)
-    with Store.open(directory) as store:
+    with OutcomeStore.open(directory) as store:
         jobs = [run.job() for run in runs]
         done = _conduct(context, "networks", jobs, store, network=network, other_software=other_software, retry=True)
     points = measured(runs, done.outcomes)

@@ -17,14 +17,14 @@ from msg_analysis.errors import InputError
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.sweep.jobs.evaluate import evaluate
 from msg_analysis.sweep.jobs.job import DONE, FAILED, Job, NetworkOptions, Outcome
-from msg_analysis.sweep.jobs.software import installed
+from msg_analysis.sweep.jobs.software import installed_software
 from msg_analysis.sweep.jobs.workers import Lost, Workers
-from msg_analysis.sweep.outcome_store import Store
+from msg_analysis.sweep.outcome_store import OutcomeStore
 
 OtherSoftware = Literal["refuse", "redo", "keep"]
 NETWORK_PATIENCE = 60.0  # s that running networks have to end in order
 
-Watch = Callable[[int, int, int], None]  # progress: outcomes that are there, of how many, how many of them failed
+SweepProgress = Callable[[int, int, int], None]  # outcomes available, total, how many of them failed
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +38,14 @@ class Conducted:
 
 def conduct(
     jobs: Sequence[Job],  # equal ones are done once
-    store: Store,
+    store: OutcomeStore,
     *,
     workers: int | None = None,  # processes here; None: one per CPU, or a single one where networks run
     scheduler: str | None = None,  # of a Dask cluster, whose workers are used instead
     network: NetworkOptions | None = None,  # needed where jobs run networks
     other_software: OtherSoftware = "refuse",  # what to do with outcomes that other software made
     retry: bool = False,  # whether failed jobs are done again
-    watch: Watch = lambda _done, _total, _failed: None,
+    watch: SweepProgress = lambda _done, _total, _failed: None,
 ) -> Conducted:
     """Do all jobs that have not been done; outcomes are kept in ``store`` as soon as they come.
 
@@ -74,27 +74,27 @@ def conduct(
     return Conducted(outcomes, kept, len(store.outcomes.keys() - {job.id for job in jobs}))
 
 
-def _todo(jobs: Sequence[Job], store: Store, other_software: OtherSoftware, retry: bool) -> dict[str, Job]:
+def _todo(jobs: Sequence[Job], store: OutcomeStore, other_software: OtherSoftware, retry: bool) -> dict[str, Job]:
     """The jobs that have to be done, by id."""
     todo, others = {}, {}
     for job in jobs:
         known = store.outcomes.get(job.id)
         if known is None or (retry and known.status == FAILED):
             todo[job.id] = job
-        elif known.software != installed() and other_software != "keep":
+        elif known.software != installed_software() and other_software != "keep":
             others[job.id] = known.software
             todo[job.id] = job
     if others and other_software == "refuse":
         was = " and ".join(sorted(set(others.values())))
         raise InputError(
-            f"{store.directory}: {len(others)} results are of other software ({was}): expected {installed()}: choose "
-            "another --out, or say with --other-software whether to redo or to keep them"
+            f"{store.directory}: {len(others)} results were made with other software ({was}), not "
+            f"{installed_software()}: choose another --out, or use --other-software redo or keep"
         )
     return todo
 
 
 def _lost(job: Job, lost: Lost) -> Outcome:
-    return Outcome(job.id, FAILED, lost.reason, {}, 0.0, "", installed())
+    return Outcome(job.id, FAILED, lost.reason, {}, 0.0, "", installed_software())
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class Judgement:
         return {"disagrees": 1, "incomplete": 3}.get(self.verdict or "", 0)
 
 
-def judge(outcomes: Sequence[Outcome], level: float) -> Judgement:
+def judge_sweep(outcomes: Sequence[Outcome], level: float) -> Judgement:
     """Judge all runs together (Holm): the chance of any false "disagrees" is at most ``level``."""
     p_values: list[float | None] = [outcome.result.get("p") if outcome.status == DONE else None for outcome in outcomes]
     tested = [place for place, p in enumerate(p_values) if p is not None]

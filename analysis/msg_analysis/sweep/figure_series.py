@@ -13,9 +13,9 @@ from typing import Any
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.problems import show
 from msg_analysis.sweep.plan import Sweep
-from msg_analysis.sweep.table import Row, column_names
+from msg_analysis.sweep.table import Row, column_names, is_number
 
-DEFAULT = "system_error"
+DEFAULT_COLUMN = "system_error"
 HALF = 1.959963984540054  # standard errors on each side of a 95 % interval
 
 
@@ -55,7 +55,7 @@ def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None) -> Pic
 
     ``column`` may be the beginning of a name: ``system_error`` stands for what is measured or predicted of it.
     """
-    wanted = column or DEFAULT
+    wanted = column or DEFAULT_COLUMN
     names = _columns(rows, wanted)
     if not names["value"]:
         if column is None:  # nothing but failures
@@ -97,7 +97,7 @@ def _columns(rows: Sequence[Row], wanted: str) -> dict[str, str | None]:
 
 def _numeric(rows: Sequence[Row], name: str) -> bool:
     given = [row[name] for row in rows if row.get(name) is not None]
-    return bool(given) and all(isinstance(value, int | float) and not isinstance(value, bool) for value in given)
+    return bool(given) and all(map(is_number, given))
 
 
 def _offer(rows: Sequence[Row]) -> str:
@@ -134,5 +134,5 @@ def _logarithmic(sweep: Sweep, along: str) -> bool:
     axis = sweep.spec.over[along]
     if axis.logarithmic is not None:
         return axis.logarithmic
-    numbers = [value for value in axis if isinstance(value, int | float) and not isinstance(value, bool)]
+    numbers = list(filter(is_number, axis))
     return len(numbers) == len(axis) and min(numbers) > 0 and max(numbers) / min(numbers) >= 50

@@ -19,7 +19,7 @@ _FIELDS = {field.name for field in fields(Outcome)}
 
 
 @dataclass(slots=True)
-class Store:
+class OutcomeStore:
     """The outcomes in a directory; a lock lets one process at a time write there."""
 
     directory: Path

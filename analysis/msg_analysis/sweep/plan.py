@@ -19,7 +19,7 @@ from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show, translate
 from msg_analysis.model.experiment.yaml_document import read_yaml
 from msg_analysis.sweep.dotted_keys import KeyProblemError, put
-from msg_analysis.sweep.jobs.job import Job, Kind
+from msg_analysis.sweep.jobs.job import Job, JobKind
 from msg_analysis.sweep.sweep_file import MOST_POINTS, SweepSpec
 
 SEED = "run.seed"
@@ -48,7 +48,7 @@ class Sweep:
     points: tuple[Point, ...]  # in the order of the file: first key slowest, repetitions fastest
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> JobKind:
         """What is done at every point."""
         return self.spec.kind
 

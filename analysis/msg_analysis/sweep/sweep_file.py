@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator
 
 from msg_analysis.model.experiment.spec import Count, expected, is_number
-from msg_analysis.sweep.jobs.job import Kind
+from msg_analysis.sweep.jobs.job import JobKind
 
 MOST_POINTS = 20_000  # of a sweep: the experiments of all are held in memory
 
@@ -34,7 +34,7 @@ def _axis(value: object) -> Axis:
     if "values" in value:
         listed = value["values"]
         if len(value) > 1 or not isinstance(listed, list) or not listed:
-            raise expected("values to be a list with at least one entry, and nothing beside it")
+            raise expected("values to be a list with at least one entry, and no other key")
         return Axis(listed)
     first, last = value.get("from"), value.get("to")
     if not is_number(first) or not is_number(last) or ("count" in value) == ("step" in value):
@@ -93,7 +93,7 @@ class SweepSpec(BaseModel):
     ] = Field(
         description="an experiment file, relative to this file, or the experiment itself", examples=["line_ring.yaml"]
     )
-    kind: Kind = Field(
+    kind: JobKind = Field(
         "predict",
         description="at every point: predict the errors; simulate a run with the offline twin and compare it; or run a "
         "network of ROS 2 processes and compare it",
@@ -121,7 +121,7 @@ class SweepSpec(BaseModel):
         examples=["independent"],
     )
     level: Annotated[float, Field(strict=True, gt=0, le=0.5)] = Field(
-        0.01, description="chance of a false 'disagrees', all runs together", examples=[0.01]
+        0.01, description="probability of a false 'disagrees', all runs together", examples=[0.01]
     )
 
 

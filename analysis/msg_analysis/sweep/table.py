@@ -69,6 +69,11 @@ def column_names(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
+def is_number(value: object) -> bool:
+    """Whether it is a number; a boolean is not."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def arrow_table(rows: Sequence[Row]) -> pa.Table:
     """The table: booleans or numbers where all of a column are, else texts; values that are not text become JSON."""
     import pyarrow as pa
@@ -79,9 +84,9 @@ def arrow_table(rows: Sequence[Row]) -> pa.Table:
         given = [value for value in values if value is not None]
         if given and all(isinstance(value, bool) for value in given):
             columns[name] = pa.array(values, pa.bool_())
-        elif given and all(isinstance(value, int) and not isinstance(value, bool) for value in given):
+        elif given and all(is_number(value) and isinstance(value, int) for value in given):
             columns[name] = pa.array(values, pa.int64() if max(map(abs, given)) < 2**63 else pa.float64())
-        elif given and all(isinstance(value, int | float) and not isinstance(value, bool) for value in given):
+        elif given and all(map(is_number, given)):
             columns[name] = pa.array([None if value is None else float(value) for value in values], pa.float64())
         else:
             columns[name] = pa.array([value if value is None else _text(value) for value in values], pa.string())

@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphIndices:
-    """Indices of one undirected connected graph from its effective resistances r_uv; edge weights are conductances."""
+    """Indices of one undirected connected graph from its effective resistances r_uv (Klein and Randić 1993).
+
+    Edge weights are conductances.
+    """
 
     name: str
     # Sum of r_uv over pairs, m tr(L^+) (Klein and Randić 1993): 2 m times the system error of the graph with F = I.
@@ -58,7 +61,7 @@ def graph_indices(graph: Graph) -> GraphIndices | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bounds:
-    """Bounds of the system error for a given stationary law, whatever the rates.
+    """Bounds of the system error for a given stationary law, whatever the rates (docs/theory.md, "Bounds").
 
     Attributes
     ----------
@@ -79,7 +82,7 @@ class Bounds:
         return {"lower": self.lower, "upper": self.upper, "note": self.note}
 
 
-_NO_BOUNDS = "the averaged graph and the graphs held for ever bound nothing here: "
+_NO_BOUNDS = "the averaged graph and the graphs held fixed give no bounds here: "
 
 
 def error_bounds(prediction: Prediction) -> Bounds:
@@ -114,17 +117,17 @@ def error_bounds(prediction: Prediction) -> Bounds:
         return Bounds(None, None, _NO_BOUNDS + "the noise is not the same, and independent, for every agent")
     upper = prediction.static.system_error if prediction.static else None
     if system.time == "discrete":
-        return Bounds(None, upper, "undirected graphs and equal noise: E is at most that of the graphs held for ever")
+        return Bounds(None, upper, "undirected graphs and equal noise: E is at most that of the graphs held fixed")
     try:
         lower = float(np.trace(MomentSolver(averaged(system)).steady()[0]))
     except InputError:  # connected, but so weakly that rounding hides it
         lower = None
-    note = "undirected graphs and equal noise: E lies between the averaged graph and the graphs held for ever"
+    note = "undirected graphs and equal noise: E lies between the averaged graph and the graphs held fixed"
     return Bounds(lower, upper, note)
 
 
 def averaged(system: JumpSystem) -> JumpSystem:
-    """The limit of infinitely fast switching in continuous time: one graph, with Z and Q averaged over pi."""
+    """The limit of infinitely fast switching in continuous time, averaged over pi (docs/theory.md, "Bounds")."""
     weights = system.stationary[:, None, None]
     return JumpSystem(
         time=system.time,

@@ -94,7 +94,7 @@ class MomentSolver:
         except np.linalg.LinAlgError:
             raise InputError(
                 "second moments: the equations have no positive solution, so the errors grow without bound: "
-                "lower run.dt, or add edges until the union of the graphs connects everybody"
+                "lower run.dt, or add edges until the union of the graphs connects all agents"
             ) from None
         return moments
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import networkx as nx
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from msg_analysis.model.experiment.experiment import Experiment
 
 
-ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding
+ERROR_ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding
 SHOWN_AGENTS = 30  # most agents in a notebook's table; the arrays have all of them
 WEAK_NOISE = 1e-6  # directions with less noise, relative to the noisiest one, do not show whether steps are stable
 
@@ -63,7 +64,7 @@ class Moments:
     def node_errors(self) -> FloatArray:
         """(m,) E_i."""
         errors = np.diag(self.covariance)
-        return np.where(errors > ROUNDING * errors.max(initial=0.0), errors, 0.0)
+        return np.where(errors > ERROR_ROUNDING * errors.max(initial=0.0), errors, 0.0)
 
     @property
     def system_error(self) -> float:
@@ -99,7 +100,7 @@ class Moments:
         return document
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Prediction:
     """The result of ``predict``.
 
@@ -119,9 +120,9 @@ class Prediction:
     continuous
         the paper's continuous-time system; None in discrete time, with a protocol, or with noise on the air, loss or
         delay
-    static
-        the pi-weighted mean over the graphs held fixed, of the continuous-time system where there is one; None with
-        noise on the air, loss or delay, or where one of the graphs cannot keep the agents together
+    paper
+        the system of the paper: in continuous time where ``continuous`` is there, else the steps; None with noise on
+        the air, loss or delay
     """
 
     experiment: Experiment
@@ -130,12 +131,22 @@ class Prediction:
     steady: FloatArray
     emulated: Moments
     continuous: Moments | None
-    static: Moments | None
+    paper: JumpSystem | None
+
+    @cached_property
+    def static(self) -> Moments | None:
+        """The pi-weighted mean over the graphs held fixed, computed when it is first asked for.
+
+        None without ``paper``, or where one of the graphs cannot keep the agents together.
+        """
+        if self.paper is None or not all(_holds_together(self.experiment, mode) for mode in range(self.step.modes)):
+            return None
+        return _static(self.paper)
 
     def _laws(self) -> dict[str, Moments]:
         """Those moments that there are, by the name that texts give them."""
         steps = "steps in turn" if self.emulated.law == "sequential" else "steps of the run"
-        laws = {steps: self.emulated, "continuous time": self.continuous, "graphs held for ever": self.static}
+        laws = {steps: self.emulated, "continuous time": self.continuous, "graphs held fixed": self.static}
         return {name: law for name, law in laws.items() if law is not None}
 
     def __repr__(self) -> str:
@@ -171,21 +182,23 @@ class Prediction:
         return document
 
 
-def predict(experiment: Experiment) -> Prediction:
+def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction:
     """Steady-state prediction of an experiment (Propositions 2 and 3 of the paper, 7 and 8 in discrete time).
 
     Parameters
     ----------
     experiment
         whose law is linear
+    step
+        its step model, if it is known, such as that of a run record
 
     Raises
     ------
     InputError
         too large, or without finite steady errors
     """
-    step = build_step_model(experiment)
-    continuous = static = None
+    step = step or build_step_model(experiment)
+    continuous = paper = None
     if not experiment.noise.steps_only:
         if experiment.time == "continuous" and not experiment.steps_only:
             paper = systems.continuous(experiment)
@@ -193,11 +206,9 @@ def predict(experiment: Experiment) -> Prediction:
             continuous = _moments(exact, exact.steady())
         else:
             paper = systems.emulated(step, experiment.problem)
-        if all(_holds_together(experiment, mode) for mode in range(step.modes)):
-            static = _static(paper)
-    solver, steady = _steady(step, build_run_model(experiment), experiment.problem)
+    solver, steady = _steady(step, build_run_model(experiment, step), experiment.problem)
     emulated = dataclasses.replace(_moments(solver, steady), law=step_law(experiment))
-    return Prediction(experiment, step, solver, steady, emulated, continuous, static)
+    return Prediction(experiment, step, solver, steady, emulated, continuous, paper)
 
 
 def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
@@ -209,7 +220,7 @@ def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
     """
     step = build_step_model(experiment)
     with threadpool_limits(1):
-        solver, steady = _steady(step, build_run_model(experiment), experiment.problem)
+        solver, steady = _steady(step, build_run_model(experiment, step), experiment.problem)
         values, vectors = np.linalg.eigh(steady[mode] / step.stationary[mode])
         root = (vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T
         return solver.system.lifted(root)

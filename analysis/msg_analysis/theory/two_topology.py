@@ -122,7 +122,7 @@ def _factors(operator: FloatArray, graph: int) -> tuple[FloatArray, Any]:
     reciprocal, _ = scipy.linalg.lapack.dgecon(factors[0], np.linalg.norm(operator, 1))
     if not reciprocal > 1e-13:
         raise InputError(
-            f"two-topology form: graph {graph} held for ever has no steady error (reciprocal condition "
-            f"{reciprocal:.1e}), expected graphs that each connect everybody: use predict"
+            f"two-topology form: graph {graph} held fixed has no steady error (reciprocal condition "
+            f"{reciprocal:.1e}), expected graphs that each connect all agents: use predict"
         )
     return factors

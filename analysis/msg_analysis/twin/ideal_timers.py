@@ -17,15 +17,7 @@ from msg_analysis.types import FloatArray, IntArray
 
 
 class IdealTimers:
-    """A run in which every agent makes its step when it is due, and hears at once what others have made.
-
-    Parameters
-    ----------
-    experiment
-        of pace realtime
-    model
-        its step model
-    """
+    """A run in real time in which every agent steps when it is due, and hears at once what others made."""
 
     def __init__(self, experiment: Experiment, model: StepModel) -> None:
         self._phase = phases(experiment)
@@ -34,21 +26,10 @@ class IdealTimers:
         self._rounds = [_rounds(model, mode, self._phase) for mode in range(model.modes)]
 
     def states(self, modes: IntArray, start: FloatArray, drives: Iterable[FloatArray]) -> Iterator[FloatArray]:
-        """x(1), x(2), ...; every sum is the one that an agent computes alone, to the last bit.
+        """(m, R) each: x(1), x(2), ... under the graphs ``modes`` (N,), from x(0) = ``start`` (m, R).
 
-        Parameters
-        ----------
-        modes
-            (N,)
-        start
-            (m, R) x(0)
-        drives
-            for every step, (m, R) noise plus offset
-
-        Yields
-        ------
-        FloatArray
-            (m, R) each, one for each step
+        ``drives`` has noise plus offset (m, R) of every step. Every sum is the one that an agent computes alone, to the
+        last bit.
         """
         m = len(start)
         both = np.concatenate([start, start])  # x(k) above x(k+1)
@@ -59,13 +40,7 @@ class IdealTimers:
             yield both[m:].copy()
 
     def log(self, modes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-        """``Trajectory.agent_modes``, ``Trajectory.used`` and ``Trajectory.made`` of a run with these graphs (N,).
-
-        Parameters
-        ----------
-        modes
-            (N,) graph of every step, from 0
-        """
+        """``agent_modes``, ``used`` and ``made`` of ``Trajectory`` for a run with these graphs (N,), from 0."""
         model, phase, steps = self._model, self._phase, len(modes)
         agent_modes = np.repeat(np.concatenate([[-1], modes])[:, None], model.agents, axis=1)
         ahead = ideal_uses(model, phase)[modes]

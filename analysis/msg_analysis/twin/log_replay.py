@@ -11,25 +11,10 @@ from msg_analysis.types import FloatArray
 
 
 def replay(trajectory: Trajectory) -> FloatArray:
-    """Make every step of a real-time run again, from the logged states that went into it, by the agents' own law.
+    """(N + 1, m, R) states that the law gives from the logged inputs of every step; NaN where inputs are missing.
 
-    By induction, a log that equals this from x(0) on is what the law makes of the start, the seed, and who heard what.
-
-    Parameters
-    ----------
-    trajectory
-        of a run in real time
-
-    Returns
-    -------
-    FloatArray
-        (N + 1, m, replicas) the states that the law gives, to the last bit; NaN where the log has not all that is
-        needed.
-
-    Raises
-    ------
-    ValueError
-        nothing was logged of who used what
+    By induction, a log in real time that equals this from x(0) on is what the law gives for the start, the seed, and
+    the values that the agents used. ValueError: the log does not have these (a run in lockstep).
     """
     used, modes = trajectory.used, trajectory.agent_modes
     if used is None or modes is None:

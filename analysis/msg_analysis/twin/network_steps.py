@@ -9,7 +9,7 @@ import numpy as np
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.arithmetic.update_law import step
 from msg_analysis.model.experiment.experiment import Experiment
-from msg_analysis.model.step.air_reception import Reception, padded_inputs
+from msg_analysis.model.step.air_reception import AirReception, padded_inputs
 from msg_analysis.model.step.process_noise import ProcessNoise
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.twin.ideal_timers import IdealTimers
@@ -17,16 +17,22 @@ from msg_analysis.types import FloatArray, IntArray
 
 
 def states(
-    experiment: Experiment, model: StepModel, modes: IntArray, start: FloatArray, first: int = 0
+    experiment: Experiment,
+    model: StepModel,
+    modes: IntArray,
+    start: FloatArray,
+    first: int = 0,
+    reception: AirReception | None = None,
 ) -> Iterator[FloatArray]:
     """x(first + 1), x(first + 2), ..., each (m, R), from x(first) under the graphs ``modes`` from there on.
 
-    ``first`` is a multiple of STEPS_PER_BLOCK; the steps before a run are negative.
+    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``reception``: one that keeps a log.
     """
     drives = _drives(experiment, model, modes, first)
     if experiment.run.pace == "realtime":
         return IdealTimers(experiment, model).states(modes, start, drives)
-    reception = Reception(experiment, model) if experiment.noise.on_air else None
+    if experiment.noise.on_air and reception is None:
+        reception = AirReception(experiment, model)
     return _synchronous(model, modes, start, drives, reception, first)
 
 
@@ -49,7 +55,7 @@ def _synchronous(
     modes: IntArray,
     start: FloatArray,
     drives: Iterator[FloatArray],
-    reception: Reception | None,
+    reception: AirReception | None,
     first: int,
 ) -> Iterator[FloatArray]:
     rows = [_padded_rows(model, mode) for mode in range(model.modes)]

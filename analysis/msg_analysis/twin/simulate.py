@@ -14,7 +14,7 @@ from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.model.step.air import LOST
-from msg_analysis.model.step.air_reception import Reception
+from msg_analysis.model.step.air_reception import AirReception
 from msg_analysis.model.step.step_model import StepMatrices, StepModel, build_model
 from msg_analysis.twin.ideal_timers import IdealTimers
 from msg_analysis.twin.network_steps import states as states_of_all
@@ -23,15 +23,7 @@ from msg_analysis.types import BoolArray
 
 
 def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecord:
-    """Everything that a new run of an experiment starts from.
-
-    Parameters
-    ----------
-    experiment
-        that is going to be run
-    run
-        run id; a new random one if not given
-    """
+    """Everything that a new run of an experiment starts from; ``run``: its id, a new random one if not given."""
     model = build_model(experiment)
     modes = mode_path(experiment, model.initial)
     start = draw_start(experiment, model, int(modes[0]))
@@ -44,20 +36,9 @@ def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecor
 
 
 def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Trajectory:
-    """Run an experiment without ROS.
+    """Run an experiment without ROS, or repeat the run of a record (then its experiment is used); see ``api``.
 
-    Parameters
-    ----------
-    experiment
-        what to run; with a record, that of the record
-    record
-        of the run to repeat; a new run with a new id if not given
-
-    Returns
-    -------
-    Trajectory
-        The same states, to the last bit, as those of a lockstep network run; in real time, as those of a run with ideal
-        timers and no delay.
+    The states equal those of a network run to the last bit: in lockstep, or with ideal timers and no delay.
     """
     experiment = record.experiment if record else experiment
     experiment.require_available()
@@ -68,14 +49,14 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Traj
     modes = mode_path(experiment, model.initial)
     states = np.empty((experiment.steps + 1, *record.start.shape))
     states[0] = record.start
-    for k, state in enumerate(states_of_all(experiment, model, modes, record.start), start=1):
+    reception = AirReception(experiment, model, experiment.steps) if experiment.noise.on_air else None
+    for k, state in enumerate(states_of_all(experiment, model, modes, record.start, reception=reception), start=1):
         states[k] = state
     if experiment.run.pace == "realtime":
         agent_modes, used, made = IdealTimers(experiment, model).log(modes)
         whole = Completeness(states.shape[0] * states.shape[1], states.shape[0] * states.shape[1], 0)
         return Trajectory(record, states, modes, whole, agent_modes, used=used, made=made)
-    on_air = experiment.noise.on_air
-    published, lost = Reception(experiment, model).log(states, modes) if on_air else (None, None)
+    published, lost = reception.log(states[-1], modes) if reception else (None, None)
     expected = states.shape[0] * states.shape[1] * (1 if published is None else 2)
     return Trajectory(record, states, modes, Completeness(expected, expected, 0), published=published, lost=lost)
 

@@ -22,11 +22,24 @@ from msg_analysis.wire.cdr_fields import HEADER_SIZE, LITTLE_ENDIAN, RUN_SIZE, C
 _STAMP = {b"\x00\x01": struct.Struct("<4xiI"), b"\x00\x00": struct.Struct(">4xiI")}
 # Encapsulation, sec, nanosec, frame_id (length 1, NUL), run, agent, step, mode, len(heard), len(state).
 _STATE = struct.Struct("<4siIIB16s3xI4xQIII4x")
+STATE_SIZE = _STATE.size  # bytes of a message without the entries of ``heard`` and ``state``
+# The same bytes up to the length of ``heard``, for many messages at once; the gaps between the offsets are padding.
+STATE_HEAD = np.dtype(
+    {
+        "names": [
+            *("encapsulation", "seconds", "nanoseconds", "frame_size", "frame_end", "run"),
+            *("agent", "step", "mode", "heard_count"),
+        ],
+        "formats": ["<u4", "<i4", "<u4", "<u4", "u1", ("<u8", (2,)), "<u4", "<u8", "<u4", "<u4"],
+        "offsets": [0, 4, 8, 12, 16, 17, 36, 44, 52, 56],
+        "itemsize": 60,
+    }
+)
 # The same bytes for reading: the stamp is skipped, frame_id and run are one field.
 _STATE_FIXED = struct.Struct("<4s8x21s3xI4xQIII4x")
 # The entries of ``heard`` (uint64) lie between its length and that of the state, without padding.
 _HEARD = struct.Struct("<I")
-_HEARD_START = _STATE.size - 8
+_HEARD_START = STATE_HEAD.itemsize
 _LENGTH = struct.Struct("<I4x")  # of the state, with the padding before it
 STATE_MODE = _STATE.size - 16  # byte offset of ``mode`` in a state message
 

@@ -32,7 +32,7 @@ from msg_agents.nodes.ros.qos import LATCHED, STREAM
 from msg_agents.nodes.ros.timers import every
 from msg_agents.recovery.checkpoint import longest_heard
 from msg_agents.stepping.synchronizer import AGAIN, Refusal
-from msg_analysis.bags.format.storage_options import DEFAULT, Storage
+from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
 from msg_analysis.model.arithmetic.payload import all_finite
@@ -55,7 +55,7 @@ class Recorder(NetworkNode):
     Messages are stamped with simulated time, so that equal runs give equal bags whatever the load of the machine.
     """
 
-    def __init__(self, *, record: RunRecord, directory: Path, storage: Storage = DEFAULT) -> None:
+    def __init__(self, *, record: RunRecord, directory: Path, storage: Storage = DEFAULT_STORAGE) -> None:
         super().__init__("recorder", record=record)
         experiment = record.experiment
         # In the bag topics keep their own names, even if they are remapped: readers of bags look for these.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from msg_agents.processes.environment import DISCOVERY_TIMEOUT
-from msg_analysis.bags.format.storage_options import DEFAULT, MEGABYTE, Storage
+from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, MEGABYTE, Storage
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import Experiment
 
@@ -82,7 +82,7 @@ def plan_network(
     checkpoints: Path | None = None,  # directory of the states for a takeover; None: killed processes cannot resume
     *,
     use_sim_time: bool = False,
-    storage: Storage = DEFAULT,
+    storage: Storage = DEFAULT_STORAGE,
     share: Share | None = None,
 ) -> list[ProcessPlan]:
     """The processes of a run, in the order in which to start them; with ``share``, those of this host only.

@@ -21,7 +21,7 @@ from msg_agents.running.run_folder import workshop
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, Supervisor
 from msg_agents.stepping.stall_detection import Pace
 from msg_agents.terminal.interruption import Interruption
-from msg_analysis.bags.format.storage_options import DEFAULT, Storage
+from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.writer import RECORDING_MARKER
@@ -96,7 +96,7 @@ def run_network(
     domain: int | None = None,
     restarts: int = RESTARTS,
     use_sim_time: bool = False,
-    storage: Storage = DEFAULT,
+    storage: Storage = DEFAULT_STORAGE,
     pin: bool = True,
     on_progress: Callable[[int], None] = lambda _: None,
     on_note: Callable[[str], None] = lambda _: None,

@@ -151,7 +151,7 @@ def test_one_of_the_two_topics_is_missing(record: Record, topic: str, field: str
 def test_without_the_experiment(record: Record) -> None:
     """Nobody knows what run it is of: no comparison, but `info` says what is there."""
     bag = record(lambda messages: [m for m in messages if m[0] != "/experiment"])
-    with pytest.raises(BagError, match="without the latched topic `experiment`"):
+    with pytest.raises(BagError, match="the latched topic `experiment` is missing"):
         read_bag(bag)
     document = describe_bag(bag)
     assert "latched topic" in document["problem"]
@@ -182,7 +182,7 @@ def test_sqlite(record: Record) -> None:
         with pytest.raises(BagError, match="storage is sqlite3, expected mcap: record with `ros2 bag record -s mcap`"):
             function(bag)
     (file,) = bag.glob("*.db3")
-    with pytest.raises(BagError, match="is no MCAP file"):
+    with pytest.raises(BagError, match="not an MCAP file"):
         read_bag(file)
 
 

@@ -267,7 +267,7 @@ def test_no_bag(tmp_path: Path, make_run: MakeRun) -> None:
     run = make_run()
     with pytest.raises(BagError, match="not found"):
         read_bag(tmp_path / "nowhere")
-    with pytest.raises(BagError, match="no bag"):
+    with pytest.raises(BagError, match="not a bag"):
         read_bag(tmp_path)
     (tmp_path / "empty.mcap").touch()
     with pytest.raises(BagError, match="is empty"):
@@ -275,7 +275,7 @@ def test_no_bag(tmp_path: Path, make_run: MakeRun) -> None:
     (tmp_path / "text.mcap").write_text("name: line_ring")
     with pytest.raises(BagError, match="no MCAP file"):
         read_bag(tmp_path / "text.mcap")
-    with pytest.raises(BagError, match="without the latched topic"):
+    with pytest.raises(BagError, match="latched topic `experiment` is missing"):
         read_bag(_mcap(tmp_path / "x.mcap", _messages(run)[1:]))
     bad = [("/experiment", "std_msgs/msg/String", encode_string("{}"), 0), *_messages(run)[1:]]
     with pytest.raises(InputError, match="not a run record"):

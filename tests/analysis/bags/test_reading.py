@@ -260,7 +260,7 @@ def test_unpack() -> None:
 
 
 def test_chunks_that_claim_too_much_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcap_chunks, "LIMIT", 10**6)
+    monkeypatch.setattr(mcap_chunks, "RECORD_LIMIT", 10**6)
     bomb = bytes(10**7)
     with pytest.raises(DamageError):
         unpack(_chunk(bomb, b"zstd", zstandard.ZstdCompressor().compress(bomb), size=9), zstandard.ZstdDecompressor())

@@ -86,10 +86,10 @@ def test_no_guarantee_says_why(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--count", "5"], "--count 5: expected 1 to 4"),
+        (["--count", "5"], "count 5: expected 1 to 4"),
         (["--count", "2", "--law", "discrete"], "use continuous or emulated"),
-        (["--count", "2", "--gain", "nan"], "--gain nan: expected a number > 0"),
-        (["--count", "2", "--top", "0"], "--top 0: expected a number >= 1"),
+        (["--count", "2", "--gain", "nan"], "gain nan: expected a number > 0"),
+        (["--count", "2", "--top", "0"], "top 0: expected a number >= 1"),
         (["--count", "2", "--method", "best"], "--method"),
         ([], "--count"),
     ],

@@ -148,7 +148,7 @@ def test_failures_are_told_and_the_exit_code_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--scheduler", "tcp://127.0.0.1:9"], "--scheduler tcp://127.0.0.1:9: nobody answers there"),
+        (["--scheduler", "tcp://127.0.0.1:9"], "--scheduler tcp://127.0.0.1:9: no answer"),
         (["--scheduler", "nonsense://1"], "--scheduler nonsense://1: "),
         (["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"], "give one of them"),
         (["--out", "/proc/nothing"], "choose another place with --out"),

@@ -7,7 +7,7 @@ from scipy import stats
 
 from msg_analysis.inference.hypothesis_tests import innovations as module
 from msg_analysis.inference.hypothesis_tests.gain_regression import regressors
-from msg_analysis.inference.hypothesis_tests.innovations import innovation_tests, innovations, quadratic_form
+from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations, quadratic_form
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.theory.prediction import predict
@@ -60,7 +60,7 @@ def test_covariance_is_the_corrected_likelihood_ratio(observation):
     statistic = n * (np.trace(ratio) - np.log(np.linalg.det(ratio)) - p)
     corrected = statistic * (1 - (2 * p**2 + 3 * p - 1) / (6 * n * (p + 1)))
     expected = stats.chi2.sf(corrected, 6)
-    assert innovation_tests(observation).p_covariance == pytest.approx(expected, rel=1e-9)
+    assert InnovationSums(observation).tests().p_covariance == pytest.approx(expected, rel=1e-9)
 
 
 def test_whiteness_is_the_portmanteau_sum(observation):
@@ -79,7 +79,7 @@ def test_whiteness_is_the_portmanteau_sum(observation):
         pairs = sum(w[k, a, r] * w[k, a, s] for k in range(steps) for r in range(replicas) for s in range(r))
         chi2 += pairs**2 / (steps * 3)
     expected = stats.chi2.sf(chi2, 10 * rank**2 + rank)
-    assert innovation_tests(observation).p_whiteness == pytest.approx(expected, rel=1e-9)
+    assert InnovationSums(observation).tests().p_whiteness == pytest.approx(expected, rel=1e-9)
 
 
 def test_gain_is_the_score_test_written_out(observation):
@@ -99,13 +99,13 @@ def test_gain_is_the_score_test_written_out(observation):
                 for b, (j, _, _) in enumerate(regressors):
                     covariance[a, b] += step.noise[g][i, j] * phi[a] * phi[b]
     expected = stats.chi2.sf(score @ np.linalg.solve(covariance, score), 9)
-    assert innovation_tests(observation).p_gain == pytest.approx(expected, rel=1e-8)
+    assert InnovationSums(observation).tests().p_gain == pytest.approx(expected, rel=1e-8)
 
 
 def test_blocks_change_nothing(observation, monkeypatch):
-    whole = innovation_tests(observation)
+    whole = InnovationSums(observation).tests()
     monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 40)
-    split = innovation_tests(observation)
+    split = InnovationSums(observation).tests()
     assert split.p_covariance == pytest.approx(whole.p_covariance, rel=1e-9)
     assert split.p_whiteness == pytest.approx(whole.p_whiteness, rel=1e-9)
     assert split.p_gain == pytest.approx(whole.p_gain, rel=1e-9)
@@ -119,39 +119,39 @@ def test_regressors_stay_few(observation, monkeypatch, limit, count):
     assert len(terms) == count
     assert rows.shape == (count,)
     assert inputs.shape == (2, count, 4)
-    assert 0.0 < innovation_tests(observation).p_gain < 1.0
+    assert 0.0 < InnovationSums(observation).tests().p_gain < 1.0
 
 
 def test_a_direction_without_noise_must_stand_still():
     quiet = observe(noise={"process": [1.0, 1.0, 0.0]})
-    assert innovation_tests(quiet).p_covariance > 0.001
+    assert InnovationSums(quiet).tests().p_covariance > 0.001
     quiet.states[30, 2, 1] += 1e-4
-    assert innovation_tests(quiet).p_covariance == 0.0
+    assert InnovationSums(quiet).tests().p_covariance == 0.0
 
 
 @pytest.mark.parametrize("tiny", [1e-4, 1e-6, 1e-9])
 def test_hardly_any_noise_is_no_alarm(tiny):
-    assert innovation_tests(observe(noise={"process": [1.0, 1.0, tiny]})).p_covariance > 0.001
+    assert InnovationSums(observe(noise={"process": [1.0, 1.0, tiny]})).tests().p_covariance > 0.001
 
 
 def test_grounded_leaders_have_no_noise():
     leaders = {"agents": [1], "gain": float("inf"), "reference": 2.0}
     grounded = observe(leaders=leaders)
-    tests = innovation_tests(grounded)
+    tests = InnovationSums(grounded).tests()
     assert min(tests.p_covariance, tests.p_whiteness, tests.p_gain) > 0.001
     grounded.states[:, 0] += 0.01
-    assert innovation_tests(grounded).p_covariance == 0.0
+    assert InnovationSums(grounded).tests().p_covariance == 0.0
 
 
 def test_without_noise_there_is_nothing_to_test():
-    tests = innovation_tests(observe(noise={"process": 0.0}))
+    tests = InnovationSums(observe(noise={"process": 0.0})).tests()
     assert (tests.p_covariance, tests.p_whiteness, tests.p_gain) == (None, None, None)
 
 
 def test_replicas_with_the_same_noise_are_found():
     copied = observe()
     copied.states[:] = copied.states[:, :, :1]
-    assert innovation_tests(copied).p_whiteness < 1e-6
+    assert InnovationSums(copied).tests().p_whiteness < 1e-6
 
 
 def test_quadratic_form_ignores_dependent_and_dead_entries():

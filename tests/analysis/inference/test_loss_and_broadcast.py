@@ -8,9 +8,9 @@ import pytest
 from scipy import stats
 
 from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
-from msg_analysis.inference.hypothesis_tests.innovations import innovation_tests, innovations
-from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import broadcast_p, loss_test
-from msg_analysis.inference.observed.heard_values import Reception
+from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations
+from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import BroadcastSums, loss_test
+from msg_analysis.inference.observed.heard_values import HeardValues
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import Experiment
@@ -114,7 +114,7 @@ def nominal(what):
 @pytest.mark.parametrize("what", [CASES["all"], CASES["correlated"]])
 def test_innovations_are_what_is_left_of_each_step(what):
     observation, trajectory, weights = observe(what), simulate(what), nominal(what)
-    found = innovations(observation, 0, 400, Reception.of(observation, 0, 400))
+    found = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
     for k, g in enumerate(trajectory.modes):
         for i in range(3):
             rest = trajectory.states[k + 1, i] - weights[g][i, i] * trajectory.states[k, i]
@@ -132,9 +132,9 @@ def test_regression_against_a_loop(most):
     observation, trajectory, weights = observe(what), simulate(what), nominal(what)
     regression = HeardRegression(observation, most)
     for first, last in ((0, 150), (150, 400)):
-        reception = Reception.of(observation, first, last)
+        reception = HeardValues.of(observation, first, last)
         regression.add(reception, innovations(observation, first, last, reception))
-    e = innovations(observation, 0, 400, Reception.of(observation, 0, 400))
+    e = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
     process = what.run.dt * np.array(CORRELATED) @ np.array(CORRELATED).T
     links = [(i, j) for g in (0, 1) for i in range(3) for j in range(3) if j != i and weights[g][i, j]]
     size = {400: 3 + len(links) + 2, 12: 9, 8: 6}[most]
@@ -181,9 +181,9 @@ def test_regression_against_a_loop(most):
 
 def test_blocks_change_nothing(monkeypatch):
     observation = observe(CASES["correlated"])
-    whole = innovation_tests(observation), loss_test(observation), broadcast_p(observation)
+    whole = InnovationSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
     monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 70)
-    split = innovation_tests(observation), loss_test(observation), broadcast_p(observation)
+    split = InnovationSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
     for one, other in zip(whole[:2], split[:2], strict=True):
         for ours, theirs in zip(dataclasses.astuple(other), dataclasses.astuple(one), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-9)
@@ -198,7 +198,7 @@ def test_agents_that_moved_without_having_heard_anything():
     assert compare(trajectory).verdict == "agrees"
     moved = trajectory.states.copy()
     moved[step + 1 :] += np.array([1e-4, 0.0, 0.0])[:, None]
-    result = innovation_tests(Observation.of(dataclasses.replace(trajectory, states=moved), predict(what)))
+    result = InnovationSums(Observation.of(dataclasses.replace(trajectory, states=moved), predict(what))).tests()
     assert result.p_covariance == 0.0
 
 
@@ -253,6 +253,6 @@ def test_rare_losses_have_their_binomial_law(lost):
 
 def test_broadcast_noise_that_is_repeated():
     observation = observe(experiment(run={"duration": 20}))
-    assert broadcast_p(observation) > 1e-3
+    assert BroadcastSums(observation).p_value() > 1e-3
     same = observation.states + (observation.published - observation.states)[:, :1]
-    assert broadcast_p(dataclasses.replace(observation, published=same)) < 1e-6
+    assert BroadcastSums(dataclasses.replace(observation, published=same)).p_value() < 1e-6

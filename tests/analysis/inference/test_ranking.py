@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.inference.errors.ranking import order_of
+from msg_analysis.inference.errors.ranking import rank_estimates
 
 
 def test_pairs_by_hand():
     measured = np.array([1.0, 2.0, 1.05, 4.0])
     covariance = np.diag([0.01, 0.04, 0.01, 0.04])
     covariance[0, 1] = covariance[1, 0] = 0.015
-    found = order_of(measured, covariance, np.array([1.0, 2.0, 1.0, 1.5]), 0.01)
+    found = rank_estimates(measured, covariance, np.array([1.0, 2.0, 1.0, 1.5]), 0.01)
     p = {}
     for i in range(4):
         for j in range(i):
@@ -35,15 +35,15 @@ def test_pairs_by_hand():
 
 
 def test_equal_predictions_that_are_told_apart_contradict():
-    found = order_of(np.array([1.0, 2.0]), np.eye(2) * 1e-4, np.array([1.5, 1.5 * (1 + 1e-13)]), 0.01)
+    found = rank_estimates(np.array([1.0, 2.0]), np.eye(2) * 1e-4, np.array([1.5, 1.5 * (1 + 1e-13)]), 0.01)
     assert found.predicted_ranking == (1, 2)
     assert [d.predicted for d in found.contradictions] == [None]
 
 
 def test_nothing_to_put_in_order():
-    assert order_of(np.array([1.0]), np.eye(1), None, 0.01) is None
-    assert order_of(np.array([1.0, 2.0]), np.zeros((2, 2)), None, 0.01) is None
-    assert order_of(np.zeros(101), np.eye(101), None, 0.01) is None
+    assert rank_estimates(np.array([1.0]), np.eye(1), None, 0.01) is None
+    assert rank_estimates(np.array([1.0, 2.0]), np.zeros((2, 2)), None, 0.01) is None
+    assert rank_estimates(np.zeros(101), np.eye(101), None, 0.01) is None
 
 
 def test_false_distinctions_stay_below_the_level():
@@ -51,5 +51,5 @@ def test_false_distinctions_stay_below_the_level():
     random = np.random.default_rng(1)
     root = random.standard_normal((5, 5))
     draws = 1.0 + 0.01 * random.standard_normal((2000, 5)) @ root.T
-    wrong = sum(bool(order_of(draw, 1e-4 * root @ root.T, None, 0.05).distinctions) for draw in draws)
+    wrong = sum(bool(rank_estimates(draw, 1e-4 * root @ root.T, None, 0.05).distinctions) for draw in draws)
     assert wrong <= stats.binom.isf(1e-4, 2000, 0.05)

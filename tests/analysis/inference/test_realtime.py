@@ -10,8 +10,8 @@ from scipy import stats
 from msg_analysis.common.number_words import percent
 from msg_analysis.errors import InputError
 from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
-from msg_analysis.inference.hypothesis_tests.innovations import innovation_tests, innovations
-from msg_analysis.inference.observed.heard_values import Reception, process_noise
+from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations
+from msg_analysis.inference.observed.heard_values import HeardValues, process_noise
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.realtime.event_order import order_events
 from msg_analysis.inference.realtime.timing import measure_timing
@@ -87,9 +87,9 @@ def test_innovations_are_the_noise_that_was_added(late_timers, case):
     assert (graphs != trajectory.modes[:, None]).mean() > 0.05
     assert (trajectory.used == -1).any()
     observation = observe(trajectory)
-    found = innovations(observation, 0, 400, Reception.of(observation, 0, 400))
+    found = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
     np.testing.assert_allclose(found, drawn_noise(what, graphs), atol=1e-12)
-    part = innovations(observation, 120, 130, Reception.of(observation, 120, 130))
+    part = innovations(observation, 120, 130, HeardValues.of(observation, 120, 130))
     np.testing.assert_array_equal(part, found[120:130])
 
 
@@ -100,7 +100,7 @@ def test_timing_does_not_change_what_is_tested_of_the_noise(late_timers, case):
     results = []
     for trajectory in (simulate(what), late_timers.run(what, **lateness(late_timers))):
         observation = observe(trajectory)
-        results.append(innovation_tests(observation, order_events(observation).position))
+        results.append(InnovationSums(observation, order_events(observation).position).tests())
     if case == "noise by graph":
         assert min(results[1].p_covariance, results[1].p_whiteness) > 1e-3
     else:
@@ -112,7 +112,7 @@ def test_lockstep_is_the_same_with_or_without_a_log_of_it(late_timers):
     """A log that says that all of step k was used gives what is tested in lockstep."""
     what = experiment(run={"pace": "lockstep"}, noise={"process": CORRELATED})
     trajectory = simulate(what)
-    plain = innovation_tests(Observation.of(trajectory, predict(what)))
+    plain = InnovationSums(Observation.of(trajectory, predict(what))).tests()
     model = predict(what).step
     used = np.full((400, 3, model.most_neighbours), -1)
     for k, g in enumerate(trajectory.modes):
@@ -124,7 +124,7 @@ def test_lockstep_is_the_same_with_or_without_a_log_of_it(late_timers):
         trajectory, record=dataclasses.replace(trajectory.record, experiment=what.with_run(pace="realtime")),
         agent_modes=graphs, used=used, made=made,
     )  # fmt: skip
-    found = innovation_tests(observe(logged))
+    found = InnovationSums(observe(logged)).tests()
     found, plain = dataclasses.asdict(found), dataclasses.asdict(plain)
     assert found.pop("ratios") == pytest.approx(plain.pop("ratios"), rel=1e-6)
     assert found == pytest.approx(plain, rel=1e-6)
@@ -137,9 +137,9 @@ def test_regression_frees_innovations_of_those_made_before(late_timers):
     position, timers, step = order_events(observation).position, observation.timers, observation.step
     regression = HeardRegression(observation, 400, position)
     for first, last in ((0, 150), (150, 400)):
-        reception = Reception.of(observation, first, last)
+        reception = HeardValues.of(observation, first, last)
         regression.add(reception, innovations(observation, first, last, reception), first)
-    e = innovations(observation, 0, 400, Reception.of(observation, 0, 400))
+    e = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
     places = {}
     for g in range(2):
         for i in range(3):

@@ -263,7 +263,7 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     (TRACKING | {"leaders.reference": math.inf}, ["leaders.reference: .inf: expected a finite number"]),
     (
         TRACKING | {"leaders": {"agents": [1, 2, 3, 4, 5], "gain": "inf"}},
-        ["leaders.agents: everybody, with gain inf: expected at least one agent that follows"],
+        ["leaders.agents: all agents, with gain inf: expected at least one agent that follows"],
     ),
     # the run
     (

@@ -64,13 +64,13 @@ def test_a_bag_of_what_is_not_installed(name: str, offer: Callable[..., None], t
     assert read.lost is not None
     assert trajectory.lost is not None
     assert np.array_equal(read.lost, trajectory.lost)
-    word = f"protocol {name} (msg_agents_example_protocols 0.1.0) is not here"
+    word = f"protocol {name} (msg_agents_example_protocols 0.1.0) is not available here"
     assert word in describe_bag(bag)["protocol"]["absent"]
     comparison = compare(read)
     assert comparison.verdict == "unpredicted"
     assert comparison.unpredicted is not None
     assert word in comparison.unpredicted
-    with pytest.raises(InputError, match=r"is not here .*: install msg_agents_example_protocols 0"):
+    with pytest.raises(InputError, match=r"is not available here .*: install msg_agents_example_protocols 0"):
         check(read)
 
 
@@ -86,5 +86,5 @@ def test_a_bag_of_another_version(offer: Callable[..., None], tmp_path: Path) ->
     offer(("mine", type("More", (EulerSteps,), {"states": 2})), version="2.0")
     read = read_bag(tmp_path / "bag")
     assert read.completeness.complete
-    with pytest.raises(InputError, match=r"mine \(pack 1.2\) is not here, but 2.0, whose states are of another kind"):
+    with pytest.raises(InputError, match=r"mine \(pack 1.2\) is not available here: the states of version 2.0"):
         check(read)

@@ -292,7 +292,7 @@ def test_agents_that_hear_nobody_must_lead() -> None:
         selection = select_leaders(experiment, 2, method=method)  # type: ignore[arg-type]
         assert [agents for _, agents in selection.sets] == [(0, 5)]
         assert {0, 5} < set(select_leaders(experiment, 3, method=method).sets[0][1])  # type: ignore[arg-type]
-        with pytest.raises(InputError, match="no set of 1 reaches everybody"):
+        with pytest.raises(InputError, match="no set of 1 reaches all agents"):
             select_leaders(experiment, 1, method=method)  # type: ignore[arg-type]
 
 
@@ -317,12 +317,12 @@ def test_everybody_leads() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"count": 0}, "--count 0: expected 1 to 4"),
-        ({"count": 5}, "--count 5: expected 1 to 4.*somebody has to follow"),
-        ({"count": 6, "gain": 1.0}, "--count 6: expected 1 to 5"),
-        ({"gain": 0.0}, "--gain 0.0: expected a number > 0"),
-        ({"gain": math.nan}, "--gain nan"),
-        ({"top": 0}, "--top 0"),
+        ({"count": 0}, "count 0: expected 1 to 4"),
+        ({"count": 5}, "count 5: expected 1 to 4.*at least one agent must follow"),
+        ({"count": 6, "gain": 1.0}, "count 6: expected 1 to 5"),
+        ({"gain": 0.0}, "gain 0.0: expected a number > 0"),
+        ({"gain": math.nan}, "gain nan"),
+        ({"top": 0}, "top 0"),
         ({"law": "discrete"}, "--law discrete.*use continuous or emulated"),
         ({"method": "best"}, "method best: expected one of auto, exhaustive"),
     ],

@@ -336,7 +336,7 @@ def test_union_that_does_not_connect_is_refused():
     gamma = np.array([[-1.0, 1.0], [1.0, -1.0]])
     model = JumpSystem("continuous", z, np.stack([np.eye(3)] * 2), gamma, np.array([0.5, 0.5]), lift)
     for method in ("auto", "krylov", "dense"):
-        with pytest.raises(InputError, match="union of the graphs connects everybody"):
+        with pytest.raises(InputError, match="union of the graphs connects all agents"):
             MomentSolver(model, method=method).steady()
 
 

@@ -222,7 +222,7 @@ def test_graphs_that_hardly_differ_lose_nothing():
 def test_what_is_refused():
     document = random_experiment(1, 3).to_document()
     document["graphs"] = {"first": {"edges": [[1, 2]]}, "second": {"edges": [[2, 3]]}}
-    with pytest.raises(InputError, match="graph 1 held for ever has no steady error"):
+    with pytest.raises(InputError, match="graph 1 held fixed has no steady error"):
         two_topology(systems.continuous(Experiment.parse(document)))
     system = systems.continuous(random_experiment(1, 3))
     with pytest.raises(InputError, match="1 graphs, expected 2"):

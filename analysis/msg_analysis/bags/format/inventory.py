@@ -15,21 +15,16 @@ from typing import Any, BinaryIO
 
 import numpy as np
 import yaml
-from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, ChunkIndex
 from mcap.summary import Summary
 
+from msg_analysis.bags.format.mcap_chunks import CHUNK_CRC, RECORD_LIMIT, chunk_head
 from msg_analysis.bags.format.mcap_file import Batch, McapFile
 from msg_analysis.bags.format.metadata import ChannelCount, FileCount
 
-RECORD_LIMIT = 2**28  # bytes of a record at the end of a file; only damage claims more
 _FOOTER = struct.Struct("<9xQQI8x")  # starts of summary and summary offsets; CRC of all from the summary up to itself
 _BEHIND_CRC = 12  # bytes of the CRC and the closing magic
-_CHUNK = struct.Struct("<BQQQQ")  # opcode, length, first and last log time, size when unpacked
-_CHUNK_CRC = 4  # bytes of the CRC behind `_CHUNK`
-_PACKED = struct.Struct("<Q")  # compressed size, behind the name of the compression
-_RECORD_HEAD = 9  # bytes of opcode and length
 
 
 @dataclass(slots=True)
@@ -116,21 +111,23 @@ def summary_of(file: Path) -> Summary | None:
 
 def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
     """Whether the chunk that an index describes stands where the index says, with the same head."""
-    name = index.compression.encode()
-    times = (index.message_start_time, index.message_end_time)
-    head = _CHUNK.pack(Opcode.CHUNK, index.chunk_length - _RECORD_HEAD, *times, index.uncompressed_size)
-    rest = len(name).to_bytes(4, "little") + name + _PACKED.pack(index.compressed_size)
+    head = chunk_head(index)
     stream.seek(index.chunk_start_offset)
-    found = stream.read(len(head) + _CHUNK_CRC + len(rest))
-    filled = len(found) + index.compressed_size == index.chunk_length
-    return filled and found.startswith(head) and found.endswith(rest)
+    found = bytearray(stream.read(len(head)))
+    found[CHUNK_CRC] = head[CHUNK_CRC]
+    return found == head and len(head) + index.compressed_size == index.chunk_length
 
 
 def channel_count(channel: Channel, type_name: str) -> ChannelCount:
     """A topic without messages yet, from an MCAP channel; ``type_name`` is ``package/msg/Name``."""
-    try:
-        qos: Any = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "[]"))
-    except (ValueError, RecursionError, yaml.YAMLError):
-        qos = []
     type_hash = channel.metadata.get("topic_type_hash", "")
-    return ChannelCount(channel.topic, type_name, type_hash, qos if isinstance(qos, list) else [])
+    return ChannelCount(channel.topic, type_name, type_hash, offered_profiles(channel))
+
+
+def offered_profiles(channel: Channel) -> list[Any]:
+    """The QoS profiles that the publishers of a channel offered, as rosbag2 writes them; empty if not readable."""
+    try:
+        profiles = yaml.safe_load(channel.metadata.get("offered_qos_profiles", ""))
+    except (ValueError, RecursionError, yaml.YAMLError):
+        return []
+    return profiles if isinstance(profiles, list) else []

@@ -12,17 +12,20 @@ from collections.abc import Sequence
 import numpy as np
 import zstandard
 from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 
 from msg_analysis.types import AnyArray, IntArray
 
-LIMIT = 2**28  # bytes of one record or chunk; recorders write megabytes, only damage claims more
+RECORD_LIMIT = 2**28  # bytes of one record or chunk; recorders write megabytes, only damage claims more
 RECORD = struct.Struct("<BQ")  # opcode and length, before the content of every record
+CHUNK_TIMES = struct.Struct("<QQ")  # first and last log time, at the start of a chunk
 # Fields of a message record before the CDR bytes: 22 bytes; times in ns.
 MESSAGE_HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")])
 _CHUNK = struct.Struct("<QQQII")  # start and end time, size, CRC (0: none), length of the compression's name
-_INDEX_HEAD = 6  # bytes before the entries of a message index record: channel, length; an entry: time, offset
+INDEX_HEAD = 6  # bytes before the entries of a message index record: channel, length; an entry: time, offset
 _RECORD_HEAD = np.dtype([("opcode", "u1"), ("length", "<u8")])
 _LENGTH = struct.Struct("<Q")
+CHUNK_CRC = slice(RECORD.size + 24, RECORD.size + 28)  # place of the CRC in the record of a chunk
 _ALIKE = 16  # records of equal length in a row, after which more are expected
 
 
@@ -45,8 +48,17 @@ def gather(data: bytes, start: IntArray, size: int) -> AnyArray:
     return np.asarray(windows[start])
 
 
+def chunk_head(index: ChunkIndex) -> bytes:
+    """The first bytes of the record of a chunk, before its data, as its index describes it; with 0 as CRC."""
+    name = index.compression.encode()
+    times = (index.message_start_time, index.message_end_time)
+    content = _CHUNK.pack(*times, index.uncompressed_size, 0, len(name)) + name + _LENGTH.pack(index.compressed_size)
+    head: bytes = RECORD.pack(Opcode.CHUNK, index.chunk_length - RECORD.size) + content
+    return head
+
+
 def unpack(content: bytes, zstd: zstandard.ZstdDecompressor) -> bytes:
-    """The records in a chunk, from the content of its record; DamageError: larger than ``LIMIT``, or a wrong checksum.
+    """The records in a chunk, from the content of its record; DamageError: too large, or a wrong checksum.
 
     ``zstd`` is reused from chunk to chunk: making one takes longer than a small chunk.
     """
@@ -56,17 +68,17 @@ def unpack(content: bytes, zstd: zstandard.ZstdDecompressor) -> bytes:
     (packed_size,) = _LENGTH.unpack_from(content, at)
     at += _LENGTH.size
     packed = memoryview(content)[at : at + packed_size]
-    if size > LIMIT:
+    if size > RECORD_LIMIT:
         raise DamageError
     if name == b"zstd":
-        if zstandard.frame_content_size(packed) > LIMIT:
+        if zstandard.frame_content_size(packed) > RECORD_LIMIT:
             raise DamageError  # max_output_size is ignored where the frame states its size
         data = zstd.decompress(packed, max_output_size=size)
     elif name == b"lz4":
         import lz4.frame
 
         frame = lz4.frame.LZ4FrameDecompressor()
-        data = frame.decompress(packed, max_length=LIMIT)
+        data = frame.decompress(packed, max_length=RECORD_LIMIT)
         if not frame.eof:
             raise DamageError
     else:
@@ -82,7 +94,7 @@ def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | N
     ``index`` has the contents of the message index records behind the chunk. None where the messages that it names do
     not fill the chunk from the first byte to the last: then only a walk from record to record finds what is there.
     """
-    entries = [np.frombuffer(record, "<u8", offset=_INDEX_HEAD) for record in index if _is_index(record)]
+    entries = [np.frombuffer(record, "<u8", offset=INDEX_HEAD) for record in index if _is_index(record)]
     if not entries or len(entries) < len(index):
         return None
     start = np.concatenate(entries)[1::2]
@@ -92,7 +104,7 @@ def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | N
     start = start.astype(np.int64)
     head = gather(data, start, RECORD.size).view(_RECORD_HEAD)
     start += RECORD.size
-    size = np.minimum(head["length"], LIMIT + 1).astype(np.int64)
+    size = np.minimum(head["length"], RECORD_LIMIT + 1).astype(np.int64)
     end = start + size
     followed = start[0] == RECORD.size and end[-1] == len(data) and (start[1:] - end[:-1] == RECORD.size).all()
     return (start, size) if followed and (head["opcode"] == Opcode.MESSAGE).all() else None
@@ -143,13 +155,13 @@ def indexed(start: IntArray, index: Sequence[bytes]) -> bool:
     """Whether a non-empty index names exactly the messages whose contents begin at ``start``, (messages,) ascending."""
     if not all(map(_is_index, index)):
         return False
-    entries = [np.frombuffer(record, "<u8", offset=_INDEX_HEAD)[1::2] for record in index]
+    entries = [np.frombuffer(record, "<u8", offset=INDEX_HEAD)[1::2] for record in index]
     return np.array_equal(np.sort(np.concatenate(entries)), (start - RECORD.size).astype(np.uint64))
 
 
 def _is_index(record: bytes) -> bool:
     """Whether it has the length that it states, in whole entries."""
-    if len(record) < _INDEX_HEAD:
+    if len(record) < INDEX_HEAD:
         return False
-    size = int.from_bytes(record[_INDEX_HEAD - 4 : _INDEX_HEAD], "little")
-    return size == len(record) - _INDEX_HEAD and size % 16 == 0
+    size = int.from_bytes(record[INDEX_HEAD - 4 : INDEX_HEAD], "little")
+    return size == len(record) - INDEX_HEAD and size % 16 == 0

@@ -15,12 +15,12 @@ import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
 
 from msg_analysis.bags.format.mcap_chunks import (
-    LIMIT,
     MESSAGE_HEAD,
     RECORD,
+    RECORD_LIMIT,
     DamageError,
     gather,
     indexed,
@@ -86,9 +86,9 @@ class _Chunk:
     _filled: int = 0
 
     def add_index(self, content: bytes) -> None:
-        """Take the content of one more index record, up to ``LIMIT`` bytes of all."""
+        """Take the content of one more index record, up to ``RECORD_LIMIT`` bytes of all."""
         self._filled += len(content)
-        if self._filled <= LIMIT:
+        if self._filled <= RECORD_LIMIT:
             self.index.append(content)
 
 
@@ -138,6 +138,7 @@ class McapFile:
     schemas: dict[int, Schema] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
+    statistics: Statistics | None = None
     profile: str = ""
     library: str = ""
     whole_bytes: int = 0  # length of the whole records so far, with the magic bytes; of a .zstd file, unpacked
@@ -165,9 +166,9 @@ class McapFile:
     def _batches(self, stream: io.BufferedReader, size: int) -> Iterator[Batch]:
         start = stream.read(len(MAGIC))
         if not start:
-            raise BagError(f"{self.path}: is empty: nothing was recorded")
+            raise BagError(f"{self.path}: empty: nothing was recorded")
         if start != MAGIC:
-            raise BagError(f"{self.path}: is no MCAP file: expected a bag of ROS 2's mcap storage")
+            raise BagError(f"{self.path}: not an MCAP file: expected a bag of ROS 2's mcap storage")
         self.whole_bytes = len(MAGIC)
         _keep_memory()
         zstd = zstandard.ZstdDecompressor()
@@ -185,7 +186,7 @@ class McapFile:
                 yield _loose_batch(content, *places, self.whole_bytes)
             else:
                 with contextlib.suppress(DamageError):
-                    self._note(opcode, content)
+                    self.note(opcode, content)
         if chunk is not None:
             yield from self._chunk(chunk, zstd)
 
@@ -207,7 +208,7 @@ class McapFile:
             if not opcode:  # a power cut leaves zeros
                 self.torn = f"no record at byte {self.whole_bytes}, where one should be"
                 return
-            if length <= min(LIMIT, size - self.whole_bytes):
+            if length <= min(RECORD_LIMIT, size - self.whole_bytes):
                 content = stream.read(length)
             if len(content) < length:
                 self.torn = f"the record at byte {self.whole_bytes} is cut off or damaged"
@@ -219,7 +220,8 @@ class McapFile:
                 return
             yield opcode, content, (np.array([0]), np.array([length]))
 
-    def _note(self, opcode: int, content: bytes) -> None:
+    def note(self, opcode: int, content: bytes) -> None:
+        """Keep the content of a record that is not a message; DamageError where it does not fit its type."""
         stream = ReadDataStream(io.BytesIO(content))
         try:
             if opcode == Opcode.HEADER:
@@ -233,6 +235,8 @@ class McapFile:
                 self.channels[channel.id] = channel
             elif opcode == Opcode.METADATA:
                 self.metadata.append(Metadata.read(stream))
+            elif opcode == Opcode.STATISTICS:
+                self.statistics = Statistics.read(stream)
             elif opcode == Opcode.ATTACHMENT:
                 self.attachments.append(Attachment.read(stream))
         except Exception as error:  # the library raises many kinds of errors on damage
@@ -262,7 +266,7 @@ class McapFile:
             if opcode == Opcode.MESSAGE:
                 yield at, length
             else:
-                self._note(opcode, data[at : at + length])
+                self.note(opcode, data[at : at + length])
             at += length
 
 

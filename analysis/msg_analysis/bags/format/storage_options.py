@@ -28,4 +28,4 @@ class Storage:
             raise InputError(f"split size: {self.split_size} bytes: expected more than 0")
 
 
-DEFAULT = Storage()
+DEFAULT_STORAGE = Storage()

@@ -25,7 +25,7 @@ from msg_analysis.inference.hypothesis_tests.switching import Transitions
 from msg_analysis.inference.statistics.forward_selection import Selected, select
 from msg_analysis.model.network.markov_chain import MarkovChain
 
-Kind = Literal[
+CauseKind = Literal[
     "frozen",
     "gain",
     "ignored",
@@ -38,14 +38,14 @@ Kind = Literal[
     "broadcast",
     "unknown",
 ]
-MAX_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
+MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
     """One thing that is wrong."""
 
-    kind: Kind
+    kind: CauseKind
     words: str  # a sentence
     agent: int | None = None  # from 1; None where the cause is not one agent
     link: tuple[int, int] | None = None  # from 1: sender and receiver, or the two ends of an edge or of a correlation
@@ -202,7 +202,7 @@ def _correlations(sums: InnovationSums, pardoned: Sequence[int], families: int, 
     m = sums.still.shape[1]
     agents = [i for i in range(m) if i not in pardoned]
     pairs = [(i, j) for place, i in enumerate(agents) for j in agents[:place]]
-    if not 0 < len(pairs) <= MAX_PAIRS:
+    if not 0 < len(pairs) <= MAX_NOISE_PAIRS:
         return []
     samples = int(sums.samples.sum())
     should = np.tensordot(sums.samples, sums.noises, axes=1)

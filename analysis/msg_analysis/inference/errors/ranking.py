@@ -12,8 +12,7 @@ from msg_analysis.inference.errors.time_means import TimeMeans
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.types import FloatArray, IntArray
 
-MAX_PAIRS = 4950  # pairs tested, at most: 100 agents
-SHOWN = 12  # statements in words, at most
+MAX_RANKED_PAIRS = 4950  # pairs tested, at most: 100 agents
 EQUAL = 1e-9  # relative difference of predicted errors that counts as none
 
 
@@ -41,7 +40,7 @@ class Distinction:
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class Ranking:
     """Measured errors in order."""
 
     ranking: tuple[int, ...]  # numbers from 1, smallest measured error first
@@ -78,18 +77,20 @@ class Order:
         }
 
 
-def order_of_nodes(means: TimeMeans, level: float) -> Order | None:
+def rank_agents(means: TimeMeans, level: float) -> Ranking | None:
     """Order the agents by measured error; None where their errors are not estimated together."""
     if not len(means.nodes):
         return None
     covariance = means.nodes @ means.covariance @ means.nodes.T
-    return order_of(means.nodes @ means.measured, covariance, means.nodes @ means.predicted, level)
+    return rank_estimates(means.nodes @ means.measured, covariance, means.nodes @ means.predicted, level)
 
 
-def order_of(measured: FloatArray, covariance: FloatArray, predicted: FloatArray | None, level: float) -> Order | None:
+def rank_estimates(
+    measured: FloatArray, covariance: FloatArray, predicted: FloatArray | None, level: float
+) -> Ranking | None:
     """Order estimates, and distinguish pairs of them by z-tests, adjusted by Holm.
 
-    None where there is no pair, no noise, or more than ``MAX_PAIRS``.
+    None where there is no pair, no noise, or more than ``MAX_RANKED_PAIRS``.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def order_of(measured: FloatArray, covariance: FloatArray, predicted: FloatArray
     """
     q = len(measured)
     first, second = np.triu_indices(q, 1)
-    if not 0 < len(first) <= MAX_PAIRS:
+    if not 0 < len(first) <= MAX_RANKED_PAIRS:
         return None
     difference = measured[second] - measured[first]
     own = np.diag(covariance)
@@ -115,7 +116,7 @@ def order_of(measured: FloatArray, covariance: FloatArray, predicted: FloatArray
         _distinction(*_sorted(first[a], second[a], difference[a]), abs(difference[a]), error[a], adjusted[a], predicted)
         for a in apart[np.argsort(adjusted[apart], kind="stable")]
     ]
-    return Order(
+    return Ranking(
         ranking=_ranking(measured),
         predicted_ranking=None if predicted is None else _ranking(predicted),
         distinctions=tuple(found),

@@ -246,6 +246,13 @@ def forms_of(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Linear functions of packed y y^T to be estimated: all second moments, the node errors, or the system error.
 
+    Parameters
+    ----------
+    system
+        reduced system of the run's steps
+    kind
+        what is estimated
+
     Returns
     -------
     tuple[FloatArray, FloatArray, FloatArray]

@@ -12,7 +12,7 @@ from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 MAX_REGRESSORS = 400
-ROUNDING = 1e-12  # relative to the sum of an agent's weights
+WEIGHT_ROUNDING = 1e-12  # relative to the sum of an agent's weights
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +86,13 @@ def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[T
     every agent (1, which finds a wrong reference or offset). Where these are more than ``most``: the whole pull (W_g x
     - x)_i of a row instead of each of its terms; where that is still too many, without distinguishing graphs.
 
+    Parameters
+    ----------
+    step
+        step model of the run
+    most
+        largest number K
+
     Returns
     -------
     tuple[IntArray, FloatArray, list[Term]]
@@ -95,12 +102,12 @@ def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[T
     terms = [Term("constant", i) for i in range(m)]
     sums = step.weights.sum(axis=2)
     heard = int(step.links.sum(where=~np.eye(m, dtype=np.bool_)))
-    if m + heard + int((np.abs(1.0 - sums) > ROUNDING).sum()) <= most:
+    if m + heard + int((np.abs(1.0 - sums) > WEIGHT_ROUNDING).sum()) <= most:
         for mode in range(n):
             for i in range(m):
                 for j in step.neighbours(mode, i).tolist():
                     terms.append(Term("link", i, mode, j, float(step.weights[mode, i, j])))
-                if abs(1.0 - sums[mode, i]) > ROUNDING:
+                if abs(1.0 - sums[mode, i]) > WEIGHT_ROUNDING:
                     terms.append(Term("lead", i, mode, None, float(sums[mode, i] - 1.0)))
     elif m + n * m <= most:
         terms += [Term("pull", i, mode) for mode in range(n) for i in range(m)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from msg_analysis.inference.hypothesis_tests.gain_regression import Term
-from msg_analysis.inference.observed.heard_values import Reception, mode_links, process_noise
+from msg_analysis.inference.observed.heard_values import HeardValues, mode_links, process_noise
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.types import FloatArray, IntArray
@@ -21,6 +21,8 @@ class HeardRegression:
 
     Parameters
     ----------
+    observation
+        of a run with noise or loss on the air, or in real time
     most
         largest number of regressors K; beyond it, fewer kinds of them are tested
     position
@@ -84,7 +86,7 @@ class HeardRegression:
             found += [Term("lead", i, mode, None, float(self._pull[mode, i])) for i in leaders]
         return found
 
-    def add(self, reception: Reception, innovations: FloatArray, first: int = 0) -> None:
+    def add(self, reception: HeardValues, innovations: FloatArray, first: int = 0) -> None:
         """Add a block of steps, beginning with step ``first``, and their innovations (b, m, R)."""
         order = None
         if self._position is not None:
@@ -106,7 +108,7 @@ class HeardRegression:
                 self._covariance[block] += (rows[:, None] == rows) * (flat @ flat.T)
 
     def _regressors(
-        self, reception: Reception, at: IntArray, graphs: IntArray
+        self, reception: HeardValues, at: IntArray, graphs: IntArray
     ) -> tuple[IntArray, IntArray, FloatArray]:
         """Places (a,), rows (a,) and values (len(at), a, R): constants of all agents, then what their rows use."""
         m = self._step.agents

@@ -17,7 +17,7 @@ from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardR
 from msg_analysis.inference.observed.heard_values import (
     NO_NOISE,
     Equalizer,
-    Reception,
+    HeardValues,
     full_reception_noise,
 )
 from msg_analysis.inference.observed.observation import Observation
@@ -26,7 +26,7 @@ from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.types import FloatArray, IntArray
 
 LAGS = 10
-ROUNDING = 1e-9  # relative size of what counts as rounding in directions without noise
+QUIET_ROUNDING = 1e-9  # relative size of what counts as rounding in directions without noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class _Directions:
 class InnovationSums:
     """Sums over the innovations of runs of one experiment: enough for the tests and for the diagnosis (``blame``).
 
-    In real time, ``position`` is that of ``events.Order``, (N, m).
+    In real time, ``position`` is that of ``event_order.EventOrder``, (N, m).
     """
 
     def __init__(self, observation: Observation, position: IntArray | None = None) -> None:
@@ -111,7 +111,7 @@ class InnovationSums:
             p_covariance, p_whiteness = self._equalizer.p_size(), None
         else:
             p_covariance, ratios = self._covariance_p(), self._ratios()
-        if self.quiet > max(ROUNDING * self.largest, hidden):
+        if self.quiet > max(QUIET_ROUNDING * self.largest, hidden):
             p_covariance = 0.0
         chi2, dof = quadratic_form(self.score, self.covariance)
         p_gain = float(stats.chi2.sf(chi2, dof)) if dof else None
@@ -144,7 +144,7 @@ class InnovationSums:
         for first, last in observation.blocks(max(observation.states[0].size, regression.numbers_per_step)):
             modes = observation.modes[first:last]
             if isinstance(regression, HeardRegression):
-                reception = Reception.of(observation, first, last)
+                reception = HeardValues.of(observation, first, last)
                 e = innovations(observation, first, last, reception)
                 regression.add(reception, e, first)
                 if self._equalizer:
@@ -184,16 +184,7 @@ class InnovationSums:
         return float(stats.chi2.sf(statistic, dof)) if dof else None
 
 
-def innovation_tests(observation: Observation, position: IntArray | None = None) -> InnovationTests:
-    """Test the innovations of a run: covariance, whiteness and gains.
-
-    ``position`` is that of ``events.Order``, (N, m), in real time; see ``covariance_statistic``, ``Whiteness`` and
-    ``StateRegression`` for the tests.
-    """
-    return InnovationSums(observation, position).tests()
-
-
-def innovations(observation: Observation, first: int, last: int, reception: Reception | None = None) -> FloatArray:
+def innovations(observation: Observation, first: int, last: int, reception: HeardValues | None = None) -> FloatArray:
     """(last - first, m, R): innovations e(k) of the steps first..last-1, given what was heard.
 
     Without a ``reception`` of these steps, all agents heard the states themselves.

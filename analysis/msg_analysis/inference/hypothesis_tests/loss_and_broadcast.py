@@ -13,7 +13,7 @@ from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.statistics.covariance_test import covariance_statistic
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
-MIN_EXPECTED = 25.0  # smallest expected count for which a chi-square law is used
+MIN_EXPECTED_LOSSES = 25.0  # smallest expected count for which a chi-square law is used
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class LossTally:
             return LossTest(0, 0.0, None)
         variance = probability * (1.0 - probability)
         rarer = min(probability, 1.0 - probability)
-        often = messages * rarer >= MIN_EXPECTED
+        often = messages * rarer >= MIN_EXPECTED_LOSSES
         chi2 = float(((lost - probability * messages)[often] ** 2 / messages[often]).sum() / variance)
         dof = int(often.sum())
         rest, rest_lost = int(messages[~often].sum()), int(lost[~often].sum())
@@ -86,7 +86,7 @@ class LossTally:
             p = float(stats.binomtest(rest_lost, rest, probability).pvalue)
             chi2, dof = chi2 + float(stats.chi2.isf(p, 1)), dof + 1
         for product, pairs in ((self.successive, self.successive_pairs), (self.same_step, self.same_step_pairs)):
-            if pairs * rarer**2 >= MIN_EXPECTED:
+            if pairs * rarer**2 >= MIN_EXPECTED_LOSSES:
                 chi2, dof = chi2 + product**2 / (variance**2 * pairs), dof + 1
         p = float(stats.chi2.sf(chi2, dof))
         return LossTest(int(lost.sum()), float(probability * messages.sum()), p)
@@ -151,12 +151,6 @@ class BroadcastSums:
         self.samples += other.samples
 
     def p_value(self) -> float:
-        """See ``broadcast_p``."""
+        """p-value of published - state being N(0, s^2 I), s = ``noise.broadcast``."""
         statistic, dof = covariance_statistic(self.scatter, self.samples)
         return float(stats.chi2.sf(statistic, dof))
-
-
-def broadcast_p(observation: Observation) -> float | None:
-    """p-value of published - state being N(0, s^2 I), s = ``noise.broadcast``; None without broadcast noise."""
-    sums = BroadcastSums.of(observation)
-    return sums.p_value() if sums else None

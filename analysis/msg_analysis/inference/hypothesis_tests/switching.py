@@ -12,7 +12,7 @@ from msg_analysis.types import FloatArray, IntArray
 
 PATHS = 9999
 MAX_JUMPS = 10_000_000  # simulated jumps; longer runs use fewer paths, but at least 199
-MIN_EXPECTED = 25.0  # smallest expected count of every possible transition for the chi-square law
+MIN_EXPECTED_TRANSITIONS = 25.0  # smallest expected count of every possible transition for the chi-square law
 SEED = 20_240_229
 
 
@@ -56,7 +56,7 @@ class Transitions:
             return SwitchingTest(counts, expected, None)
         # Decided by the expectation of the chain, not by the data: a choice made from the data would be a bias.
         usual = counts.sum() * stationary_law(transition)[:, None] * transition
-        if usual[transition > 0.0].min() >= MIN_EXPECTED:
+        if usual[transition > 0.0].min() >= MIN_EXPECTED_TRANSITIONS:
             chi2 = float(likelihood_ratio(counts, transition))
             return SwitchingTest(counts, expected, float(stats.chi2.sf(chi2, dof)))
         return SwitchingTest(counts, expected, self._simulated_p(transition))
@@ -110,7 +110,7 @@ def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
     Returns
     -------
     FloatArray
-        (...)
+        (..., ) one G for each matrix of counts
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = counts * np.log(counts / (counts.sum(axis=-1, keepdims=True) * transition))

@@ -32,7 +32,7 @@ def neighbour_weights(step: StepModel) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reception:
+class HeardValues:
     """What was heard in a block of b steps."""
 
     modes: IntArray  # (b,) graphs of the network
@@ -46,7 +46,7 @@ class Reception:
     link_variance: FloatArray  # (b, m) of the link noise in what each agent heard
 
     @classmethod
-    def of(cls, observation: Observation, first: int, last: int) -> Reception:
+    def of(cls, observation: Observation, first: int, last: int) -> HeardValues:
         """Reception of the steps first..last-1."""
         step, modes, timers = observation.step, observation.modes[first:last], observation.timers
         tables, agents = neighbour_tables(step), np.arange(step.agents)
@@ -149,7 +149,7 @@ class Equalizer:
         # Sum of e^T N^+ e, its degrees of freedom, and the largest innovation in directions without noise.
         self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
 
-    def equalize(self, innovations: FloatArray, reception: Reception) -> FloatArray:
+    def equalize(self, innovations: FloatArray, reception: HeardValues) -> FloatArray:
         """(b, m, R): transformed innovations (b, m, R) of the steps of a block."""
         m = innovations.shape[1]
         keys = np.column_stack([reception.modes, reception.graphs, reception.link_variance])

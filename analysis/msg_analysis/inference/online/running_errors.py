@@ -60,7 +60,7 @@ class LiveEstimate:
         self.record = record
         self.steps = StepCollector(experiment.agents, len(experiment.graph_list), experiment.steps, lockstep=lockstep)
         reason = experiment.protocol.unpredictable() if experiment.protocol else None
-        prediction = None if reason else predict(experiment)
+        prediction = None if reason else predict(experiment, record.step_model)
         self._errors = RunningErrors(record, prediction, nodes=nodes)
         self._latest: tuple[int, int, FloatArray] | None = None
         self._newest = -1

@@ -13,14 +13,14 @@ from msg_analysis.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Order:
+class EventOrder:
     """The steps of all agents as one sequence of events."""
 
     position: IntArray  # (N, m) place of the event in which agent i makes x_i(k+1)
     contradiction: str | None  # why the times in the log contradict cause and effect; None where they do not
 
 
-def order_events(observation: Observation) -> Order:
+def order_events(observation: Observation) -> EventOrder:
     """Order the events of a run in real time by time; at equal times, a value comes before the steps that use it.
 
     Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
@@ -57,7 +57,7 @@ def order_events(observation: Observation) -> Order:
     order = np.lexsort((agents, steps, level[1:].ravel(), after.ravel()))
     position = np.empty(len(order), dtype=np.int64)
     position[order] = np.arange(len(order))
-    return Order(position.reshape(after.shape), contradiction)
+    return EventOrder(position.reshape(after.shape), contradiction)
 
 
 def _turns(source: IntArray, target: IntArray, count: int) -> tuple[IntArray, bool]:

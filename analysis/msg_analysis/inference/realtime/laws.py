@@ -12,7 +12,7 @@ from msg_analysis.common.number_words import percent
 from msg_analysis.inference.errors.estimates import Estimate, covariance_test, estimates
 from msg_analysis.inference.errors.time_means import TimeMeans, time_means
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.realtime.event_order import Order, sampled
+from msg_analysis.inference.realtime.event_order import EventOrder, sampled
 from msg_analysis.inference.realtime.logged_pattern import PatternUnavailableError, pattern_means, timing_effect
 from msg_analysis.inference.realtime.timing import Timing
 from msg_analysis.inference.statistics.holm import holm
@@ -69,7 +69,7 @@ class Laws:
         }
 
 
-def measure_laws(observation: Observation, order: Order, timing: Timing, level: float) -> tuple[TimeMeans, Laws]:
+def measure_laws(observation: Observation, order: EventOrder, timing: Timing, level: float) -> tuple[TimeMeans, Laws]:
     """Compare a run in real time with each law; also the time means under the pattern law, else the sequential law.
 
     The pattern law is supported unless the errors reject it at ``level``. The others are not supported if the errors

@@ -19,7 +19,7 @@ import numpy as np
 
 from msg_analysis.inference.errors.time_means import TimeMeans, forms_of, moments
 from msg_analysis.inference.observed.observation import Observation, Timers
-from msg_analysis.inference.realtime.event_order import Order, order_events, sampled
+from msg_analysis.inference.realtime.event_order import EventOrder, order_events, sampled
 from msg_analysis.inference.realtime.pattern_events import Periods
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.twin.ideal_timers import IdealTimers
@@ -60,8 +60,15 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
     return float(means.trace @ means.predicted) / expected - 1.0 if expected > 0.0 else None
 
 
-def pattern_means(observation: Observation, order: Order) -> TimeMeans:
+def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
     """Time means of the sampled states, with expectation and standard errors given the log.
+
+    Parameters
+    ----------
+    observation
+        of a run in real time
+    order
+        of its events
 
     Raises
     ------

@@ -9,7 +9,7 @@ import numpy as np
 
 from msg_analysis.inference.blame.causes import Accused, Cause, find_causes
 from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate, covariance_test, estimates
-from msg_analysis.inference.errors.ranking import order_of_nodes
+from msg_analysis.inference.errors.ranking import rank_agents
 from msg_analysis.inference.errors.time_means import TimeMeans
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
 from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import loss_test
@@ -36,6 +36,13 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     time, the family has only tests that are exact whatever the timing was. Where the law has no prediction (a protocol
     that is not linear, or is not installed), only graphs and losses are tested.
 
+    Parameters
+    ----------
+    trajectory
+        of a bag or of the twin
+    level
+        probability of a false "disagrees", all tests together
+
     Raises
     ------
     InputError
@@ -45,7 +52,7 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     unpredicted = protocol.unpredictable() if protocol else None
     if unpredicted:
         return _measured(trajectory, level, unpredicted)
-    prediction = predict(trajectory.record.experiment)
+    prediction = predict(trajectory.record.experiment, trajectory.record.step_model)
     if trajectory.prefix < MIN_STEPS and not trajectory.completeness.complete:
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
     observation = Observation.of(trajectory, prediction)
@@ -109,7 +116,7 @@ def judge(
         timing=evidence.timing,
         laws=evidence.laws,
         given=evidence.given,
-        order=order_of_nodes(means, level),
+        order=rank_agents(means, level),
         blame=blame,
     )
 

@@ -13,7 +13,7 @@ from msg_analysis.common.markdown import markdown_table, number_text
 from msg_analysis.inference.blame.causes import Cause
 from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.errors.given_path import GivenPath
-from msg_analysis.inference.errors.ranking import Order
+from msg_analysis.inference.errors.ranking import Ranking
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
 from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import LossTest
 from msg_analysis.inference.hypothesis_tests.switching import SwitchingTest
@@ -105,7 +105,7 @@ class Comparison:
         the family, in the order of the report
     running
         "time" [units of simulated time], and the mean of the system error up to then with its standard error (0 without
-        a prediction): "system_error", "standard_error"; arrays of the same length, at most 400
+        a prediction): "system_error", "standard_error"; (T,) each, T at most 400
     loss
         test of the lost messages; None where none can be lost
     p_broadcast
@@ -146,7 +146,7 @@ class Comparison:
     timing: Timing | None = None
     laws: Laws | None = None
     given: GivenPath | None = None
-    order: Order | None = None
+    order: Ranking | None = None
     blame: Sequence[Cause] = ()
     pool: Pool | None = None
 

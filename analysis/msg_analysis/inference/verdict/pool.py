@@ -28,6 +28,13 @@ def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.0
     Sums are added up over the runs, so that every step counts the same. A further test of the family asks whether the
     runs are alike (Cochran's Q). No trajectory is kept.
 
+    Parameters
+    ----------
+    runs
+        name for messages, and trajectory; they are read one after the other
+    level
+        probability of a false "disagrees", all tests together
+
     Raises
     ------
     InputError
@@ -41,7 +48,7 @@ def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.0
         _require_another(members, name, run.record)
         if prediction is None:
             _require_prediction(name, run.record.experiment)
-            prediction, trajectory = predict(run.record.experiment), _without_data(run)
+            prediction, trajectory = predict(run.record.experiment, run.record.step_model), _without_data(run)
         member, evidence = _examine(name, run, prediction, level)
         members.append(member)
         if evidence:

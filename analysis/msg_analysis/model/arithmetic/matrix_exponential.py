@@ -18,18 +18,7 @@ TERMS = 13
 
 
 def exponential(matrix: FloatArray) -> FloatArray:
-    """exp(A) by scaling and squaring of exp(A) - I, which keeps the accuracy of small entries.
-
-    Parameters
-    ----------
-    matrix
-        (m, m) A
-
-    Returns
-    -------
-    FloatArray
-        (m, m)
-    """
+    """(m, m) exp(A) by scaling and squaring of exp(A) - I, which keeps the accuracy of small entries."""
     norm = float(np.abs(matrix).sum(axis=1).max(initial=0.0))
     squarings = max(0, math.frexp(norm)[1] + 3)
     scaled = matrix * 2.0**-squarings
@@ -43,15 +32,7 @@ def exponential(matrix: FloatArray) -> FloatArray:
 
 
 def reproducible_product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """A B, the same on every processor; its error is about 1e-16 of the largest entries of A and B.
-
-    Parameters
-    ----------
-    a
-        (m, m)
-    b
-        (m, m)
-    """
+    """(m, m) A B, the same on every processor; its error is about 1e-16 of the largest entries of A and B."""
     bits = (53 - math.frexp(len(a))[1]) // 2
     left, right = _slices(a, bits), _slices(b, bits)
     total = np.zeros(a.shape)

@@ -33,16 +33,8 @@ class Stream(IntEnum):
 def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.random.Generator:
     """The generator of one block of one agent's stream.
 
-    Parameters
-    ----------
-    seed
-        the experiment's seed, >= 0
-    stream
-        what the numbers are for
-    agent
-        index of the agent from 0 (0 where the stream belongs to nobody), or number of the link
-    block
-        number of the block of steps, step // STEPS_PER_BLOCK; negative for the steps before the start
+    ``agent`` counts from 0 (0 where the stream belongs to no agent), or is a ``link_number``. ``block`` is the step //
+    STEPS_PER_BLOCK, negative for the steps before the start.
     """
     key = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     counter = np.array([0, block % 2**64, agent, int(stream)], dtype=np.uint64)
@@ -50,32 +42,10 @@ def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.r
 
 
 def link_number(receiver: int, sender: int) -> int:
-    """What stands for the agent in the streams of a directed link, from sender to receiver (indices from 0).
-
-    Parameters
-    ----------
-    receiver
-        index from 0
-    sender
-        index from 0
-    """
+    """Number in place of the agent in the streams of a directed link, from sender to receiver (indices from 0)."""
     return receiver << 32 | sender
 
 
 def normals(seed: int, stream: Stream, agent: int, block: int, shape: tuple[int, ...]) -> FloatArray:
-    """Standard normal numbers of one block, of the given shape.
-
-    Parameters
-    ----------
-    seed
-        of the experiment
-    stream
-        what the numbers are for
-    agent
-        index from 0, or ``link_number`` of a link
-    block
-        number of the block of ``STEPS_PER_BLOCK`` steps, from 0
-    shape
-        of the result
-    """
+    """Standard normal numbers of one block, of the given shape; other arguments as of ``generator``."""
     return generator(seed, stream, agent, block).standard_normal(shape)

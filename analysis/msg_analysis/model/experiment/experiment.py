@@ -167,7 +167,7 @@ class Experiment:
         return Network(
             graphs=self.graph_list,
             dt=self.step_length,
-            noise_gain=np.sqrt(self.step_length) * self.noise_gain,
+            noise_gain=self.step_noise_gain,
             tracking=self.problem == "tracking",
             leader_gains=self.leader_gains,
             reference=self.reference,
@@ -316,12 +316,17 @@ class Experiment:
     @property
     def steps(self) -> int:
         """Number of steps N of a run, which has the states x(0), ..., x(N)."""
-        return round(self.run.duration / self.run.dt)
+        return self.run.steps
 
     @property
     def step_length(self) -> float:
         """Simulated time of a step, ``run.dt`` [units of simulated time]; 1 in discrete time."""
         return self.run.dt
+
+    @property
+    def step_noise_gain(self) -> FloatArray:
+        """(n, m, m) sqrt(dt) F_i: the noise that a step of the built-in law adds is this times N(0, I)."""
+        return np.asarray(np.sqrt(self.step_length) * self.noise_gain)
 
 
 def json_schema() -> dict[str, Any]:

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.problems import problem, show, translate
+from msg_analysis.model.experiment.validation import wrong_sums
 from msg_analysis.protocol import ENTRY_POINTS, Heard, LinearProtocol, Network, Protocol
 from msg_analysis.types import FloatArray
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from msg_analysis.model.experiment.spec import ProtocolSpec, Purpose, RunSpec
 
 Result = TypeVar("Result")
-SUM_TOLERANCE = 1e-9
 
 
 class ProtocolError(InputError):
@@ -88,7 +88,7 @@ class ChosenProtocol:
         name, reason = show(self.info.name), self.unpredictable()
         if self.absent:
             remedy = f"install {self.info.package} {self.info.version}"
-            return [problem("protocol.name", name, f"expected one that is here: {self.absent}", remedy)]
+            return [problem("protocol.name", name, f"expected an available protocol: {self.absent}", remedy)]
         if purpose == "run" or not reason:
             return []
         wanted = f"expected a linear protocol, but {reason}"
@@ -127,13 +127,8 @@ class ChosenProtocol:
                 f"{self.info}, {where}: weights: agent {i} uses agent {j} with {weights[i - 1, j - 1]:g}, expected 0, "
                 "since it does not hear it in this graph"
             )
-        sums = weights.sum(axis=1)
-        wrong = np.flatnonzero(np.abs(sums - 1.0) > SUM_TOLERANCE * np.abs(weights).max(axis=1))
-        if wrong.size:
-            i = int(wrong[0])
-            raise ProtocolError(
-                f"{self.info}, {where}: weights: row of agent {i + 1} sums to {sums[i]:.12g}, expected 1"
-            )
+        for i, total in wrong_sums(weights, 1.0):
+            raise ProtocolError(f"{self.info}, {where}: weights: row of agent {i + 1} sums to {total:.12g}, expected 1")
 
     def guard(self, where: str, call: Callable[[], Result]) -> Result:
         """The result of a call of the protocol's code; what it raises becomes a ProtocolError that says ``where``."""
@@ -195,7 +190,7 @@ def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
     return array
 
 
-def installed() -> dict[str, list[EntryPoint]]:
+def installed_protocols() -> dict[str, list[EntryPoint]]:
     """Entry points of the installed protocols, by name; several where packages offer the same name."""
     found: dict[str, list[EntryPoint]] = {}
     for point in entry_points(group=ENTRY_POINTS):
@@ -215,11 +210,11 @@ def find(spec: ProtocolSpec, recorded: ProtocolInfo | None = None) -> tuple[Chos
 
 
 def _absent(recorded: ProtocolInfo, problems: list[str]) -> ChosenProtocol:
-    return ChosenProtocol(recorded, absent=f"{recorded} is not here ({'; '.join(problems)})")
+    return ChosenProtocol(recorded, absent=f"{recorded} is not available here ({'; '.join(problems)})")
 
 
 def _find(spec: ProtocolSpec) -> tuple[ChosenProtocol | None, list[str]]:
-    offers = installed()
+    offers = installed_protocols()
     points = offers.get(spec.name, [])
     if len(points) != 1:
         known = ", ".join(f"{name} ({_package(point)})" for name in offers for point in offers[name])
@@ -250,7 +245,7 @@ def _find(spec: ProtocolSpec) -> tuple[ChosenProtocol | None, list[str]]:
         return None, [translate(detail, kind.Parameters, "protocol") for detail in details]
     except Exception as error:
         text = f"{spec.name}: {type(error).__name__}: {error}"
-        wanted = f"expected Parameters of {point.value} (package {package} {version}) that take what stands here"
+        wanted = f"expected Parameters of {point.value} (package {package} {version}) that accept these values"
         return None, [problem("protocol", text, wanted, "tell its authors")]
     info = ProtocolInfo(spec.name, package, version, issubclass(kind, LinearProtocol))
     return ChosenProtocol(info, kind, parameters), []
@@ -273,7 +268,7 @@ def bind(
         return _absent(recorded, found), []
     here = bound.info
     if (here.linear, here.states, here.hidden) != (recorded.linear, recorded.states, recorded.hidden):
-        other = f"{recorded} is not here, but {here.version}, whose states are of another kind"
+        other = f"{recorded} is not available here: the states of version {here.version} are of another kind"
         return ChosenProtocol(recorded, absent=other), []
     return replace(bound, info=recorded), []
 
@@ -285,7 +280,7 @@ def _bind(chosen: ChosenProtocol, network: Network, run: RunSpec) -> tuple[Chose
         return bound, _problems(lambda: bound.matrices())
     found = []
     if network.tracking and not chosen.kind.tracking:  # type: ignore[union-attr]
-        wanted = f"expected consensus, since {chosen.info} knows no leaders"
+        wanted = f"expected consensus, since {chosen.info} does not support leaders"
         found.append(problem("problem", "'tracking'", wanted, "use another protocol, or consensus"))
     if run.start == "stationary":
         wanted = f"expected 'zero' or one value per agent, since {chosen.info} has no prediction to start from"

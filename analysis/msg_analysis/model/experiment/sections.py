@@ -25,6 +25,13 @@ def _adapter(key: str) -> TypeAdapter[Any]:
     return TypeAdapter(annotation)
 
 
+def _section(key: str, mapping: Mapping[Any, Any]) -> Any:
+    """One valid section of a document with mistakes in others."""
+    if key in mapping:
+        return _adapter(key).validate_python(mapping[key])
+    return ExperimentSpec.model_fields[key].get_default(call_default_factory=True, validated_data={})
+
+
 class Sections:
     """A document that is being checked: a section is None as long as it is not known to be valid.
 
@@ -35,20 +42,12 @@ class Sections:
         self.problems: list[str] = []
         bad: set[str] = set()
         try:
-            ExperimentSpec.model_validate(dict(mapping))
+            spec = ExperimentSpec.model_validate(dict(mapping))
+            self.values = {key: getattr(spec, key) for key in ExperimentSpec.model_fields}
         except ValidationError as error:
             self.problems += [translate(detail) for detail in error.errors(include_url=False)]
             bad = {str(detail["loc"][0]) for detail in error.errors(include_url=False)}
-
-        def section(key: str) -> Any:
-            if key in bad:
-                return None
-            info = ExperimentSpec.model_fields[key]
-            if key not in mapping:
-                return info.get_default(call_default_factory=True, validated_data={})
-            return _adapter(key).validate_python(mapping[key])
-
-        self.values = {key: section(key) for key in ExperimentSpec.model_fields}
+            self.values = {key: None if key in bad else _section(key, mapping) for key in ExperimentSpec.model_fields}
         self.known = set(self.values) - bad
         run = self.values["run"]
         if run is not None and self.values["time"] == "discrete" and "dt" not in run.model_fields_set:
@@ -135,14 +134,14 @@ class Sections:
             return
         untold = all(spec.complete or spec.star for spec in graphs.values())
         if declared is None and (untold or largest < 2):
-            wanted = "expected the number of agents, since no graph tells it"
+            wanted = "expected the number of agents, since the graphs do not give it"
             self.problems.append(problem("agents", "missing", wanted, "for example agents: 5"))
         else:
             self.agents = declared or largest
 
     def _fits(self, run: RunSpec | None) -> bool:
         assert self.agents is not None
-        steps = round(run.duration / run.dt) if run else 1
+        steps = run.steps if run else 1
         replicas = run.replicas if run else 1
         noise = self.values["noise"]
         delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)

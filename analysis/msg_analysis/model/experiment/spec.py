@@ -126,7 +126,7 @@ class _Section(BaseModel):
 
 
 class Star(_Section):
-    """A star: everybody is connected with the centre."""
+    """A star: every agent is connected with the centre."""
 
     center: Label = Field(description="the agent in the middle", examples=[1])
 
@@ -145,11 +145,11 @@ class GraphSpec(_Section):
     )
     arcs: Links | None = Field(
         None,
-        description="directed: [1, 2, 0.5] says that agent 2 listens to agent 1",
+        description="directed: [1, 2, 0.5] means that agent 2 listens to agent 1",
         examples=[[[1, 2], [2, 3, 0.5]]],
     )
     star: Star | None = Field(None, description="a star with its centre", examples=[{"center": 1}])
-    complete: Literal[True] | None = Field(None, description="everybody with everybody", examples=[True])
+    complete: Literal[True] | None = Field(None, description="every agent with every other agent", examples=[True])
     grid: Annotated[tuple[Count, Count], BeforeValidator(_grid)] | None = Field(
         None, description="[rows, columns], agents row by row", examples=[[3, 4]]
     )
@@ -226,7 +226,7 @@ class NoiseSpec(_Section):
 
 
 class LeadersSpec(_Section):
-    """Who knows the reference (tracking only)."""
+    """The agents that know the reference (tracking only)."""
 
     agents: list[Label] = Field(min_length=1, description="the leaders", examples=[[3]])
     gain: Annotated[
@@ -238,7 +238,7 @@ class LeadersSpec(_Section):
 
 
 class ProtocolSpec(_Section):
-    """A law of agents that a package offers, instead of the built-in one. What stands beside its name is for it."""
+    """A law of agents that a package offers, instead of the built-in one. Keys next to its name are its parameters."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
@@ -272,6 +272,11 @@ class RunSpec(_Section):
         str | int,
         PlainValidator(_processes, json_schema_input_type=Literal["auto", "one_per_agent"] | Count),
     ] = Field("auto", description="'auto', 'one_per_agent' or a number of processes", examples=["auto"])
+
+    @property
+    def steps(self) -> int:
+        """Number of steps."""
+        return round(self.duration / self.dt)
 
 
 class ExperimentSpec(_Section):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -111,13 +111,11 @@ def _from_matrix(
         elif not generator and not 0 <= value <= 1:
             wanted = "expected a probability between 0 and 1"
             found.append(problem(place, value, wanted, f"probability from {names[i]} to {names[j]}"))
-    for i, row in enumerate(matrix):
-        target = 0.0 if generator else 1.0
-        total = math.fsum(row)
-        if abs(total - target) > SUM_TOLERANCE * float(np.abs(row).max()):
-            remedy = "the diagonal is minus the sum of the others" if generator else "correct the row"
-            where = f"row {i + 1} ({names[i]}) sums to {total:.12g}"
-            found.append(problem(f"switching.{key}[{i + 1}]", where, f"expected {target:g}", remedy))
+    target = 0.0 if generator else 1.0
+    for i, total in wrong_sums(matrix, target):
+        remedy = "the diagonal is minus the sum of the others" if generator else "correct the row"
+        where = f"row {i + 1} ({names[i]}) sums to {total:.12g}"
+        found.append(problem(f"switching.{key}[{i + 1}]", where, f"expected {target:g}", remedy))
     if found:
         return None, found
     if generator:
@@ -125,6 +123,14 @@ def _from_matrix(
         np.fill_diagonal(matrix, 0.0 - matrix.sum(axis=1))
         return matrix, []
     return np.asarray(matrix / matrix.sum(axis=1, keepdims=True)), []
+
+
+def wrong_sums(matrix: FloatArray, target: float) -> Iterator[tuple[int, float]]:
+    """The rows (from 0) whose sum is not ``target``, apart from rounding, and their sums."""
+    for i, row in enumerate(matrix):
+        total = math.fsum(row)
+        if abs(total - target) > SUM_TOLERANCE * float(np.abs(row).max()):
+            yield i, total
 
 
 def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> list[str]:
@@ -153,7 +159,7 @@ def connection_problems(graphs: Sequence[Graph], leaders: LeadersSpec | None) ->
         return []
     start = "a leader" if leaders is not None else f"agent{_list(sources)}"
     text = f"agent{_list(lost)} cannot be reached from {start} in the union of all graphs"
-    return [problem("graphs", text, "expected a union that connects everybody", "add an edge, or lower `agents`")]
+    return [problem("graphs", text, "expected a union that connects all agents", "add an edge, or lower `agents`")]
 
 
 def _widest_reaching(leads: BoolArray) -> list[int]:
@@ -248,7 +254,7 @@ def leader_problems(problem_kind: str, leaders: LeadersSpec | None, agents: int 
             found.append(problem("leaders.agents", f"agent {label}", f"expected agents 1 to {agents}", "correct it"))
     if math.isinf(leaders.gain) and len(set(leaders.agents)) >= agents:
         wanted = "expected at least one agent that follows"
-        found.append(problem("leaders.agents", "everybody, with gain inf", wanted, "remove a leader"))
+        found.append(problem("leaders.agents", "all agents, with gain inf", wanted, "remove a leader"))
     return found
 
 

@@ -23,7 +23,7 @@ class _StrictLoader(yaml.SafeLoader):
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
                 if key.value in seen:
                     raise yaml.constructor.ConstructorError(
-                        None, None, f"key '{key.value}' stands twice: remove one", key.start_mark
+                        None, None, f"key '{key.value}' appears twice: remove one", key.start_mark
                     )
                 seen.add(key.value)
         return super().construct_mapping(node, deep)

@@ -16,20 +16,10 @@ Time = Literal["continuous", "discrete"]
 
 
 def stationary_law(matrix: FloatArray) -> FloatArray:
-    """Stationary law of an irreducible chain by the GTH algorithm.
+    """(n,) stationary law of an irreducible chain by the GTH algorithm; ``matrix`` (n, n): generator or transitions.
 
-    Uses no subtraction, so every entry is accurate to machine precision whatever the rates
-    (Grassmann, Taksar, Heyman 1985).
-
-    Parameters
-    ----------
-    matrix
-        (n, n) generator (rows sum to 0) or transition matrix (rows sum to 1); only off-diagonal entries are used
-
-    Returns
-    -------
-    FloatArray
-        (n,) probabilities
+    Uses no subtraction and only off-diagonal entries, so every entry of the law is accurate to machine precision
+    whatever the rates (Grassmann, Taksar, Heyman 1985).
     """
     rates = np.array(matrix, dtype=float)
     n = len(rates)
@@ -108,7 +98,7 @@ class MarkovChain:
         return np.asarray(transition / transition.sum(axis=1, keepdims=True))
 
     def sojourns(self, initial: FloatArray, random: np.random.Generator) -> Iterator[tuple[int, float]]:
-        """Exact path of the chain, for ever: (mode from 0, time spent in it).
+        """Exact path of the chain, without end: (mode from 0, time spent in it).
 
         Holding times are exponential [units of time] in continuous time, geometric [steps] in discrete time; the
         next graph is drawn from the jump chain.

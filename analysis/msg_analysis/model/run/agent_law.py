@@ -19,24 +19,10 @@ from msg_analysis.types import FloatArray, IntArray
 
 
 class AgentLaw:
-    """The state of one agent, as it travels, and how it moves on.
+    """The state x(k) of one agent (index from 0) as a payload, and its next states.
 
-    Parameters
-    ----------
-    record
-        of the run
-    model
-        its step model
-    agent
-        index of the agent from 0
-
-    Attributes
-    ----------
-    step, state
-        k and x(k)
-    heard
-        for the neighbours of the step that led here, ascending: the step of the value that was used, or ``LOST``; empty
-        when all of them were of the step before
+    ``heard`` has the steps of the values used in the step to x(k), or ``LOST``, by neighbour, ascending; empty where
+    all are of the step before.
     """
 
     def __init__(self, record: RunRecord, model: StepModel, agent: int) -> None:
@@ -53,54 +39,22 @@ class AgentLaw:
         self._drives = self._draw(0)
 
     def resume(self, step: int, state: bytes) -> None:
-        """Go on from x(step). The noise is a function of the seed and the step: nothing else is needed.
-
-        Parameters
-        ----------
-        step
-            k, from which the agent goes on
-        state
-            payload of x(k)
-        """
+        """Go on from x(step), a payload. The noise is a function of the seed and the step: nothing else is needed."""
         self.step, self.state = step, state
         self._drives = self._draw(step // STEPS_PER_BLOCK)
 
     def neighbours(self, mode: int) -> list[int]:
-        """The other agents, ascending, whose states this agent uses under a mode (index from 0).
-
-        Parameters
-        ----------
-        mode
-            graph, from 0
-        """
+        """The other agents, ascending, with states that this agent uses under a mode (from 0)."""
         return [j for j in self._inputs[mode] if j != self.agent]
 
     def published(self, step: int, state: bytes) -> bytes:  # noqa: ARG002  what is published is the truth
-        """What is published of x(step).
-
-        Parameters
-        ----------
-        step
-            k
-        state
-            payload of x(k)
-        """
+        """Payload that is published of x(step)."""
         return state
 
     def advance(self, mode: int, heard: list[bytes]) -> bytes:
-        """Move from x(k) to x(k+1).
+        """x(k+1) from x(k) under g(k) = ``mode`` (from 0).
 
-        Parameters
-        ----------
-        mode
-            index of g(k) from 0
-        heard
-            what the mode's neighbours, ascending, published of x_j(k)
-
-        Returns
-        -------
-        bytes
-            x(k+1)
+        ``heard`` has what the neighbours of this mode, ascending, published of x_j(k).
         """
         before = self._own[mode]
         values = [*heard[:before], self.state, *heard[before:]]
@@ -117,17 +71,7 @@ class AgentLaw:
 
 
 class AgentLawOnAir(AgentLaw):
-    """The same where something becomes of the values between the agents: see ``model.step.air``.
-
-    Parameters
-    ----------
-    record
-        of the run
-    model
-        of its experiment
-    agent
-        index from 0
-    """
+    """The same with noise or loss on the air: see ``model.step.air``."""
 
     def __init__(self, record: RunRecord, model: StepModel, agent: int) -> None:
         super().__init__(record, model, agent)
@@ -160,21 +104,9 @@ class AgentLawOnAir(AgentLaw):
 
 
 class ProtocolLaw:
-    """The same for an agent whose protocol is not linear; a message that is lost is not among what it has heard.
+    """The same for an agent with a nonlinear protocol; ``state`` is all of its state, row by row.
 
-    Parameters
-    ----------
-    record
-        of the run
-    model
-        its wiring
-    agent
-        index of the agent from 0
-
-    Attributes
-    ----------
-    step, state, heard
-        see AgentLaw; the state is all of it, row by row
+    A lost message is not passed to the protocol.
     """
 
     def __init__(self, record: RunRecord, model: Wiring, agent: int) -> None:
@@ -189,9 +121,7 @@ class ProtocolLaw:
         modes = range(model.modes)
         self._neighbours = [model.neighbours(mode, agent) for mode in modes]
         self._weights = [experiment.graph_list[mode].adjacency[agent, self._neighbours[mode]] for mode in modes]
-        self._noise = ProcessNoise(
-            experiment.run.seed, np.sqrt(experiment.step_length) * experiment.noise_gain, experiment.run.replicas
-        )
+        self._noise = ProcessNoise(experiment.run.seed, experiment.step_noise_gain, experiment.run.replicas)
         for shared in (*self._neighbours, *self._weights):
             shared.flags.writeable = False
         self._noises = self._draw(0)
@@ -261,17 +191,7 @@ def _links(air: Air, model: Wiring, agent: int) -> Callable[[int, int], tuple[Fl
 
 
 def agent_law(record: RunRecord, model: Wiring, agent: int) -> AgentLaw | ProtocolLaw:
-    """The law of one agent of a run: see AgentLaw for the parameters.
-
-    Parameters
-    ----------
-    record
-        of the run
-    model
-        of its experiment
-    agent
-        index from 0
-    """
+    """The law of one agent (index from 0) of a run; ``model`` is that of the record."""
     if not isinstance(model, StepModel):
         return ProtocolLaw(record, model, agent)
     kind = AgentLawOnAir if record.experiment.noise.on_air else AgentLaw

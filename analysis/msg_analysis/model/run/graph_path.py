@@ -19,36 +19,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Sojourn:
-    """A stretch of steps with one graph.
+    """A stretch of steps with one graph."""
 
-    Attributes
-    ----------
-    sequence
-        number of the sojourn from 0
-    mode
-        index of the graph from 0
-    first_step, last_step
-        the steps k -> k+1 with first_step <= k <= last_step use it
-    """
-
-    sequence: int
-    mode: int
-    first_step: int
+    sequence: int  # its number, from 0
+    mode: int  # from 0
+    first_step: int  # the steps k -> k+1 with first_step <= k <= last_step use this graph
     last_step: int
 
 
 def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
-    """The graph path of a run of N steps, drawn from the experiment's seed.
+    """The graph path of a run of N steps, drawn from the experiment's seed; ``initial`` (n,) is the law of g(0).
 
-    Step k uses the graph that the chain is in at time k dt, so the graphs of successive steps are a Markov chain with
-    P = expm(Gamma dt), exactly. A sojourn between two sampling times, which no step sees, is left out.
-
-    Parameters
-    ----------
-    experiment
-        whose chain, seed and duration
-    initial
-        (n,) law of g(0)
+    Step k uses the graph of the chain at time k dt, so successive graphs are a Markov chain with P = expm(Gamma dt),
+    exactly. A sojourn between two sampling times, which no step uses, is left out.
     """
     random = generator(experiment.run.seed, Stream.SWITCHING)
     return _sampled(experiment.chain, initial, random, experiment.steps, experiment.step_length)
@@ -73,32 +56,15 @@ def _sampled(
 
 
 def mode_path(experiment: Experiment, initial: FloatArray) -> IntArray:
-    """(N,) index of the graph of each step k -> k+1.
-
-    Parameters
-    ----------
-    experiment
-        whose chain, seed and duration
-    initial
-        (n,) law of g(0)
-    """
+    """(N,) index of the graph of each step k -> k+1; ``initial`` (n,) is the law of g(0)."""
     return _modes(sojourns(experiment, initial), experiment.steps)
 
 
 def past_modes(experiment: Experiment, first_mode: int, steps: int) -> IntArray:
-    """(steps,) g(-steps), ..., g(-1): the graphs before a run, given that it begins with g(0).
+    """(steps,) g(-steps), ..., g(-1): the graphs before a run, given that it begins with g(0) = ``first_mode``.
 
-    Drawn backwards from g(0) by the reversed chain, so that the graphs before and after time 0 are one stationary path.
-    A longer past ends with the same graphs as a shorter one.
-
-    Parameters
-    ----------
-    experiment
-        whose chain and seed
-    first_mode
-        index of g(0) from 0
-    steps
-        how far back [steps]
+    Drawn backwards by the reversed chain, so that the graphs before and after time 0 are one stationary path. A longer
+    past ends with the same graphs as a shorter one.
     """
     chain = experiment.chain.reversed
     start = np.eye(chain.modes)[first_mode]

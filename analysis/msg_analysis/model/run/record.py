@@ -25,7 +25,6 @@ from msg_analysis.model.step.step_model import (
     Wiring,
     build_model,
     build_step_model,
-    built_in_noise_gain,
     step_matrices,
 )
 from msg_analysis.types import FloatArray
@@ -152,7 +151,7 @@ def _entries(matrix: FloatArray) -> list[list[float]]:
 
 
 def _matrices(document: Any, experiment: Experiment, source: str) -> StepMatrices:
-    stacks = {"noise_gain": built_in_noise_gain(experiment)}
+    stacks = {"noise_gain": experiment.step_noise_gain}
     for key in ("weights", "noise_gain")[: 2 if experiment.protocol else 1]:
         stack = np.zeros((len(experiment.graph_list), experiment.agents, experiment.agents))
         for mode, listed in enumerate(document[key]):

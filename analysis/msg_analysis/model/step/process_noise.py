@@ -12,18 +12,9 @@ from msg_analysis.types import FloatArray
 
 
 class ProcessNoise:
-    """The process noise of any agent at any step: row i of B_g v(k).
+    """The process noise of any agent at any step: row i of B_g v(k), with B_g (n, m, m) = ``noise_gain``.
 
     Correlated noise needs no communication: an agent draws the sources v_j that its rows use by itself.
-
-    Parameters
-    ----------
-    seed
-        the experiment's seed
-    noise_gain
-        (n, m, m) B_g of the step model
-    replicas
-        entries of each state
     """
 
     def __init__(self, seed: int, noise_gain: FloatArray, replicas: int) -> None:
@@ -40,16 +31,9 @@ class ProcessNoise:
         self._source = source
 
     def block(self, agent: int, block: int) -> list[FloatArray]:
-        """For each mode, the noise of one agent in the steps of one block, (STEPS_PER_BLOCK, replicas).
+        """For each mode, the noise of one agent (from 0) in one block of steps, (STEPS_PER_BLOCK, replicas).
 
         Modes with the same noise share one array.
-
-        Parameters
-        ----------
-        agent
-            index from 0
-        block
-            number of the block of steps, from 0
         """
         rows = self._gain[:, agent]
         drawn = {key: self._combined(row, block) for key, row in {row.tobytes(): row for row in rows}.items()}

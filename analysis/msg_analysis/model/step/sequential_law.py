@@ -30,12 +30,13 @@ def step_law(experiment: Experiment) -> StepLaw:
     return "sequential" if experiment.run.pace == "realtime" else "synchronous"
 
 
-def build_run_model(experiment: Experiment) -> StepModel:
+def build_run_model(experiment: Experiment, step: StepModel | None = None) -> StepModel:
     """What a step of all agents of a run with a linear law does to x(k), as one jump linear system.
 
-    In real time the law is sequential: noise of an agent reaches those that are due later in the same period.
+    In real time the law is sequential: noise of an agent reaches those that are due later in the same period. ``step``
+    is the model of the experiment, if it is known.
     """
-    step = build_step_model(experiment)
+    step = step or build_step_model(experiment)
     return sequential(step, phases(experiment)) if step_law(experiment) == "sequential" else step
 
 

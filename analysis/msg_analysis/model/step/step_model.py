@@ -20,29 +20,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wiring:
-    """Who uses whose values under which graph, and how the graphs follow each other: all that is true of any law.
+    """Which agent uses the values of which agents in which graph, and the law of the graphs: all that any law has.
 
-    Modes and agents count from 0 here.
-
-    Attributes
-    ----------
-    links
-        (n, m, m) whether agent i uses what agent j publishes; the diagonal means nothing
-    chain
-        the Markov chain that switches between the graphs
-    initial
-        (n,) law of g(0)
-    dt
-        simulated time of a step
-    loss
-        probability that a directed message is ignored in a step
+    Modes and agents count from 0.
     """
 
-    links: BoolArray
-    chain: MarkovChain
-    initial: FloatArray
-    dt: float
-    loss: float
+    links: BoolArray  # (n, m, m) whether agent i uses what agent j publishes; the diagonal has no meaning
+    chain: MarkovChain  # switches between the graphs
+    initial: FloatArray  # (n,) law of g(0)
+    dt: float  # simulated time of a step
+    loss: float  # probability that a directed message is ignored in a step
 
     @property
     def modes(self) -> int:
@@ -65,39 +52,13 @@ class Wiring:
         return self.chain.stationary
 
     def inputs(self, mode: int, agent: int) -> IntArray:
-        """Agents, ascending, whose values an agent uses under a mode; the agent itself always among them.
-
-        Parameters
-        ----------
-        mode
-            graph, from 0
-        agent
-            index from 0
-
-        Returns
-        -------
-        IntArray
-            (d,) indices from 0
-        """
+        """(d,) agents, ascending, with values that an agent uses under a mode; the agent itself is always included."""
         used = self.links[mode, agent].copy()
         used[agent] = True
         return np.flatnonzero(used)
 
     def neighbours(self, mode: int, agent: int) -> IntArray:
-        """The other agents, ascending, whose values an agent uses under a mode.
-
-        Parameters
-        ----------
-        mode
-            graph, from 0
-        agent
-            index from 0
-
-        Returns
-        -------
-        IntArray
-            (d,) indices from 0
-        """
+        """(d,) the other agents, ascending, with values that an agent uses under a mode."""
         used = self.inputs(mode, agent)
         return np.asarray(used[used != agent])
 
@@ -119,59 +80,35 @@ class StepModel(Wiring):
 
     Convention: the step k -> k+1 uses g(k). With a delay d, the entries of W_g(k) off the diagonal take x(k - d)
     instead of x(k), and x(k) = x(0) before the start.
-
-    Attributes
-    ----------
-    weights
-        (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
-    nominal
-        (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time), or what a
-        linear protocol says; rows of grounded leaders are zero
-    offsets
-        (n, m) what the reference adds, so that the reference is a fixed point
-    noise_gain
-        (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
-    noise
-        (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
-    delay
-        age d, in steps, of the states of others that a step uses
-    loss_variance
-        (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and their spread
-        adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
-    grounded
-        (m,) True for leaders of infinite gain
-    reference
-        what tracking agents should hold; 0 for consensus
     """
 
+    # (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
     weights: FloatArray
+    # (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time), or what a
+    # linear protocol says; rows of grounded leaders are zero
     nominal: FloatArray
-    offsets: FloatArray
+    offsets: FloatArray  # (n, m) what the reference adds, so that the reference is a fixed point
+    # (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
     noise_gain: FloatArray
-    noise: FloatArray
-    delay: int
+    noise: FloatArray  # (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
+    delay: int  # age d, in steps, of the states of others that a step uses
+    # (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and their spread
+    # adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
     loss_variance: FloatArray
-    grounded: BoolArray
-    reference: float
+    grounded: BoolArray  # (m,) True for leaders of infinite gain
+    reference: float  # what tracking agents should hold; 0 for consensus
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepMatrices:
     """The numbers of a linear step.
 
-    In discrete time and with a protocol they come out of linear algebra, whose last bits may depend on processor and
+    In discrete time and with a protocol they are results of linear algebra, whose last bits may depend on processor and
     libraries. So a run computes them once, and its record carries them.
-
-    Attributes
-    ----------
-    weights
-        (n, m, m) W_g when nothing is lost: ``StepModel.nominal``
-    noise_gain
-        (n, m, m) B_g
     """
 
-    weights: FloatArray
-    noise_gain: FloatArray
+    weights: FloatArray  # (n, m, m) W_g when nothing is lost: ``StepModel.nominal``
+    noise_gain: FloatArray  # (n, m, m) B_g
 
 
 @lru_cache(maxsize=16)
@@ -183,15 +120,7 @@ def _transition(chain: MarkovChain, dt: float) -> FloatArray:
 
 
 def build_model(experiment: Experiment, matrices: StepMatrices | None = None) -> Wiring:
-    """What a run needs to know of its network: a ``StepModel`` where the law is linear, else its wiring alone.
-
-    Parameters
-    ----------
-    experiment
-        with a protocol or without
-    matrices
-        of the run record, if they are known
-    """
+    """A ``StepModel`` where the law is linear, else the wiring alone; ``matrices`` are those of the run record."""
     if experiment.protocol is None or experiment.protocol.linear:
         return build_step_model(experiment, matrices)
     return Wiring(
@@ -204,19 +133,9 @@ def build_model(experiment: Experiment, matrices: StepMatrices | None = None) ->
 
 
 def step_matrices(experiment: Experiment, expm: Callable[[FloatArray], FloatArray] = exponential) -> StepMatrices:
-    """Compute the matrices of an experiment's step.
+    """Compute the matrices of a step; ``expm`` is the exponential of a matrix (m, m).
 
-    Parameters
-    ----------
-    experiment
-        whose law is linear
-    expm
-        the exponential of a matrix (m, m)
-
-    Raises
-    ------
-    InputError
-        the experiment has a protocol that is not linear, not here, or fails
+    InputError: the experiment has a protocol that is not linear, is not available, or fails.
     """
     agents, dt = experiment.agents, experiment.step_length
     grounded = np.isinf(experiment.leader_gains)
@@ -225,31 +144,16 @@ def step_matrices(experiment: Experiment, expm: Callable[[FloatArray], FloatArra
         weights[:, range(agents), range(agents)] -= dt * np.where(grounded, 0.0, experiment.leader_gains)
         weights[:, grounded] = 0.0
     else:
-        weights, gain = _built_in(experiment, expm), built_in_noise_gain(experiment)
+        weights, gain = _built_in(experiment, expm), experiment.step_noise_gain
     if experiment.time == "continuous":
         gain[:, grounded] = 0.0  # a leader held at the reference has no noise either
     return StepMatrices(weights, gain)
 
 
-def built_in_noise_gain(experiment: Experiment) -> FloatArray:
-    """(n, m, m) B_g of the built-in law, grounded leaders aside: sqrt(dt) F."""
-    return np.asarray(np.sqrt(experiment.step_length) * experiment.noise_gain)
-
-
 def build_step_model(experiment: Experiment, matrices: StepMatrices | None = None) -> StepModel:
-    """Compile an experiment to what one of its steps does.
+    """What one step of an experiment does; ``matrices`` are those of the run record, computed if not given.
 
-    Parameters
-    ----------
-    experiment
-        whose law is linear
-    matrices
-        of the run record; computed if not given
-
-    Raises
-    ------
-    InputError
-        the experiment has a protocol that is not linear, not here, or fails
+    InputError: as of ``step_matrices``.
     """
     if matrices is None:
         matrices = step_matrices(experiment)
@@ -307,13 +211,7 @@ def _built_in(experiment: Experiment, expm: Callable[[FloatArray], FloatArray]) 
 
 
 def first_graph(experiment: Experiment) -> FloatArray:
-    """(n,): the law of g(0).
-
-    Parameters
-    ----------
-    experiment
-        of which the file says how it begins
-    """
+    """(n,): the law of g(0)."""
     first = experiment.switching.initial
     if first == "stationary":
         return experiment.chain.stationary

@@ -18,7 +18,7 @@ from scipy import stats
 
 from msg_analysis.common.markdown import markdown_table, number_text
 from msg_analysis.errors import InputError
-from msg_analysis.inference.errors.ranking import Order, order_of
+from msg_analysis.inference.errors.ranking import Ranking, rank_estimates
 from msg_analysis.report.terminal.tables import number_table
 from msg_analysis.report.terminal.verdict_text import order_statements
 
@@ -144,11 +144,11 @@ def merge_results(rows: Sequence[Result]) -> list[Merged]:
     return found
 
 
-def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
+def order_of_results(rows: Sequence[Result], level: float) -> Ranking | None:
     """Which system errors of independent runs are smaller than which; numbers are places in ``rows``, from 1.
 
     With leaders of infinite gain in every row, that is the order of their joint robustness centrality. None unless
-    every row has a measured error with a standard error, and where ``order_of`` has no order.
+    every row has a measured error with a standard error, and where ``rank_estimates`` gives none.
     """
     errors = [(row.measured, row.standard_error) for row in rows]
     known = [(measured, error) for measured, error in errors if measured is not None and error is not None]
@@ -156,7 +156,7 @@ def order_of_results(rows: Sequence[Result], level: float) -> Order | None:
         return None
     measured, deviations = np.array(known).T
     predicted = [row.predicted for row in rows if row.predicted is not None]
-    return order_of(
+    return rank_estimates(
         measured, np.diag(deviations**2), np.array(predicted) if len(predicted) == len(rows) else None, level
     )
 

@@ -23,7 +23,7 @@ def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
 
     ``stopping`` is asked while a network runs; if the sweep is being ended, NetworkStoppedError is raised.
     """
-    from msg_analysis.sweep.jobs.software import installed
+    from msg_analysis.sweep.jobs.software import installed_software
 
     begin = time.perf_counter()
     reason: str | None = None
@@ -42,7 +42,7 @@ def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
         reason = f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - begin
     place = f"{socket.gethostname()}:{os.getpid()}"
-    return Outcome(job.id, FAILED if reason else DONE, reason, result, seconds, place, installed())
+    return Outcome(job.id, FAILED if reason else DONE, reason, result, seconds, place, installed_software())
 
 
 def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Self
 
-Kind = Literal["predict", "simulate", "network"]
+JobKind = Literal["predict", "simulate", "network"]
 DONE, FAILED = "done", "failed"
 
 
@@ -31,13 +31,13 @@ class Job:
     """One thing to do, self-contained: a worker needs no file for it."""
 
     id: str  # hash of kind, document and, of runs, level
-    kind: Kind
+    kind: JobKind
     document: str  # the experiment, as JSON
     level: float  # of the tests of a run
     network: NetworkOptions | None = field(default=None, compare=False)
 
     @classmethod
-    def of(cls, kind: Kind, document: Mapping[str, Any], level: float = 0.01) -> Self:
+    def of(cls, kind: JobKind, document: Mapping[str, Any], level: float = 0.01) -> Self:
         """The job for an experiment, a document as in its file; ``level`` of the tests of a run."""
         text = json.dumps(document)
         what = json.dumps([kind, None if kind == "predict" else level, document], sort_keys=True)
@@ -48,7 +48,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came of a job."""
+    """The result of a job, or why it failed."""
 
     id: str  # of the job
     status: str  # ``DONE`` or ``FAILED``
@@ -56,4 +56,4 @@ class Outcome:
     result: Mapping[str, Any]  # what is kept, also of an incomplete run; empty where it failed otherwise
     seconds: float  # wall time [s]
     place: str  # host:process id
-    software: str  # see ``software.installed``
+    software: str  # see ``software.installed_software``

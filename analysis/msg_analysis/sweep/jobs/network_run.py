@@ -77,7 +77,7 @@ def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
             raise
     if document is None:
         shutil.rmtree(directory, ignore_errors=True)
-        last = said.strip().splitlines()[-1:] or ["it said nothing"]
+        last = said.strip().splitlines()[-1:] or ["no error message"]
         raise InputError(f"{PROGRAM} run: exit code {code}: {last[0].removeprefix('error: ')}")
     if document.get("verdict") == "agrees" and not options.keep:
         shutil.rmtree(directory, ignore_errors=True)

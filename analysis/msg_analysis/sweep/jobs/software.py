@@ -11,9 +11,8 @@ from pathlib import Path
 from msg_analysis.common.version import __version__
 from msg_analysis.errors import InputError
 
-_ROOMS = ("model", "theory", "twin", "inference")
-
-
+# What the result of a job depends on: the folders and modules that ``evaluate`` imports.
+_SOURCES = ("common", "model", "theory", "twin", "inference", "sweep/jobs", "errors.py", "protocol.py", "types.py")
 _LIBRARIES = ("distributed", "pyarrow")
 
 
@@ -27,18 +26,24 @@ def require_libraries() -> None:
 
 
 @functools.cache
-def installed() -> str:
-    """Versions of msg_analysis, numpy and scipy in one line, with a digest of the code that results depend on.
-
-    The digest covers ``model``, ``theory``, ``inference``, the twin and ``sweep/jobs/evaluate.py``.
-    """
-    source = Path(__file__).parents[2]
-    files = [file for room in _ROOMS for file in (source / room).rglob("*.*") if file.suffix in (".py", ".c")]
-    digest = hashlib.sha256()
-    for file in sorted([*files, source / "sweep/jobs/evaluate.py"]):
-        digest.update(file.read_bytes())
+def installed_software() -> str:
+    """Versions of msg_analysis, numpy and scipy in one line, with a digest of the code that results depend on."""
     libraries = " ".join(f"{name} {_version(name)}" for name in ("numpy", "scipy"))
-    return f"msg_analysis {__version__} ({digest.hexdigest()[:10]}), {libraries}"
+    return f"msg_analysis {__version__} ({source_digest(Path(__file__).parents[2])}), {libraries}"
+
+
+def source_digest(package: Path) -> str:
+    """Digest of the files in the folder of msg_analysis that results depend on."""
+    digest = hashlib.sha256()
+    for file in source_files(package):
+        digest.update(f"{file.relative_to(package)}\0".encode() + file.read_bytes())
+    return digest.hexdigest()[:10]
+
+
+def source_files(package: Path) -> list[Path]:
+    """These files: Python and C, in order."""
+    found = [file for name in _SOURCES for file in [package / name, *(package / name).rglob("*")]]
+    return sorted(file for file in found if file.suffix in (".py", ".c") and file.is_file())
 
 
 def _version(name: str) -> str:

@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from msg_analysis.errors import InputError
-from msg_analysis.sweep.jobs.software import installed
+from msg_analysis.sweep.jobs.software import installed_software
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -109,7 +109,7 @@ class Workers:
             try:
                 self._client = distributed.Client(self._scheduler, timeout=_CONNECT, name="msg-analysis")
             except (OSError, ValueError, TypeError) as error:
-                reason = str(error).partition(":")[0] if isinstance(error, ValueError) else "nobody answers there"
+                reason = str(error).partition(":")[0] if isinstance(error, ValueError) else "no answer"
                 wanted = "expected the address of a Dask scheduler: for example tcp://127.0.0.1:8786"
                 raise InputError(f"--scheduler {self._scheduler}: {reason}: {wanted}") from error
             self._compare_software()
@@ -155,12 +155,10 @@ class Workers:
     def outcomes(
         self, function: Function[T, R], items: Sequence[T], *, patience: float = 2 * NOTICE
     ) -> Generator[list[tuple[T, R | Lost]], None, None]:
-        """Do something with every item, by a function at the top of a module that the workers can import.
+        """Results of ``function`` (at the top of a module) for all items, in batches, as they are ready.
 
-        Results come in batches, as they are ready. A batch whose workers died more often than Dask allows (3 times by
-        default) is tried again item by item; an item that kills its workers again is ``Lost``. If this is interrupted,
-        running work has ``patience`` seconds to end. WorkersLostError: the scheduler has gone; InputError: other
-        software on a worker.
+        An item that kills its workers again when tried alone is ``Lost``. If interrupted, running work has ``patience``
+        [s] to end. WorkersLostError: the scheduler is gone; InputError: other software on a worker.
         """
         from distributed import as_completed
 
@@ -197,7 +195,7 @@ class Workers:
 
     def _submit(self, function: Function[T, R], batch: list[T], running: dict[Future, list[T]], done: Any) -> None:
         assert self._client is not None
-        future = self._client.submit(_do, function, batch, self._stop_name, installed(), pure=False)
+        future = self._client.submit(_do, function, batch, self._stop_name, installed_software(), pure=False)
         running[future] = batch
         done.add(future)
 
@@ -237,16 +235,16 @@ class Workers:
         """Refuse workers with other software; those that join later refuse themselves in ``_do``."""
         assert self._client is not None
         try:
-            found = self._client.run(installed)
+            found = self._client.run(installed_software)
         except ModuleNotFoundError as error:
             raise InputError(
                 f"--scheduler {self._scheduler}: {error}: install the same software on its workers"
             ) from error
         for worker, software in found.items():
-            if software != installed():
+            if software != installed_software():
                 raise InputError(
-                    f"--scheduler {self._scheduler}: worker {worker} has {software}: expected {installed()}: install "
-                    "the same software there"
+                    f"--scheduler {self._scheduler}: worker {worker} has {software}: expected "
+                    f"{installed_software()}: install the same software there"
                 )
 
 
@@ -261,8 +259,8 @@ def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: 
     """On a worker: do a batch, and time it [s]; one thread of linear algebra, since there is a worker for every CPU."""
     from threadpoolctl import threadpool_limits
 
-    if installed() != software:
-        raise InputError(f"it has {installed()}: expected {software}")
+    if installed_software() != software:
+        raise InputError(f"it has {installed_software()}: expected {software}")
     stopping = _Stopping(stop_name)
     begin = time.perf_counter()
     results = []

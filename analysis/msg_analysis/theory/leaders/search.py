@@ -14,7 +14,7 @@ from itertools import combinations
 from typing import Protocol
 
 Leaders = frozenset[int]
-Watch = Callable[[str, int, int, float], None]  # (stage, done, of how many, least E among the sets just tried)
+SearchProgress = Callable[[str, int, int, float], None]  # (stage, done, of how many, least E among the sets just tried)
 
 TIE = 1e-9  # relative difference below which two system errors count as equal: the lower agents are preferred
 STARTS = 3  # number of greedy sets from which exchanges start
@@ -48,13 +48,13 @@ class SetFunction(Protocol):
 
 
 def ignore(_stage: str, _done: int, _total: int, _best: float) -> None:
-    """A ``Watch`` that does nothing."""
+    """A ``SearchProgress`` that does nothing."""
 
 
 class LeaderSearch:
     """One search, which keeps the value of every set that it has evaluated; agents count from 0."""
 
-    def __init__(self, function: SetFunction, watch: Watch = ignore) -> None:
+    def __init__(self, function: SetFunction, watch: SearchProgress = ignore) -> None:
         self._function = function
         self._watch = watch
         self._known: dict[Leaders, float] = {}

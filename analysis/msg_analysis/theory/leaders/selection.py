@@ -19,14 +19,14 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.model.experiment.spec import LeadersSpec
 from msg_analysis.model.step.sequential_law import build_run_model
-from msg_analysis.theory.leaders.search import Leaders, LeaderSearch, Watch, ignore
+from msg_analysis.theory.leaders.search import Leaders, LeaderSearch, SearchProgress, ignore
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import BoolArray
 
-Law = Literal["continuous", "emulated", "discrete"]
-Method = Literal["auto", "exhaustive", "greedy", "swap"]
+SelectionLaw = Literal["continuous", "emulated", "discrete"]
+SearchMethod = Literal["auto", "exhaustive", "greedy", "swap"]
 
 AUTO_SETS = 1000  # number of sets up to which "auto" evaluates them all
 MOST_SETS = 1_000_000  # number of sets beyond which enumeration is refused
@@ -37,7 +37,7 @@ class LeaderProblem:
     """System error as a function of the set of leaders of an experiment, whose own leaders are ignored."""
 
     experiment: Experiment
-    law: Law  # "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
+    law: SelectionLaw  # "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
     gain: float = math.inf  # kappa of the leaders [1 / unit of time]; inf holds them at the reference
 
     @property
@@ -62,8 +62,8 @@ class LeaderProblem:
         if step.noise.min() < -1e-12 * np.abs(step.noise).max():
             return "the noise of some agents is negatively correlated"
         if self.experiment.protocol:
-            everybody = self._system(frozenset(range(self.agents)), self.gain if math.isfinite(self.gain) else 0.0)
-            if everybody.matrices.min() < 0.0:
+            all_agents = self._system(frozenset(range(self.agents)), self.gain if math.isfinite(self.gain) else 0.0)
+            if all_agents.matrices.min() < 0.0:
                 return "some weights of the protocol are negative"
         elif self.law == "emulated":
             pull = self.gain if math.isfinite(self.gain) else 0.0
@@ -171,10 +171,10 @@ class Selection:
         }
 
 
-def resolve_law(experiment: Experiment, law: Law | None = None) -> Law:
+def resolve_law(experiment: Experiment, law: SelectionLaw | None = None) -> SelectionLaw:
     """``law`` if the experiment has it, else InputError; None stands for the paper's law, or else that of the steps."""
     if experiment.time == "discrete":
-        possible: list[Law] = ["discrete"]
+        possible: list[SelectionLaw] = ["discrete"]
     elif experiment.steps_only:
         possible = ["emulated"]
     else:
@@ -189,7 +189,9 @@ def resolve_law(experiment: Experiment, law: Law | None = None) -> Law:
     return law
 
 
-def system_error(experiment: Experiment, agents: list[int], *, law: Law | None = None, gain: float = math.inf) -> float:
+def system_error(
+    experiment: Experiment, agents: list[int], *, law: SelectionLaw | None = None, gain: float = math.inf
+) -> float:
     """E(S) with the given agents as leaders; inf where S does not reach all agents.
 
     Parameters
@@ -211,7 +213,7 @@ def system_error(experiment: Experiment, agents: list[int], *, law: Law | None =
     return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(frozenset(agents))
 
 
-def joint_robustness_centrality(experiment: Experiment, agents: list[int], *, law: Law | None = None) -> float:
+def joint_robustness_centrality(experiment: Experiment, agents: list[int], *, law: SelectionLaw | None = None) -> float:
     """1/E(S) in the exact limit of infinite gain (the paper's definition, Section 4); inf where E(S) is 0.
 
     Parameters
@@ -227,11 +229,11 @@ def select_leaders(
     experiment: Experiment,
     count: int,
     *,
-    method: Method = "auto",
-    law: Law | None = None,
+    method: SearchMethod = "auto",
+    law: SelectionLaw | None = None,
     gain: float = math.inf,
     top: int = 10,
-    watch: Watch = ignore,
+    watch: SearchProgress = ignore,
 ) -> Selection:
     """The set of leaders with the least system error, or a good one (docs/leaders.md, "Search methods").
 
@@ -257,15 +259,15 @@ def select_leaders(
     InputError
         impossible count, gain or law; no set of this size reaches all agents; too many sets
     """
-    _check(method in get_args(Method), f"method {method}: expected one of {', '.join(get_args(Method))}")
-    _check(gain > 0.0, f"--gain {gain}: expected a number > 0, or inf for leaders held at the reference")
+    _check(method in get_args(SearchMethod), f"method {method}: expected one of {', '.join(get_args(SearchMethod))}")
+    _check(gain > 0.0, f"gain {gain}: expected a number > 0, or inf for leaders held at the reference")
     most = experiment.agents - (1 if math.isinf(gain) else 0)
     _check(
         1 <= count <= most,
-        f"--count {count}: expected 1 to {most}, since {experiment.source} has {experiment.agents} agents"
-        + (" and somebody has to follow" if math.isinf(gain) else ""),
+        f"count {count}: expected 1 to {most}, since {experiment.source} has {experiment.agents} agents"
+        + (" and at least one agent must follow" if math.isinf(gain) else ""),
     )
-    _check(top >= 1, f"--top {top}: expected a number >= 1")
+    _check(top >= 1, f"top {top}: expected a number >= 1")
     problem = LeaderProblem(experiment, resolve_law(experiment, law), gain)
     sets = math.comb(experiment.agents, count)
     chosen_method = method if method != "auto" else "exhaustive" if sets <= AUTO_SETS else "swap"
@@ -273,7 +275,7 @@ def select_leaders(
     order: list[int] = []
     bound: float | None = None
     if chosen_method == "exhaustive":
-        _check(sets <= MOST_SETS, f"--method exhaustive: {sets} sets of {count} leaders: use swap")
+        _check(sets <= MOST_SETS, f"method exhaustive: {sets} sets of {count} leaders: use swap")
         found = search.exhaustive(count, top)
     else:
         order = search.greedy(count) if chosen_method == "greedy" else search.swap(count)
@@ -282,7 +284,7 @@ def select_leaders(
         found = search.evaluated(count, top)
     _check(
         bool(found),
-        f"--count {count}: no set of {count} reaches everybody in the union of all graphs: use more leaders",
+        f"count {count}: no set of {count} reaches all agents in the union of all graphs: use more leaders",
     )
     if chosen_method == "exhaustive" or count == 1:  # a single leader: all of them were evaluated
         bound = found[0][0]

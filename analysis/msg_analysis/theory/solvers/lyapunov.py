@@ -18,7 +18,7 @@ from msg_analysis.types import AnyArray, ComplexArray, FloatArray
 # Largest condition of eigenvectors that are used: a solve has errors of its square times 1e-16, before refinement.
 MAX_CONDITION = 1e4
 MILD = 1e-4  # slowest decay, relative to the fastest, for which single precision suffices in a preconditioner
-ROUNDING = 8.0 * float(np.finfo(float).eps)  # eigenvalues below this * dimension * the largest one count as 0
+EIGENVALUE_ROUNDING = 8.0 * float(np.finfo(float).eps)  # eigenvalues below this * dimension * largest one are 0
 
 
 class Eigenvectors(NamedTuple):
@@ -53,7 +53,7 @@ class LocalSolves:
         else:
             values = self.eigenvectors.values
         size = np.abs(values).max(axis=1, initial=0.0, keepdims=True)
-        self._null = np.abs(values) <= ROUNDING * drift.shape[1] * size
+        self._null = np.abs(values) <= EIGENVALUE_ROUNDING * drift.shape[1] * size
         values = np.where(self._null, 0.0, values)
         row, column, rate = values[:, :, None], values[:, None, :], leaving[:, None, None]
         if time == "continuous":

@@ -36,6 +36,6 @@ def singular_message(reason: str = "") -> str:
     """The error message for equations that have no solution that can be trusted; ``reason`` follows "singular"."""
     return (
         f"second moments: the equations are (nearly) singular{reason}, so the errors grow without bound or cannot be "
-        "computed: check that the union of the graphs connects everybody and that the rates do not differ by many "
+        "computed: check that the union of the graphs connects all agents and that the rates do not differ by many "
         "orders of magnitude"
     )
