@@ -30,7 +30,7 @@ def require_libraries() -> None:
 def installed() -> str:
     """Versions of msg_analysis, numpy and scipy in one line, with a digest of the code that results depend on.
 
-    The digest covers ``model``, ``theory``, ``inference``, the twin and ``sweep/jobs/evaluate.py``.
+    The digest covers ``model``, ``theory``, ``inference``, the twin and ``sweep/point.py``.
     """
     source = Path(__file__).parents[2]
     files = [file for room in _ROOMS for file in (source / room).rglob("*.*") if file.suffix in (".py", ".c")]
