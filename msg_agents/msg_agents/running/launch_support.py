@@ -22,29 +22,29 @@ from msg_analysis.twin.simulate import new_record
 
 TRUE, FALSE = {"true", "1", "yes", "on"}, {"false", "0", "no", "off"}
 NETWORK_ARGUMENTS = {
-    "experiment": ("line_ring", "Experiment file, or the name of one of msg_agents_bringup."),
-    "out": ("runs", "Where the bag's directory <name>_<time> is made."),
-    "record": ("true", "Whether to record; otherwise there is no bag and no verdict."),
+    "experiment": ("line_ring", "Experiment file, or the name of one in msg_agents_bringup."),
+    "out": ("runs", "Where the folder <name>_<time> of the bag is made."),
+    "record": ("true", "Whether to record; if false: no bag, no verdict."),
     "analyse": (
         "true",
         "Whether to compare the bag with the prediction afterwards: the launch fails if they disagree.",
     ),
-    "seed": ("", "Instead of run.seed."),
-    "duration": ("", "Instead of run.duration, in units of simulated time."),
-    "pace": ("", "Instead of run.pace: lockstep or realtime."),
-    "speed": ("", "Instead of run.speed: units of simulated time per second (realtime)."),
-    "processes": ("", "Instead of run.processes: auto, one_per_agent or a number."),
-    "namespace": ("", "Of all nodes and topics, such as /lab."),
+    "seed": ("", "Replaces run.seed."),
+    "duration": ("", "Replaces run.duration, in units of simulated time."),
+    "pace": ("", "Replaces run.pace: lockstep or realtime."),
+    "speed": ("", "Replaces run.speed: units of simulated time per second (realtime)."),
+    "processes": ("", "Replaces run.processes: auto, one_per_agent or a number."),
+    "namespace": ("", "Namespace of all nodes and topics, such as /lab."),
     "use_sim_time": ("false", "Whether to take the time from /clock (realtime)."),
 }
 """Default and description of each argument of network.launch.py."""
 REPLAY_ARGUMENTS = {
     "bag": ("", "The bag: a directory, or one of its files."),
-    "rate": ("1", "Seconds of the bag per second, or max: as fast as readers take it."),
-    "live": ("true", "Whether to watch it: errors beside their prediction, on the topic estimate too."),
-    "namespace": ("", "Of the network in the bag: where to watch it."),
-    "clock": ("", "Hz at which to publish the time of the bag on /clock; empty: not."),
-    "loop": ("false", "Whether to begin again at the end, for ever; not together with live."),
+    "rate": ("1", "Seconds of the bag per second, or max: as fast as the readers accept messages."),
+    "live": ("true", "Whether to watch it: errors and their prediction, also on the topic estimate."),
+    "namespace": ("", "Namespace of the network in the bag, for live."),
+    "clock": ("", "Rate [Hz] at which to publish the time of the bag on /clock; empty: do not publish it."),
+    "loop": ("false", "Whether to repeat without end; not together with live."),
 }
 """The same for replay.launch.py."""
 
