@@ -295,7 +295,7 @@ forge = {
     "wrong length": lambda: send_state(replicas=rng.choice([0, 1, 3, 50])),
     "not finite": lambda: send_state(value=rng.choice([np.nan, np.inf, -np.inf]), step=now[0] + 60),
     "step out of range": lambda: send_state(step=rng.choice([last + 1, 2**40, 2**63 - 1, 2**64 - 1])),
-    "a step long past": lambda: send_state(step=rng.randrange(now[0] - 6100)),
+    "step too old": lambda: send_state(step=rng.randrange(now[0] - 6100)),
     "a step that a peer cannot have reached": lambda: send_state(step=min(now[0] + 12_500, last)),
     "undecodable": lambda: state.publish(bytes([0, 1, 0, 0]) + rng.randbytes(rng.randrange(1, 200))),
     "other run, graph": lambda: graph.publish(ActiveGraph(0, other, 0, 1, "line", 0, last - 1).encode()),
@@ -346,7 +346,7 @@ def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Ra
         "wrong length",
         "not finite",
         "step out of range",
-        "a step long past",
+        "step too old",
         "a step that a peer cannot have reached",
     ):
         assert refused["agent_2/state", reason]["count"] > 0, reason
@@ -377,5 +377,5 @@ def test_second_processes_of_agents(network: Any) -> None:
             )
         result = network.completed(run)
     for agent in doubles:
-        entry = {"node": "switcher", "topic": f"agent_{agent}", "reason": "a second node of this name", "count": 1}
+        entry = {"node": "switcher", "topic": f"agent_{agent}", "reason": "duplicate node name", "count": 1}
         assert entry in result["strangers"]
