@@ -41,9 +41,11 @@ import rclpy
 from rclpy.duration import Duration
 from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress
 from std_msgs.msg import String
-from msg_agents.nodes.ros.qos import LATCHED, STREAM
+from msg_agents.nodes.ros.qos import ros_profile
+from msg_analysis.wire.topics import LATCHED, STREAM
 
 AGENTS, PROCESSES = 5, 2
+latched, stream = ros_profile(LATCHED), ros_profile(STREAM)
 rclpy.init()
 node = rclpy.create_node("stranger", enable_rosout=False)
 kinds = {"graph": ActiveGraph, "progress": Progress, "end": Progress, "epoch": Progress, "experiment": String}
@@ -52,7 +54,7 @@ readers |= {f"agent_{i}/state": 2 for i in (1, 2, 3, 5)}  # the recorder and the
 readers["agent_4/state"] = 1
 messages = [line.split() for line in Path(sys.argv[1]).read_text().splitlines()]
 publishers = {
-    topic: node.create_publisher(kinds.get(topic, AgentState), topic, LATCHED) for topic in dict(messages)
+    topic: node.create_publisher(kinds.get(topic, AgentState), topic, latched) for topic in dict(messages)
 }
 for topic, publisher in publishers.items():
     while publisher.get_subscription_count() < readers[topic]:
@@ -64,7 +66,7 @@ for publisher in publishers.values():
 referee = rclpy.create_node("referee", enable_rosout=False)
 topics = {"graph": ActiveGraph} | {f"agent_{i}/state": AgentState for i in range(1, AGENTS + 1)}
 for topic, kind in topics.items():
-    referee.create_subscription(kind, topic, lambda _: None, LATCHED if topic == "graph" else STREAM)
+    referee.create_subscription(kind, topic, lambda _: None, latched if topic == "graph" else stream)
 time.sleep(600)
 """
 Forgery = tuple[str, bytes]  # topic, message
@@ -257,7 +259,8 @@ import numpy as np
 import rclpy
 from rclpy.qos import qos_profile_sensor_data
 from msg_agents_interfaces.msg import ActiveGraph as GraphMsg, AgentState as StateMsg, Progress as ProgressMsg
-from msg_agents.nodes.ros.qos import LATCHED, STREAM
+from msg_agents.nodes.ros.qos import ros_profile
+from msg_analysis.wire import topics
 from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, StateFrame
 from msg_analysis.model.run.record import RunRecord
 
@@ -269,10 +272,10 @@ frame = StateFrame(run, 2, 0)
 now = [0]
 rclpy.init()
 node = rclpy.create_node("intruder", enable_rosout=False)
-state = node.create_publisher(StateMsg, "agent_2/state", STREAM)
-graph = node.create_publisher(GraphMsg, "graph", LATCHED)
-progress = node.create_publisher(ProgressMsg, "progress", LATCHED)
-end = node.create_publisher(ProgressMsg, "end", LATCHED)
+state = node.create_publisher(StateMsg, "agent_2/state", ros_profile(topics.STREAM))
+graph = node.create_publisher(GraphMsg, "graph", ros_profile(topics.LATCHED))
+progress = node.create_publisher(ProgressMsg, "progress", ros_profile(topics.LATCHED))
+end = node.create_publisher(ProgressMsg, "end", ros_profile(topics.LATCHED))
 
 def listen(data):  # to the true agent, not to itself
     agent, step, _, value = frame.unwrap(data) or (0, 0, 0, b"")
@@ -372,9 +375,7 @@ def test_second_processes_of_agents(network: Any) -> None:
         for agent, double in doubles.items():
             _, stderr = double.communicate(timeout=60)
             assert double.returncode == 2, stderr
-            assert re.search(rf"there was still more than one .*agent_{agent}.* in the same ROS_DOMAIN_ID", stderr), (
-                stderr
-            )
+            assert re.search(rf"more than one node was still called .*agent_{agent}.* in ROS_DOMAIN_ID", stderr), stderr
         result = network.completed(run)
     for agent in doubles:
         entry = {"node": "switcher", "topic": f"agent_{agent}", "reason": "duplicate node name", "count": 1}

@@ -50,9 +50,9 @@ class Qos:
         ]
 
 
-# Keep-all, reliable: a slow reader holds the writer back end to end. Keep-last, of any depth, loses messages silently to
-# a busy reader. Rare messages that late readers need are latched. States are not: the start gate waits for their readers,
-# and a writer that keeps thousands of old ones works in cold memory, which costs a network a tenth of its speed.
+# Reliable, keep-all: a slow reader holds the writer back end to end. Keep-last, of any depth, loses messages silently
+# to a busy reader. Rare messages that late readers need are latched. States are not: the start gate waits for their
+# readers, and a writer that keeps thousands of old ones works in cold memory, which costs a tenth of the speed.
 STREAM, LATCHED = Qos(), Qos(latched=True)
 NEWEST = Qos(1, latched=True)
 """Values that replace earlier ones: the writer never waits, and a late reader gets the newest."""

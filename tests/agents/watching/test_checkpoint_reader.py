@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_agents.processes.process_plan import agent_name
-from msg_agents.recovery.checkpoint import Checkpoint, longest_heard
+from msg_agents.recovery.checkpoint import Checkpoint
 from msg_agents.watching.checkpoint_reader import BLOCK, Tap
 from msg_agents.watching.run_observer import Observer
 from msg_analysis.inference.verdict.compare import compare
@@ -18,7 +17,9 @@ from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.simulate import simulate
-from msg_analysis.wire.messages import StateCodec, StateFrame
+from msg_analysis.wire.messages import StateCodec
+from msg_analysis.wire.receiving import state_frame
+from msg_analysis.wire.topics import agent_name
 
 
 def _experiment(duration: float = 20, **changes: Any) -> Experiment:
@@ -37,7 +38,7 @@ class Writers:
     def __init__(self, trajectory: Trajectory, directory: Path) -> None:
         self.record: RunRecord = trajectory.record
         experiment, run = self.record.experiment, self.record.run.bytes
-        frame = StateFrame(run, experiment.width, longest_heard(self.record))
+        frame = state_frame(self.record, whole=True)
         self._trajectory, self._done = trajectory, -1
         self._files = [Checkpoint(directory / f"{agent_name(i)}.states", frame.size) for i in range(experiment.agents)]
         self._codecs = [
@@ -97,7 +98,7 @@ def test_half_written_states_do_not_count(tmp_path: Path) -> None:
     writers = Writers(trajectory, tmp_path)
     writers.write(50)
     path = tmp_path / "agent_2.states"
-    size = StateFrame(trajectory.record.run.bytes, 2).size
+    size = state_frame(trajectory.record, whole=True).size
     data = bytearray(path.read_bytes())
     data[20 * (size + 16) + size + 8 : 20 * (size + 16) + size + 16] = bytes(8)  # the mark of step 20
     path.write_bytes(data)

@@ -11,7 +11,9 @@ from msg_analysis.types import FloatArray, IntArray
 from msg_analysis.wire.refusals import Refusal
 
 SPREAD = 64  # steps that neighbours can be apart in lockstep
-MOST_RESENT = 5_000  # states of one agent that may arrive late because they have to be sent again: a writer's history
+WRITER_HISTORY = (
+    5_000  # states of one agent that may arrive late because they have to be sent again: a writer's history
+)
 MOST_WAITING = 20_000  # incomplete steps kept, at most
 
 
@@ -35,7 +37,7 @@ class StepCollector:
 
     def __init__(self, agents: int, modes: int, last: int, *, lockstep: bool) -> None:
         self._agents, self._modes, self._last, self._lockstep = agents, modes, last, lockstep
-        self._window = min(SPREAD * (agents + 1) + MOST_RESENT, MOST_WAITING)
+        self._window = min(SPREAD * (agents + 1) + WRITER_HISTORY, MOST_WAITING)
         self._rows: dict[int, _Row] = {}
         self._low = 0  # earlier steps are no longer kept
         self._ready: list[tuple[int, int, bytes, bytes]] = []  # step, mode, states, those after it
