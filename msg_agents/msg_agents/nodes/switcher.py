@@ -264,11 +264,11 @@ class RealtimeSwitcher(Switcher):
         """Publish every sojourn that has begun; the first one before the epoch."""
         assert self._schedule is not None
         simulated = self._schedule.simulated(self._timer.now())
-        come: deque[Sojourn] = deque(maxlen=MOST_BEHIND)
+        begun: deque[Sojourn] = deque(maxlen=MOST_BEHIND)
         while self._next and (self._next.first_step == 0 or self._schedule.due(self._next.first_step) <= simulated):
-            come.append(self._next)
+            begun.append(self._next)
             self._next = next(self._path, None)
-        for sojourn in come:
+        for sojourn in begun:
             self._publish_sojourn(sojourn)
         if self._next:
             self._timer.set(self._schedule.clock_time(self._next.first_step))

@@ -12,7 +12,7 @@ from msg_agents.nodes.network_node import NOT_AN_AGENT
 from msg_agents.nodes.ros.timers import DueTimer
 from msg_agents.stepping.agent_inputs import NOTHING
 from msg_agents.stepping.newest_values import NewestValues
-from msg_agents.stepping.realtime_schedule import MARGIN, Schedule
+from msg_agents.stepping.realtime_schedule import CLOCK_MARGIN, Schedule
 from msg_analysis.model.arithmetic.step_clock import SECOND
 from msg_analysis.model.step.air import LOST
 from msg_analysis.model.step.phases import phases
@@ -46,7 +46,9 @@ class RealtimeAgent(Agent):
             start=self._law.step,
         )
         self._made = stamp_ns(self._resumed) if self._resumed else 0  # simulated time [ns] of the newest state
-        self._margin = round(MARGIN * SECOND * self._speed)  # the stamps of others may be so much ahead of our clock
+        self._margin = round(
+            CLOCK_MARGIN * SECOND * self._speed
+        )  # the stamps of others may be so much ahead of our clock
         self._late = 0  # largest lateness since the last report [ns of simulated time]
         self._looked = 0  # time of the clock at the last call of ``_waiting_for`` [ns]
         self._missed = self._missed_before = 0  # steps made later than the next one was due
