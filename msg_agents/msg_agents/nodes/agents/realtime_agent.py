@@ -46,9 +46,8 @@ class RealtimeAgent(Agent):
             start=self._law.step,
         )
         self._made = stamp_ns(self._resumed) if self._resumed else 0  # simulated time [ns] of the newest state
-        self._margin = round(
-            CLOCK_MARGIN * SECOND * self._speed
-        )  # the stamps of others may be so much ahead of our clock
+        # The stamps of others may be so much ahead of our clock.
+        self._margin = round(CLOCK_MARGIN * SECOND * self._speed)
         self._late = 0  # largest lateness since the last report [ns of simulated time]
         self._looked = 0  # time of the clock at the last call of ``_waiting_for`` [ns]
         self._missed = self._missed_before = 0  # steps made later than the next one was due
