@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
+from msg_analysis.model.arithmetic.payload import all_finite
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.wire.cdr_fields import CdrError
 from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, StateFrame
@@ -49,8 +50,10 @@ def state_receiver(
     record: RunRecord,
     agent: int,  # index from 0
     frame: StateFrame,
-    take: Callable[[int, int, bytes, bytes], str | None],  # of step, mode, state and whole message; may refuse it
+    take: Callable[[int, int, int, bytes, bytes], str | None],  # of agent, step, mode, state, message; may refuse it
     refuse: Callable[[str], None],
+    *,
+    finite: bool = False,  # whether to refuse states that are not finite
 ) -> Callable[[bytes], None]:
     """The callback for the topic of an agent's states. Hot path."""
     unwrap, number = frame.unwrap, agent + 1
@@ -60,7 +63,8 @@ def state_receiver(
         if found is None or found[0] != number:
             refuse(why_refused(data, record, agent, frame))
             return
-        reason = take(found[1], found[2], found[3], data)
+        _, step, mode, state = found
+        reason = Refusal.NOT_FINITE if finite and not all_finite(state) else take(agent, step, mode, state, data)
         if reason:
             refuse(reason)
 

@@ -44,19 +44,20 @@ def state(**changes: Any) -> bytes:
         (state(state=np.ones(3)), Refusal.WRONG_LENGTH),
         (state(frame_id="map"), Refusal.OTHER_LAYOUT),
         (state(heard=np.array([2], np.uint64)), Refusal.OTHER_LAYOUT),
+        (state(state=np.array([1, np.nan])), Refusal.NOT_FINITE),
         (state(step=9), "of the receiver"),
     ],
 )
 def test_refused_states(data: bytes, reason: str) -> None:
     taken, refused = [], []
 
-    def take(step: int, mode: int, payload: bytes, message: bytes) -> str | None:
-        taken.append((step, mode, payload, message))
+    def take(agent: int, step: int, mode: int, payload: bytes, message: bytes) -> str | None:
+        taken.append((agent, step, mode, payload, message))
         return "of the receiver" if step == 9 else None
 
-    receive = state_receiver(RECORD, 1, state_frame(RECORD, whole=False), take, refused.append)
+    receive = state_receiver(RECORD, 1, state_frame(RECORD, whole=False), take, refused.append, finite=True)
     receive(state())
-    assert (taken.pop(), refused) == ((3, 1, np.ones(2).tobytes(), state()), [])
+    assert (taken.pop(), refused) == ((1, 3, 1, np.ones(2).tobytes(), state()), [])
     receive(data)
     assert refused == [reason]
     assert bool(taken) == (reason == "of the receiver")

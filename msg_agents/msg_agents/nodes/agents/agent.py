@@ -16,14 +16,12 @@ from msg_agents.recovery.checkpoint import Checkpoint
 from msg_agents.stepping.stall_detection import StallDetector
 from msg_agents.stepping.turn_queue import TurnQueue
 from msg_analysis.errors import InputError
-from msg_analysis.model.arithmetic.payload import all_finite
 from msg_analysis.model.run.agent_law import agent_law
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.wire import topics
 from msg_analysis.wire.messages import ActiveGraph, StateCodec, with_state
 from msg_analysis.wire.receiving import state_frame, state_receiver
-from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.topics import agent_name
 
 
@@ -76,7 +74,7 @@ class Agent(NetworkNode):
         near = set(peers).intersection(colleagues)
         self._far = [j for j in peers if j not in near]
         self._near = [j for j in peers if j in near]
-        self._listeners: list[Callable[[int, int, bytes, bytes], str | None]] = []
+        self._listeners: list[Callable[[int, int, int, bytes, bytes], str | None]] = []
         self._expected = [*map(agent_name, self._far), *readers]
         self._next_progress = 0.0
         self._stall = StallDetector()
@@ -142,9 +140,9 @@ class Agent(NetworkNode):
         law = self._law
         message = self._codec.wrap(law.step, mode, law.state, law.heard)
         self._published.write(law.step, message)
-        self._send(law.step, law.state, message)
+        self._send(law.step, mode, law.state, message)
 
-    def _send(self, step: int, state: bytes, message: bytes) -> None:
+    def _send(self, step: int, mode: int, state: bytes, message: bytes) -> None:
         """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it."""
         if self._truth is not None:
             self.publish(self._truth, message)
@@ -152,7 +150,7 @@ class Agent(NetworkNode):
             message = with_state(message, state, len(whole))
         self.publish(self._states, message)
         for hear in self._listeners:
-            hear(self._law.agent, step, state, message)
+            hear(self._law.agent, step, mode, state, message)
 
     def send_again(self, since: int) -> None:
         """Repeat the states from step ``since`` on, for a reader that may have missed them."""
@@ -163,22 +161,20 @@ class Agent(NetworkNode):
         for step, message in self._published.read(since):
             frame = self._whole.unwrap(message)
             assert frame is not None, "written by this software"
-            self._send(step, frame[3], message)
+            self._send(step, frame[2], frame[3], message)
 
     def _ask_again(self) -> None:
         """Ask the peers in other processes for states that may have been missed."""
         raise NotImplementedError
 
     def _receiver(self, peer: int) -> Callable[[bytes], None]:
-        """The callback for a peer's states. Hot path."""
-        hear, refuse, topic = self.hear, self.refuse, topics.STATE.of(peer)
+        """The callback for a peer's states."""
+        topic = topics.STATE.of(peer)
+        return state_receiver(
+            self.record, peer, self._frame, self.hear, lambda reason: self.refuse(reason, topic), finite=True
+        )
 
-        def take(step: int, _mode: int, state: bytes, message: bytes) -> str | None:
-            return hear(peer, step, state, message) if all_finite(state) else Refusal.NOT_FINITE
-
-        return state_receiver(self.record, peer, self._frame, take, lambda reason: refuse(reason, topic))
-
-    def hear(self, peer: int, step: int, state: bytes, message: bytes) -> str | None:
+    def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:
         """Take x_peer(step), from a topic or a direct call; the reason if refused, else None. ``peer``: from 0."""
         raise NotImplementedError
 

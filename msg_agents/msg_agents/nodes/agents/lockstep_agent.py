@@ -58,7 +58,7 @@ class LockstepAgent(Agent):
             self._ask_again()
         return Health(f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting})
 
-    def hear(self, peer: int, step: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002  see Agent
+    def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002
         """See Agent."""
         reason = self._synchronizer.offer(peer, step, state)
         if not reason and self._synchronizer.ready():

@@ -121,7 +121,7 @@ class RealtimeAgent(Agent):
         steps = [LOST if step == NOTHING else step for step, _ in inputs]
         message = self._codec.wrap(law.step, mode + 1, law.state, steps, self._made)
         self._published.write(law.step, message)
-        self._send(law.step, law.state, message)
+        self._send(law.step, mode + 1, law.state, message)
 
     def send_again(self, since: int) -> None:  # noqa: ARG002  only the newest value is of use
         """Publish the newest state again; older ones are of no use."""
@@ -131,7 +131,7 @@ class RealtimeAgent(Agent):
         for j in self._far:
             self._group.ask_again(j, self._law.step)
 
-    def hear(self, peer: int, step: int, state: bytes, message: bytes) -> str | None:
+    def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002
         """See Agent."""
         return self._newest.offer(peer, step, (state, stamp_ns(message)))
 

@@ -6,7 +6,6 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
 from typing import TypeVar
 
 import rclpy
@@ -61,7 +60,7 @@ class Watcher(LeanNode):
         frame = state_frame(self.record, whole=whole)
         for agent in range(self.record.experiment.agents):
             self._topics.append(self.resolve_topic_name(topic.of(agent)))
-            receive = state_receiver(self.record, agent, frame, partial(self._take, agent), self._refuse)
+            receive = state_receiver(self.record, agent, frame, self._take, self._refuse)
             self.subscribe(topic, receive, agent=agent, qos=qos)
 
     def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:
