@@ -15,7 +15,7 @@ from msg_analysis.bags.writer import BagWriter
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
 from msg_analysis.wire.messages import StateCodec, stamp_ns
-from msg_analysis.wire.schemas import network_topics
+from msg_analysis.wire.topics import network_topics
 
 SPLITS = (None, 5_000_000)  # bytes
 

@@ -141,5 +141,5 @@ def test_interrupted_it_says_what_it_has(
     assert "no network was seen" in ended(alone, 3)[1]
     said = ended(network.start("live", "--timeout", "1"), 2)[1]
     assert re.search(
-        f"after 1 s no network in ROS_DOMAIN_ID {domain}, within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}", said
+        f"after 1 s no network in ROS_DOMAIN_ID {domain} and within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}", said
     )

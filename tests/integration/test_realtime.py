@@ -147,7 +147,7 @@ def test_without_a_clock(network: Any, option: list[str]) -> None:
         node = network.start("agent", file, *agents, "--discovery-timeout", "2", *option, ROS_DOMAIN_ID=str(domain))
         stdout, stderr = node.communicate(timeout=60)
     assert (node.returncode, stdout) == (2, ""), stderr
-    assert "had not found: a publisher of /clock." in stderr
+    assert "did not discover: a publisher of /clock." in stderr
 
 
 def test_killed_and_back(network: Any, repetition: int) -> None:

@@ -61,7 +61,7 @@ def test_alone(network: Any, run_file: Path, command: tuple[str, ...], missing: 
         node = network.start(kind, run_file, *options, "--discovery-timeout", "3", ROS_DOMAIN_ID=str(domain))
         stdout, stderr = node.communicate(timeout=60)
     assert (node.returncode, stdout) == (2, ""), stderr
-    error = re.search(r"^error: after 3 s (.*) had not found: (.*?)\. Are they running", stderr, re.MULTILINE)
+    error = re.search(r"^error: after 3 s (.*) did not discover: (.*?)\. Are they running", stderr, re.MULTILINE)
     assert error, stderr
     assert error[2].split(", ") == missing
     assert f"ROS_DOMAIN_ID ({domain})" in stderr
@@ -82,4 +82,4 @@ def test_a_missing_agent_is_named_by_the_others(network: Any, run_file: Path) ->
         texts = [node.communicate(timeout=60)[1] for node in nodes]
     assert [node.returncode for node in nodes] == [2, 2], texts
     for text in texts:
-        assert "had not found: agent_4. Are they running" in text
+        assert "did not discover: agent_4. Are they running" in text

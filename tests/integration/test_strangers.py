@@ -41,9 +41,11 @@ import rclpy
 from rclpy.duration import Duration
 from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress
 from std_msgs.msg import String
-from msg_agents.nodes.ros.qos import LATCHED, STREAM
+from msg_agents.nodes.ros.qos import ros_profile
+from msg_analysis.wire.topics import LATCHED, STREAM
 
 AGENTS, PROCESSES = 5, 2
+latched, stream = ros_profile(LATCHED), ros_profile(STREAM)
 rclpy.init()
 node = rclpy.create_node("stranger", enable_rosout=False)
 kinds = {"graph": ActiveGraph, "progress": Progress, "end": Progress, "epoch": Progress, "experiment": String}
@@ -52,7 +54,7 @@ readers |= {f"agent_{i}/state": 2 for i in (1, 2, 3, 5)}  # the recorder and the
 readers["agent_4/state"] = 1
 messages = [line.split() for line in Path(sys.argv[1]).read_text().splitlines()]
 publishers = {
-    topic: node.create_publisher(kinds.get(topic, AgentState), topic, LATCHED) for topic in dict(messages)
+    topic: node.create_publisher(kinds.get(topic, AgentState), topic, latched) for topic in dict(messages)
 }
 for topic, publisher in publishers.items():
     while publisher.get_subscription_count() < readers[topic]:
@@ -64,7 +66,7 @@ for publisher in publishers.values():
 referee = rclpy.create_node("referee", enable_rosout=False)
 topics = {"graph": ActiveGraph} | {f"agent_{i}/state": AgentState for i in range(1, AGENTS + 1)}
 for topic, kind in topics.items():
-    referee.create_subscription(kind, topic, lambda _: None, LATCHED if topic == "graph" else STREAM)
+    referee.create_subscription(kind, topic, lambda _: None, latched if topic == "graph" else stream)
 time.sleep(600)
 """
 Forgery = tuple[str, bytes]  # topic, message
@@ -257,7 +259,8 @@ import numpy as np
 import rclpy
 from rclpy.qos import qos_profile_sensor_data
 from msg_agents_interfaces.msg import ActiveGraph as GraphMsg, AgentState as StateMsg, Progress as ProgressMsg
-from msg_agents.nodes.ros.qos import LATCHED, STREAM
+from msg_agents.nodes.ros.qos import ros_profile
+from msg_analysis.wire import topics
 from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, StateFrame
 from msg_analysis.model.run.record import RunRecord
 
@@ -269,10 +272,10 @@ frame = StateFrame(run, 2, 0)
 now = [0]
 rclpy.init()
 node = rclpy.create_node("intruder", enable_rosout=False)
-state = node.create_publisher(StateMsg, "agent_2/state", STREAM)
-graph = node.create_publisher(GraphMsg, "graph", LATCHED)
-progress = node.create_publisher(ProgressMsg, "progress", LATCHED)
-end = node.create_publisher(ProgressMsg, "end", LATCHED)
+state = node.create_publisher(StateMsg, "agent_2/state", ros_profile(topics.STREAM))
+graph = node.create_publisher(GraphMsg, "graph", ros_profile(topics.LATCHED))
+progress = node.create_publisher(ProgressMsg, "progress", ros_profile(topics.LATCHED))
+end = node.create_publisher(ProgressMsg, "end", ros_profile(topics.LATCHED))
 
 def listen(data):  # to the true agent, not to itself
     agent, step, _, value = frame.unwrap(data) or (0, 0, 0, b"")
@@ -295,7 +298,7 @@ forge = {
     "wrong length": lambda: send_state(replicas=rng.choice([0, 1, 3, 50])),
     "not finite": lambda: send_state(value=rng.choice([np.nan, np.inf, -np.inf]), step=now[0] + 60),
     "step out of range": lambda: send_state(step=rng.choice([last + 1, 2**40, 2**63 - 1, 2**64 - 1])),
-    "a step long past": lambda: send_state(step=rng.randrange(now[0] - 6100)),
+    "step too old": lambda: send_state(step=rng.randrange(now[0] - 6100)),
     "a step that a peer cannot have reached": lambda: send_state(step=min(now[0] + 12_500, last)),
     "undecodable": lambda: state.publish(bytes([0, 1, 0, 0]) + rng.randbytes(rng.randrange(1, 200))),
     "other run, graph": lambda: graph.publish(ActiveGraph(0, other, 0, 1, "line", 0, last - 1).encode()),
@@ -346,7 +349,7 @@ def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Ra
         "wrong length",
         "not finite",
         "step out of range",
-        "a step long past",
+        "step too old",
         "a step that a peer cannot have reached",
     ):
         assert refused["agent_2/state", reason]["count"] > 0, reason
@@ -372,10 +375,8 @@ def test_second_processes_of_agents(network: Any) -> None:
         for agent, double in doubles.items():
             _, stderr = double.communicate(timeout=60)
             assert double.returncode == 2, stderr
-            assert re.search(rf"there was still more than one .*agent_{agent}.* in the same ROS_DOMAIN_ID", stderr), (
-                stderr
-            )
+            assert re.search(rf"more than one node was still called .*agent_{agent}.* in ROS_DOMAIN_ID", stderr), stderr
         result = network.completed(run)
     for agent in doubles:
-        entry = {"node": "switcher", "topic": f"agent_{agent}", "reason": "a second node of this name", "count": 1}
+        entry = {"node": "switcher", "topic": f"agent_{agent}", "reason": "duplicate node name", "count": 1}
         assert entry in result["strangers"]

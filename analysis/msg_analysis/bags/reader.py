@@ -24,6 +24,7 @@ from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.types import IntArray
 from msg_analysis.wire.cdr_fields import CdrError
 from msg_analysis.wire.messages import ActiveGraph, decode_string
+from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
 
 # Topics are recognised by type and by the end of their name: the network may run in any namespace.
@@ -34,7 +35,7 @@ _TOPICS = {
     ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
     STRING.full_name: re.compile(r"(?:^|/)(experiment)$"),
 }
-_ZSTD_FRAME, _COMPRESSED = b"\x28\xb5\x2f\xfd", "compressed message"
+_ZSTD_FRAME = b"\x28\xb5\x2f\xfd"
 _EACH_COMPRESSED = (
     "every message in it is compressed by itself, which cannot be read: convert it, or record with "
     "`--storage-preset-profile zstd_fast`"
@@ -60,7 +61,7 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
             unreadable.append(error)
     if len(unreadable) == len(files):
         raise unreadable[0]
-    contents.refused["unreadable file"] += len(unreadable)
+    contents.refused[Refusal.UNREADABLE_FILE] += len(unreadable)
     return _trajectory(contents, _choose(contents))
 
 
@@ -128,8 +129,8 @@ class _Contents:
             for record in file.metadata
             if record.name == RECORD_NAME and "record" in record.metadata
         )
-        self.refused["torn file"] += file.torn is not None
-        self.refused["damaged chunk"] += file.damaged_chunks
+        self.refused[Refusal.TORN_FILE] += file.torn is not None
+        self.refused[Refusal.DAMAGED_CHUNK] += file.damaged_chunks
 
     def _add(self, batch: Batch, kinds: dict[int, str | None]) -> None:
         kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: not a topic of the network
@@ -144,7 +145,7 @@ class _Contents:
                 else:
                     self._learn(decode_string(data))
             except CdrError:
-                self.refused[_COMPRESSED if data.startswith(_ZSTD_FRAME) else "undecodable"] += 1
+                self.refused[Refusal.COMPRESSED if data.startswith(_ZSTD_FRAME) else Refusal.UNDECODABLE] += 1
         for name, collector in ((_STATE, self.states), (_TRUTH, self.truths)):
             chosen = np.flatnonzero(kind == _NUMBERS[name])
             if len(chosen):
@@ -177,7 +178,7 @@ def _choose(contents: _Contents) -> RunRecord:
     path = contents.path
     later = (text for text in contents.metadata if text not in contents.experiments)
     found = [*contents.experiments.values(), *map(contents.parsed, later)]
-    if not found and contents.refused[_COMPRESSED]:
+    if not found and contents.refused[Refusal.COMPRESSED]:
         raise BagError(f"{path}: {_EACH_COMPRESSED}")
     if not found:
         pid = recording_pid(path)
@@ -244,9 +245,9 @@ def _modes(contents: _Contents, run: bytes, steps: int, graphs: int) -> IntArray
     sojourns: set[tuple[int, int, int, int]] = set()
     for graph in contents.graphs:
         if graph.run != run:
-            contents.refused["other run"] += 1
+            contents.refused[Refusal.OTHER_RUN] += 1
         elif not (1 <= graph.mode <= graphs and graph.first_step <= graph.last_step < steps):
-            contents.refused["graph out of range"] += 1
+            contents.refused[Refusal.GRAPH_OUT_OF_RANGE] += 1
         else:
             sojourns.add((graph.sequence, graph.mode, graph.first_step, graph.last_step))
     modes = np.full(steps, -1, dtype=np.int64)

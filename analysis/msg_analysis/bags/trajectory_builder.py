@@ -18,6 +18,7 @@ from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.air import LOST
 from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
+from msg_analysis.wire.refusals import Refusal
 
 _NEVER = np.zeros(1, dtype=np.bool_)
 _OTHER_COLUMNS = 4  # numbers of 8 bytes per state beside its own values, some only while it is processed
@@ -79,8 +80,8 @@ class Collector:
         """All that was collected of a run; call it after the last batch. Arguments and errors as of ``expect``."""
         self.expect(record, width)
         collected = self._of(run_number(record.run.bytes))
-        collected.refused["undecodable"] += self._undecodable
-        collected.refused["other run"] += self._counts.total() - self.count(record.run.bytes)
+        collected.refused[Refusal.UNDECODABLE] += self._undecodable
+        collected.refused[Refusal.OTHER_RUN] += self._counts.total() - self.count(record.run.bytes)
         collected.finish()
         return collected
 
@@ -158,7 +159,7 @@ class Collected:
         again = np.delete(np.arange(len(cell)), new)
         differs = self._differ(cell[again], states[again], values[again])
         self.duplicates += len(again)
-        self.refused["contradicts an earlier copy"] += int(differs.sum())
+        self.refused[Refusal.CONTRADICTION] += int(differs.sum())
         self._contradicted.append(np.unique(cell[again[differs]]))
 
     @cached_property
@@ -170,17 +171,17 @@ class Collected:
         """Those that can be states of this run, and their values; the others are counted by reason."""
         right = states.replicas == self._width
         if not right.all():
-            self.refused["wrong length"] += int((~right).sum())
+            self.refused[Refusal.WRONG_LENGTH] += int((~right).sum())
             states = states[right]
         values = states.state(self._width)
         finite = np.isfinite(values)
         good = np.ones(len(states), dtype=np.bool_)
         for reason, bad in (
-            ("unknown agent", (states.agent < 1) | (states.agent > self._shape[1])),
-            ("step out of range", states.step >= self._shape[0]),
-            ("unknown mode", states.mode > self._graphs),
-            ("not finite", _NEVER if finite.all() else ~finite.all(axis=1)),
-            ("stamped before the start", states.stamp < 0 if self._realtime else _NEVER),
+            (Refusal.UNKNOWN_AGENT, (states.agent < 1) | (states.agent > self._shape[1])),
+            (Refusal.OUT_OF_RANGE, states.step >= self._shape[0]),
+            (Refusal.UNKNOWN_MODE, states.mode > self._graphs),
+            (Refusal.NOT_FINITE, _NEVER if finite.all() else ~finite.all(axis=1)),
+            (Refusal.BEFORE_START, states.stamp < 0 if self._realtime else _NEVER),
         ):
             if bad.any():
                 self.refused[reason] += int((good & bad).sum())
@@ -189,7 +190,7 @@ class Collected:
             states, values = states[good], values[good]
         if self._lossy or states.heard_count.any():
             fits = self._links.fit(states, realtime=self._realtime, lossy=self._lossy)
-            self.refused["heard what it cannot have"] += int((~fits).sum())
+            self.refused[Refusal.BAD_HEARD] += int((~fits).sum())
             states, values = states[fits], values[fits]
         return states, values
 

@@ -20,7 +20,7 @@ from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.air import LOST
 from msg_analysis.types import IntArray
 from msg_analysis.wire.messages import ActiveGraph, StateCodec, encode_string
-from msg_analysis.wire.schemas import network_topics, state_topic, truth_topic
+from msg_analysis.wire.topics import EXPERIMENT, GRAPH, STATE, TRUTH, Topic, network_topics
 
 
 def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT_STORAGE) -> None:
@@ -37,7 +37,7 @@ def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Sto
             noisy = trajectory.published is not None
             topics = network_topics(trajectory.record.experiment.agents, truth=noisy)
             with BagWriter(unfinished, topics, record=record, storage=storage) as bag:
-                bag.write("/experiment", encode_string(record), 0)
+                bag.write(f"/{EXPERIMENT.name}", encode_string(record), 0)
                 for topic, data, time in _messages(trajectory):
                     bag.write(topic, data, time)
             unfinished.rename(directory)
@@ -53,10 +53,10 @@ def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
     used = trajectory.agent_modes
     if used is None:
         used = np.repeat(np.concatenate(([-1], modes))[:, None], experiment.agents, axis=1)
-    truth = state_topic if trajectory.published is None else truth_topic
+    truth = STATE if trajectory.published is None else TRUTH
     streams = [(_names(truth, experiment.agents), trajectory.states)]
     if trajectory.published is not None:
-        streams.append((_names(state_topic, experiment.agents), trajectory.published))
+        streams.append((_names(STATE, experiment.agents), trajectory.published))
     present = [np.asarray(~np.isnan(states).any(axis=2)) for _, states in streams]
     widths = [states.shape[2] for _, states in streams]
     codecs = [[StateCodec(run, i + 1, width, dt) for i in range(experiment.agents)] for width in widths]
@@ -71,19 +71,19 @@ def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
         k, i = divmod(cell, experiment.agents)
         now = int(made[k, i])
         while sojourn is not None and sojourn.stamp <= now:
-            yield "/graph", sojourn.encode(), sojourn.stamp
+            yield f"/{GRAPH.name}", sojourn.encode(), sojourn.stamp
             sojourn = next(sojourns, None)
         for (topics, states), there, codec in zip(streams, present, codecs, strict=True):
             if there[k, i]:
                 payload = to_payload(states[k, i])
                 yield topics[i], codec[i].wrap(k, int(used[k, i]) + 1, payload, heard(k, i), now), now
     while sojourn is not None:
-        yield "/graph", sojourn.encode(), sojourn.stamp
+        yield f"/{GRAPH.name}", sojourn.encode(), sojourn.stamp
         sojourn = next(sojourns, None)
 
 
-def _names(topic: Callable[[str, int], str], agents: int) -> list[str]:
-    return [topic("/", i + 1) for i in range(agents)]
+def _names(topic: Topic, agents: int) -> list[str]:
+    return [f"/{topic.of(i)}" for i in range(agents)]
 
 
 def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[int]]:

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 from msg_analysis.bags.format.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Compression, Storage
 from msg_analysis.errors import BagError
-from msg_analysis.wire.schemas import Topic
+from msg_analysis.wire.topics import Topic
 
 # As in rosbag2: small enough that a killed recorder loses little, large enough that the readers' work per chunk does
 # not matter. With a third of it, reading takes a fifth longer.
@@ -105,8 +105,9 @@ class BagWriter:
         self._full = None if self._split_size is None else self._stream.tell() + self._split_size
 
     def _add_channel(self, topic: Topic, schema: int) -> None:
-        count = ChannelCount(topic.name, topic.type.full_name, topic.type.type_hash, topic.qos)
-        metadata = {"offered_qos_profiles": dump(topic.qos), "topic_type_hash": topic.type.type_hash}
+        offered = topic.qos.offered()
+        count = ChannelCount(topic.name, topic.type.full_name, topic.type.type_hash, offered)
+        metadata = {"offered_qos_profiles": dump(offered), "topic_type_hash": topic.type.type_hash}
         number = self._mcap.register_channel(topic.name, "cdr", schema, metadata)
         last = self._channels.get(topic.name)
         self._channels[topic.name] = _Channel(number, count, last.before + last.count.messages if last else 0)

@@ -1,4 +1,4 @@
-"""The network's messages as bytes: CDR, the codec of states, and the description of the message types.
+"""The network's messages as bytes, the topics, and why messages are refused.
 
-Files of messages belong to ``bags``. May import model.arithmetic.
+Files of messages belong to ``bags``. May import model.
 """

@@ -28,7 +28,7 @@ INCOMPLETE = 3
 use_sim_time = click.option(
     "--use-sim-time",
     is_flag=True,
-    help="Take the time from /clock, which somebody else publishes in the same domain (realtime).",
+    help="Take the time from /clock, which another program publishes in the same domain (realtime).",
 )
 
 
@@ -129,15 +129,15 @@ def agent(
 
     def nodes() -> list[NetworkNode]:
         from msg_agents.nodes.agents.agent_group import AgentGroup
-        from msg_agents.nodes.node_process import enter_participant
-        from msg_agents.processes.process_plan import agent_name
-        from msg_agents.recovery.takeover import succeed
+        from msg_agents.nodes.node_process import store_participant
+        from msg_agents.recovery.takeover import take_over
+        from msg_analysis.wire.topics import agent_name
 
         indices = [number - 1 for number in agents]
         model, directory = record.model, _make(checkpoint)
-        successions = succeed(directory, map(agent_name, indices))
+        takeovers = take_over(directory, map(agent_name, indices))
         group = AgentGroup(record=record, model=model, agents=indices, readers=readers, checkpoints=directory)
-        enter_participant(successions, group.nodes[0])
+        store_participant(takeovers, group.nodes[0])
         return list(group.nodes)
 
     _run_nodes(nodes, record, **options)
@@ -166,13 +166,13 @@ def switcher(
             os.write(status, json.dumps(list(steps)).encode() + b"\n")
 
     def nodes() -> list[NetworkNode]:
-        from msg_agents.nodes.network_node import FAREWELL
-        from msg_agents.nodes.node_process import enter_participant
+        from msg_agents.nodes.network_node import ACK_TIMEOUT
+        from msg_agents.nodes.node_process import store_participant
         from msg_agents.nodes.switcher import SWITCHERS
-        from msg_agents.recovery.takeover import succeed
+        from msg_agents.recovery.takeover import take_over
 
         model, directory = record.model, _make(checkpoint)
-        successions = succeed(directory, ["switcher"])
+        takeovers = take_over(directory, ["switcher"])
         kind = SWITCHERS[record.experiment.run.pace]
         node = kind(
             record=record,
@@ -180,9 +180,9 @@ def switcher(
             readers=list(readers),
             on_progress=report,
             checkpoints=directory,
-            farewell=max(FAREWELL, patience or 0.0),
+            ack_timeout=max(ACK_TIMEOUT, patience or 0.0),
         )
-        enter_participant(successions, node)
+        store_participant(takeovers, node)
         return [node]
 
     _run_nodes(nodes, record, patience=patience, **options)
@@ -214,7 +214,7 @@ def _run_nodes(
     discovery_timeout: float,
     use_sim_time: bool,
     account: Path | None,
-    parameter_services: bool,  # noqa: ARG001  see QuietNode
+    parameter_services: bool,  # noqa: ARG001  see LeanNode
     patience: float | None = None,
 ) -> None:
     from msg_agents.nodes.node_process import hold_lifeline, run_nodes

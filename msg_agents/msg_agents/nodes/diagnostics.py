@@ -1,4 +1,4 @@
-"""Health of the nodes, on /diagnostics for any ROS 2 monitor and in the account file."""
+"""Health of the nodes, on /diagnostics for any ROS 2 monitor and in the status file of the process."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from msg_agents.nodes.ros.lean_node import LeanNode
 from msg_agents.nodes.ros.timers import every
 from msg_agents.processes.status_file import write_account
+from msg_analysis.wire.refusals import Refusal
+from msg_analysis.wire.topics import DIAGNOSTICS
 
-DIAGNOSTICS_TOPIC = "/diagnostics"
-PERIOD = 1.0  # s
+DIAGNOSTICS_PERIOD = 1.0  # s
 
 
 @dataclass(slots=True)
@@ -21,7 +23,7 @@ class Health:
     """The health of a node."""
 
     message: str  # one line
-    waiting: bool = False  # cannot go on, or not keep up, at present
+    waiting: bool = False  # cannot continue, or cannot keep up, at present
     values: dict[str, str] = field(default_factory=dict)
 
     def to_status(self, node: Node, refused: Mapping[tuple[str, str], int], repeated: int) -> DiagnosticStatus:
@@ -33,7 +35,7 @@ class Health:
         counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in refused.items()}
         values = self.values | counts
         if repeated:
-            values["received again"] = str(repeated)
+            values[Refusal.REPEATED] = str(repeated)
         return DiagnosticStatus(
             level=DiagnosticStatus.WARN if warn else DiagnosticStatus.OK,
             name=f"{node.get_fully_qualified_name().lstrip('/')}: network",
@@ -43,18 +45,18 @@ class Health:
         )
 
 
-class Reporter:
-    """Publishes the health of all nodes of a process once a second, and keeps its account file.
+class HealthReporter:
+    """Publishes the health of all nodes of a process once a second, and keeps its status file.
 
     The nodes need a method ``health() -> Health`` and the counters ``refused`` and ``repeated``.
     """
 
-    def __init__(self, nodes: Sequence[Node], account: Path | None = None) -> None:
+    def __init__(self, nodes: Sequence[LeanNode], account: Path | None = None) -> None:
         self._nodes = nodes
         self._account = account
         self._waiting: dict[str, str] = {}
-        self._publisher = nodes[0].create_publisher(DiagnosticArray, DIAGNOSTICS_TOPIC, 10)
-        every(nodes[0], PERIOD, self._report)
+        self._publisher = nodes[0].publisher_of(DIAGNOSTICS)
+        every(nodes[0], DIAGNOSTICS_PERIOD, self._report)
 
     def _report(self) -> None:
         healths = [(node, node.health()) for node in self._nodes]
@@ -64,10 +66,10 @@ class Reporter:
         array.header.stamp = self._nodes[0].get_clock().now().to_msg()
         self._publisher.publish(array)
         self._waiting = {node.get_name(): health.message if health.waiting else "" for node, health in healths}
-        self.keep_account()
+        self.write_status_file()
 
-    def keep_account(self) -> None:
-        """Write the account file atomically, if there is one."""
+    def write_status_file(self) -> None:
+        """Write the status file atomically, if there is one."""
         if self._account is not None:
             refused = [(node.get_name(), *what, count) for node in self._nodes for what, count in node.refused.items()]
             write_account(self._account, refused, self._waiting)

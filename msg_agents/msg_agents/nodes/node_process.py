@@ -18,11 +18,12 @@ from rclpy.exceptions import NotInitializedException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
-from msg_agents.nodes.diagnostics import Reporter
-from msg_agents.nodes.network_node import FAREWELL, NetworkNode
-from msg_agents.nodes.peer_presence import Presence
+from msg_agents.nodes.diagnostics import HealthReporter
+from msg_agents.nodes.network_node import ACK_TIMEOUT, NetworkNode
+from msg_agents.nodes.peer_presence import PeerPresence
 from msg_agents.nodes.ros.node_parameters import ros_arguments
-from msg_agents.recovery.takeover import PREFIX_SIZE, Succession
+from msg_agents.processes.environment import discovery_scope
+from msg_agents.recovery.takeover import PREFIX_SIZE, Takeover
 from msg_analysis.errors import InputError
 
 GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
@@ -83,8 +84,8 @@ def run_nodes(
     discovery_timeout: float,  # s
     throughput: bool = True,  # see ``prefer_throughput``
     use_sim_time: bool = False,
-    account: Path | None = None,  # file of what the nodes refused and wait for, written once a second and at the end
-    patience: float | None = None,  # s, see ``Presence``; None: never ends for lack of companions
+    account: Path | None = None,  # status file, written once a second and at the end
+    patience: float | None = None,  # s, see ``PeerPresence``; None: no limit
 ) -> bool:
     """Run nodes until each has done its part; False if the process was told to stop (SIGINT, SIGTERM) before.
 
@@ -98,11 +99,11 @@ def run_nodes(
     with ros_arguments():
         rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
     nodes: Sequence[NetworkNode] = []
-    reporter: Reporter | None = None
+    reporter: HealthReporter | None = None
     complete = False
     try:
         nodes = make_nodes()
-        reporter = Reporter(nodes, account)
+        reporter = HealthReporter(nodes, account)
         spinner = make_executor(executor)
         for node in nodes:
             spinner.add_node(node)
@@ -114,7 +115,7 @@ def run_nodes(
         for node in nodes:
             node.begin()
         if patience is not None:
-            Presence(nodes[0], patience)
+            PeerPresence(nodes[0], patience)
         for node in nodes:
             while not node.done.done():
                 spinner.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
@@ -126,42 +127,32 @@ def run_nodes(
         if rclpy.ok():
             raise
     finally:
-        deadline = time.monotonic() + FAREWELL
+        deadline = time.monotonic() + ACK_TIMEOUT
         for node in nodes:
             node.finish(complete=complete, deadline=deadline)
         if reporter:
-            reporter.keep_account()
+            reporter.write_status_file()
         leave(nodes, complete=complete)
     return complete
 
 
-def enter_participant(successions: Sequence[Succession], node: Node) -> None:
-    """Note the name of this process, which the endpoints of its nodes bear, for the one that will follow.
-
-    Parameters
-    ----------
-    successions
-        of the nodes of this process
-    node
-        one of them
-    """
-    if not successions:
+def store_participant(takeovers: Sequence[Takeover], node: Node) -> None:
+    """Store the GUID prefix of this process, read from the endpoints of one of its nodes, for a later takeover."""
+    if not takeovers:
         return
     own = (node.get_name(), node.get_namespace())
     endpoints = [p for topic in node.publishers for p in node.get_publishers_info_by_topic(topic.topic_name)]
     prefixes = {bytes(p.endpoint_gid[:PREFIX_SIZE]) for p in endpoints if (p.node_name, p.node_namespace) == own}
-    if len(prefixes) == 1:  # else somebody bears the same name: nobody is buried for him
-        for succession in successions:
-            succession.enter(*prefixes)
+    if len(prefixes) == 1:  # else another node has the same name: a later process removes neither
+        for takeover in takeovers:
+            takeover.store_prefix(*prefixes)
 
 
 def leave(nodes: Sequence[Node], *, complete: bool) -> None:
-    """Take the nodes off the network, so that no other node waits for them, and make sure that the process ends.
-
-    When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
-    interpreter's lock held or after the interpreter has gone. Then only C code helps: an alarm, whose default action
-    ends the process. Nothing is lost, because a complete process has delivered everything by now.
-    """
+    """Remove the nodes from the network, so that no other node waits for them, and make sure that the process ends."""
+    # When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
+    # interpreter's lock held or after the interpreter has gone. Then only C code helps: an alarm, whose default action
+    # ends the process. Nothing is lost, because a complete process has delivered everything by now.
     if complete:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(LEAVE_GRACE)
@@ -181,24 +172,22 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
     waiting = list(nodes)
     warned = False
     while True:
-        waiting = [node for node in waiting if not node.found() or node.awaited_clock()]
+        waiting = [node for node in waiting if not node.discovered_all() or node.missing_clock()]
         late = time.monotonic() > deadline
-        twice = nodes[0].namesakes() if late or not waiting else []
+        twice = nodes[0].duplicate_names() if late or not waiting else []
         if not waiting and not twice:
             return
         if twice and not warned:
             warned = True
             names = ", ".join(twice)
-            nodes[0].get_logger().warning(f"there is more than one {names}: waiting until only one is left")
+            nodes[0].get_logger().warning(f"more than one node is called {names}: waiting until only one is left")
         if late and twice:
-            raise nodes[0].clash(twice, timeout)
+            raise nodes[0].duplicate_name_error(twice, timeout)
         if late:
-            missing = sorted({name for node in waiting for name in node.awaited() + node.awaited_clock()})
+            missing = sorted({name for node in waiting for name in node.missing_nodes() + node.missing_clock()})
             raise NotFoundError(
-                f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} had not found: "
-                f"{', '.join(missing)}. Are they running, in the same ROS_DOMAIN_ID "
-                f"({os.environ.get('ROS_DOMAIN_ID', '0')}) and within ROS_AUTOMATIC_DISCOVERY_RANGE "
-                f"({os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')})?"
+                f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} did not discover: "
+                f"{', '.join(missing)}. Are they running {discovery_scope()}?"
             )
         if not rclpy.ok():
             raise ExternalShutdownException

@@ -10,47 +10,36 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
-from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.duration import Duration
-from std_msgs.msg import String
 
 from msg_agents.nodes.diagnostics import Health
-from msg_agents.nodes.network_node import (
-    END_TOPIC,
-    EPOCH_TOPIC,
-    EXPERIMENT_TOPIC,
-    FAREWELL,
-    GRAPH_TOPIC,
-    NOT_AN_AGENT,
-    PROGRESS_TOPIC,
-    NetworkNode,
-)
-from msg_agents.nodes.ros.qos import LATCHED
+from msg_agents.nodes.network_node import ACK_TIMEOUT, NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.ros.timers import DueTimer, every
-from msg_agents.processes.process_plan import RECORDER, agent_name
+from msg_agents.processes.process_plan import RECORDER
 from msg_agents.stepping.realtime_schedule import Schedule
 from msg_analysis.model.arithmetic.step_clock import SECOND
 from msg_analysis.model.run.graph_path import Sojourn, sojourns
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.step_model import Wiring
+from msg_analysis.wire import topics
 from msg_analysis.wire.messages import ActiveGraph, Progress, encode_string
+from msg_analysis.wire.refusals import Refusal
+from msg_analysis.wire.topics import agent_name
 
-AHEAD = 1000
+MOST_AHEAD = 1000
 """Sojourns that are published before the slowest agent reaches them: enough that no agent waits for one; bounded, so
 that a long run takes little memory, and below the 5,000 messages that a late reader gets."""
 
-AHEAD_LEAST, AHEAD_BYTES = 50, 1 << 22
+LEAST_AHEAD, BYTES_AHEAD = 50, 1 << 22
 """Graphs of many agents are large messages, and their agents are slow: only as many sojourns ahead as fit
-AHEAD_BYTES, but at least AHEAD_LEAST."""
+BYTES_AHEAD, but at least LEAST_AHEAD."""
 
-BEHIND = 5000
+MOST_BEHIND = 5000
 """Sojourns that a reader may be behind: the number of messages that the middleware keeps of a writer."""
 
 REPORT_PERIOD = 0.1  # s
 
-NAMESAKE = "a second node of this name"
-HEAD_START = SECOND // 2
+EPOCH_DELAY = SECOND // 2
 """ns of the clock from the publication of the epoch to the epoch: time for all nodes to receive it."""
 
 
@@ -62,13 +51,13 @@ class Switcher(NetworkNode):
         *,
         record: RunRecord,
         model: Wiring,
-        readers: list[str],  # nodes, besides the agents, that must read the graph before the run starts
+        readers: list[str],  # nodes other than the agents that must be discovered before the run starts
         on_progress: Callable[[Sequence[int]], None] = lambda _: None,  # newest step of every agent, -1: none yet
         checkpoints: Path | None = None,  # directory for a mark; finding one there means a takeover
-        farewell: float = FAREWELL,  # s to wait for acknowledgements of the end
+        ack_timeout: float = ACK_TIMEOUT,  # s to wait for acknowledgements of the end
     ) -> None:
         super().__init__("switcher", record=record)
-        self._farewell = farewell
+        self._ack_timeout = ack_timeout
         self._graphs = record.experiment.graph_list
         self._path = sojourns(record.experiment, model.initial)
         self._steps = record.experiment.steps
@@ -77,50 +66,50 @@ class Switcher(NetworkNode):
         self._heard = False  # from an agent since the last call of on_progress
         self._recorded = RECORDER not in readers
         self._on_progress = on_progress
-        self._namesakes: set[str] = set()  # names seen at the last check
+        self._duplicates: set[str] = set()  # names seen at the last check
         self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
         self._expected = [agent_name(i) for i in range(model.agents)] + readers
-        self._experiment = self.create_publisher(String, EXPERIMENT_TOPIC, LATCHED)
-        self._graph = self.create_publisher(ActiveGraphMsg, GRAPH_TOPIC, LATCHED)
-        self._end = self.create_publisher(ProgressMsg, END_TOPIC, LATCHED)
-        self.create_subscription(ProgressMsg, PROGRESS_TOPIC, self._receive, LATCHED, raw=True)
+        self._experiment = self.publisher_of(topics.EXPERIMENT)
+        self._graph = self.publisher_of(topics.GRAPH)
+        self._end = self.publisher_of(topics.END)
+        self.subscribe(topics.PROGRESS, self._receive)
         every(self, REPORT_PERIOD, self._report)
 
-    def found(self) -> bool:
-        """Whether all expected nodes are there."""
-        return not self.awaited()
+    def discovered_all(self) -> bool:
+        """Whether all expected nodes have been discovered."""
+        return not self.missing_nodes()
 
-    def awaited(self) -> list[str]:
-        """Names of nodes that are not there yet; all its topics are latched, so being there is enough."""
+    def missing_nodes(self) -> list[str]:
+        """Names of nodes that have not been discovered yet; all topics are latched, so readers need not be matched."""
         here = self.get_namespace()
         there = {name for name, namespace in self.get_node_names_and_namespaces() if namespace == here}
         return [name for name in self._expected if name not in there]
 
-    def companions(self) -> list[str]:
+    def required_peers(self) -> list[str]:
         """All agents and the required readers."""
         return self._expected
 
     def health(self) -> Health:
         """Progress of the slowest agent, or which agents have not started."""
-        self._look_for_namesakes()
+        self._check_names()
         values = {"step of the slowest agent": str(self._slowest)}
         if self._slowest < 0:
             silent = [agent_name(i) for i, step in enumerate(self._reached) if step < 0]
             return Health(f"waiting for {', '.join(silent)}", waiting=True, values=values)
-        return self._how(values)
+        return self._health(values)
 
-    def _how(self, values: dict[str, str]) -> Health:
+    def _health(self, values: dict[str, str]) -> Health:
         """Health once all agents have started; ``values``: facts to include."""
         raise NotImplementedError
 
-    def _look_for_namesakes(self) -> None:
+    def _check_names(self) -> None:
         """Warn of a duplicate node when it is seen twice in a row: a killed one may not be gone yet."""
-        there = set(self.namesakes())
-        for name in there & self._namesakes:
-            if not self.refused[name, NAMESAKE]:
-                self.refused[name, NAMESAKE] = 1
-                self.get_logger().warning(f"there is a second node called {name}: what only one of them says is taken")
-        self._namesakes = there
+        there = set(self.duplicate_names())
+        for name in there & self._duplicates:
+            if not self.refused[name, Refusal.DUPLICATE_NAME]:
+                self.refused[name, Refusal.DUPLICATE_NAME] = 1
+                self.get_logger().warning(f"two nodes are called {name}: of different messages, the first is used")
+        self._duplicates = there
 
     def begin(self) -> None:
         """Publish the experiment."""
@@ -130,12 +119,12 @@ class Switcher(NetworkNode):
         """Called when the slowest agent has advanced."""
 
     def finish(self, *, complete: bool, deadline: float) -> None:  # noqa: ARG002  it has a time limit of its own
-        """Wait until the end is acknowledged; readers need nothing else any more, and those that left have had it."""
+        """Wait until the end is acknowledged; readers need nothing else, and those that have left had received it."""
         if complete:
-            self._end.wait_for_all_acked(Duration(seconds=self._farewell))
+            self._end.wait_for_all_acked(Duration(seconds=self._ack_timeout))
 
     def _receive(self, data: bytes) -> None:
-        progress = self.decode_progress(data, PROGRESS_TOPIC)
+        progress = self.decode_progress(data, topics.PROGRESS)
         if progress is None:
             return
         if progress.agent == NOT_AN_AGENT:
@@ -185,9 +174,9 @@ class LockstepSwitcher(Switcher):
         # A mark means that part of the path has been published; how much is not known.
         self._behind = bool(self._mark and self._mark.exists())
         self._ahead: deque[int] = deque()  # first steps of published sojourns that the slowest agent has not reached
-        self._most_ahead = AHEAD
+        self._most_ahead = MOST_AHEAD
 
-    def _how(self, values: dict[str, str]) -> Health:
+    def _health(self, values: dict[str, str]) -> Health:
         values["sojourns ahead of it"] = str(len(self._ahead))
         return Health(f"{len(self._ahead)} sojourns ahead of step {self._slowest}", values=values)
 
@@ -214,7 +203,7 @@ class LockstepSwitcher(Switcher):
 
     def _catch_up(self, slowest: int) -> None:
         """Publish again what may not have been delivered when the process before this one ended."""
-        recent: deque[Sojourn] = deque(maxlen=BEHIND)
+        recent: deque[Sojourn] = deque(maxlen=MOST_BEHIND)
         for sojourn in self._path:
             recent.append(sojourn)
             if sojourn.last_step >= slowest:
@@ -225,7 +214,7 @@ class LockstepSwitcher(Switcher):
 
     def _go_ahead(self, sojourn: Sojourn) -> None:
         size = self._publish_sojourn(sojourn)
-        self._most_ahead = min(self._most_ahead, max(AHEAD_LEAST, AHEAD_BYTES // size))
+        self._most_ahead = min(self._most_ahead, max(LEAST_AHEAD, BYTES_AHEAD // size))
         self._ahead.append(sojourn.first_step)
 
 
@@ -238,7 +227,7 @@ class RealtimeSwitcher(Switcher):
         self._schedule: Schedule | None = None
         self._next = next(self._path, None)
 
-    def _how(self, values: dict[str, str]) -> Health:
+    def _health(self, values: dict[str, str]) -> Health:
         if self._schedule is None:
             return Health("waiting for the time on /clock", waiting=True, values=values)
         late = self._next is not None and self._timer.now() - self._schedule.clock_time(self._next.first_step)
@@ -256,7 +245,7 @@ class RealtimeSwitcher(Switcher):
         super()._report()
         now = self._timer.now()
         if self._schedule is None and self._slowest >= 0 and now:
-            epoch = now + HEAD_START
+            epoch = now + EPOCH_DELAY
             if self._mark:  # whole or not at all: a process that takes over must go on with this epoch
                 draft = self._mark.with_suffix(".draft")
                 draft.write_text(str(epoch), encoding="ascii")
@@ -267,7 +256,7 @@ class RealtimeSwitcher(Switcher):
         """Publish the epoch, and the path so far."""
         experiment = self.record.experiment
         self._schedule = Schedule(epoch=epoch, speed=experiment.run.speed, step_length=experiment.step_length)
-        publisher = self.create_publisher(ProgressMsg, EPOCH_TOPIC, LATCHED)
+        publisher = self.publisher_of(topics.EPOCH)
         self.publish(publisher, Progress(epoch, self.run, NOT_AN_AGENT, 0).encode())
         self._keep_up()
 
@@ -275,11 +264,11 @@ class RealtimeSwitcher(Switcher):
         """Publish every sojourn that has begun; the first one before the epoch."""
         assert self._schedule is not None
         simulated = self._schedule.simulated(self._timer.now())
-        come: deque[Sojourn] = deque(maxlen=BEHIND)
+        begun: deque[Sojourn] = deque(maxlen=MOST_BEHIND)
         while self._next and (self._next.first_step == 0 or self._schedule.due(self._next.first_step) <= simulated):
-            come.append(self._next)
+            begun.append(self._next)
             self._next = next(self._path, None)
-        for sojourn in come:
+        for sojourn in begun:
             self._publish_sojourn(sojourn)
         if self._next:
             self._timer.set(self._schedule.clock_time(self._next.first_step))

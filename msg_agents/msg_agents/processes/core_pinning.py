@@ -20,12 +20,12 @@ def available_cores() -> list[int]:
 def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) -> dict[str, int]:
     """A core for each process by name, where agent processes and recorder outnumber two or more cores; else empty.
 
-    In lockstep every message wakes the process that receives it. To wake it on another core costs an interrupt there,
-    and without pinning the scheduler spreads communicating processes over the cores: with two cores, the demo network
-    makes a third to a half fewer steps per second (docs/performance.md). ``plans`` must have the order of
-    ``plan_network``, so that neighbours share a core. Networks with successive values of ``first`` begin at different
-    cores, and so share them evenly. The switcher, which needs hardly any time, gets no core.
+    ``plans``: in the order of ``plan_network``, so that neighbours share a core. ``first``: index of the first core.
     """
+    # In lockstep every message wakes the process that receives it. To wake it on another core costs an interrupt there,
+    # and without pinning the scheduler spreads communicating processes over the cores: with two cores, the demo network
+    # makes a third to a half fewer steps per second (docs/performance.md). Networks with successive values of ``first``
+    # begin at different cores, and so share them evenly. The switcher, which needs hardly any time, gets no core.
     agents = sum(len(plan.agents) for plan in plans)
     loads = {
         plan.name: len(plan.agents) or RECORDING * agents for plan in plans if plan.agents or plan.name == RECORDER

@@ -25,6 +25,12 @@ def check_domain() -> None:
         raise InputError(f"ROS_DOMAIN_ID: {value}: expected a number from 0 to {LAST_DOMAIN}")
 
 
+def discovery_scope() -> str:
+    """Where the nodes of this process find others, as text."""
+    domain, reach = os.environ.get("ROS_DOMAIN_ID", "0"), os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    return f"in ROS_DOMAIN_ID {domain} and within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}"
+
+
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
     """Our environment with what the nodes need; another discovery range or profile of the user's is kept."""
     environment = {

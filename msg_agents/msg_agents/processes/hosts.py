@@ -23,7 +23,7 @@ from msg_agents.processes.environment import (
     PEERS_VARIABLE,
     node_environment,
 )
-from msg_agents.processes.process_plan import Share, most_processes
+from msg_agents.processes.process_plan import Share, wanted_processes
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show, translate
@@ -124,7 +124,7 @@ class Hosts:
                     )
                 )
         problems += [
-            problem(f"hosts.{name}.address", address, "is that of another host too", "give each host its own")
+            problem(f"hosts.{name}.address", address, "duplicate address", "give each host its own")
             for place, (name, address) in enumerate(addresses.items())
             if address in list(addresses.values())[:place]
         ]
@@ -139,12 +139,12 @@ class Hosts:
             known = ", ".join(self.agents)
             raise InputError(f"--name: {name}: no such host in the hosts file: expected one of {known}")
         if not self.agents[name] and name != self.recorder:
-            raise InputError(f"--name: {name}: has no agents and is not the recorder: nothing is to be done there")
+            raise InputError(f"--name: {name}: has no agents and is not the recorder: there is nothing to run on it")
         return Share(self.agents[name], name == self.recorder, discovery_timeout, patience)
 
     def participants(self, experiment: Experiment) -> int:
         """How many participants to look for on each host: more than run on any."""
-        most = max(most_processes(experiment, len(agents)) for agents in self.agents.values())
+        most = max(wanted_processes(experiment, len(agents)) for agents in self.agents.values())
         return min(most + 2 + VISITORS, MOST_PARTICIPANTS)
 
     def profile(self, experiment: Experiment) -> str:
@@ -196,7 +196,7 @@ def _mistakes(spec: HostsSpec, agents: int) -> list[str]:
     unknown = sorted(number for number in where if number > agents)
     if unknown:
         problems.append(
-            problem("agents", _listed(unknown), f"expected numbers from 1 to {agents}", "remove what there is not")
+            problem("agents", _listed(unknown), f"expected numbers from 1 to {agents}", "remove the others")
         )
     twice = {number: names for number, names in where.items() if len(names) > 1}
     if twice:

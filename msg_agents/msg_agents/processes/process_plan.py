@@ -21,11 +21,6 @@ MOST_PROCESSES = 90
 the switcher, the recorder and the user's own tools need some."""
 
 
-def agent_name(agent: int) -> str:
-    """Name of the node, and namespace of the topics, of an agent (index from 0; the name counts from 1)."""
-    return f"agent_{agent + 1}"
-
-
 @dataclass(frozen=True, slots=True)
 class ProcessPlan:
     """One process of a network."""
@@ -46,25 +41,25 @@ class Share:
     patience: float  # s that companions may be gone before a node ends itself
 
 
+def wanted_processes(experiment: Experiment, agents: int) -> int:
+    """Most processes that an experiment may have for so many agents, on a machine of any number of cores."""
+    wanted = experiment.run.processes
+    return min(agents, wanted) if isinstance(wanted, int) else agents
+
+
 def count_processes(experiment: Experiment, agents: int | None = None) -> int:
     """Number of processes for ``agents`` agents (None: all) on this machine; InputError: too many for discovery."""
-    agents, wanted = experiment.agents if agents is None else agents, experiment.run.processes
-    if wanted == "auto":
+    agents = experiment.agents if agents is None else agents
+    wanted, count = experiment.run.processes, wanted_processes(experiment, agents)
+    if wanted == "auto" and agents > SMALL:
         # A message to another process costs more than the step it is for: no more processes than can run at once.
-        return agents if agents <= SMALL else min(math.ceil(agents / SMALL), MOST_PROCESSES, os.cpu_count() or 1)
-    count = agents if wanted == "one_per_agent" else min(int(wanted), agents)
+        return min(math.ceil(agents / SMALL), MOST_PROCESSES, os.cpu_count() or 1)
     if count > MOST_PROCESSES:
         raise InputError(
             f"run.processes: {wanted} ({count} processes): expected at most {MOST_PROCESSES}, because discovery on one "
             "machine finds about 100 participants: give a smaller number, several agents share a process"
         )
     return count
-
-
-def most_processes(experiment: Experiment, agents: int) -> int:
-    """Most processes that an experiment may have for so many agents, on a machine of any number of cores."""
-    wanted = experiment.run.processes
-    return min(agents, MOST_PROCESSES, int(wanted) if isinstance(wanted, int) else agents)
 
 
 def discovery_timeout(agents: int, processes: int) -> float:

@@ -1,4 +1,4 @@
-"""The last states that an agent has published, in a file that outlives its process.
+"""The last states that an agent has published, in a file that remains when its process is killed.
 
 Every state is written before it is published. A process that takes over from a killed one resumes from there, and
 publishes again what may have been lost on the way. Any agent can also repeat what a restarted peer has missed.
@@ -11,28 +11,21 @@ import os
 import struct
 from pathlib import Path
 
-from msg_agents.stepping.synchronizer import AGAIN
+from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.errors import InputError
-from msg_analysis.model.run.record import RunRecord
 
-MOST, LEAST, ROOM = AGAIN, 256, 1 << 24
-"""States kept of each agent: as many as fit into ROOM bytes, between LEAST and MOST. Where possible, more than the
-5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
+MOST_KEPT, LEAST_KEPT, ROOM = RESEND_LIMIT, 256, 1 << 24
+"""States kept of each agent: as many as fit into ROOM bytes, from LEAST_KEPT to MOST_KEPT. Where possible, more than
+the 5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
 
 # Length of the message and step + 1, written after the message: 0 or the mark of an older step until it is whole.
 MARK = struct.Struct("<QQ")
 
 
-def longest_heard(record: RunRecord) -> int:
-    """The largest length that ``heard`` of a state message can have in a run."""
-    experiment = record.experiment
-    return experiment.agents - 1 if experiment.noise.loss or experiment.run.pace == "realtime" else 0
-
-
 def room_for(size: int) -> int:
     """Size of the checkpoint file of an agent whose longest message has ``size`` bytes."""
     slot = size + MARK.size
-    return slot * max(LEAST, min(MOST, ROOM // slot))
+    return slot * max(LEAST_KEPT, min(MOST_KEPT, ROOM // slot))
 
 
 class Checkpoint:
@@ -56,7 +49,8 @@ class Checkpoint:
             found = os.fstat(descriptor).st_size
             if found not in (0, total):
                 raise InputError(
-                    f"{path}: {found} bytes, expected {total}: it is of another run: remove it, or name another place"
+                    f"{path}: {found} bytes, expected {total}: it belongs to another run: remove it, or give another "
+                    "directory"
                 )
             self.found = bool(found)
             # Allocate all of it now: if the disk were full later, writing to the map would kill the process.
@@ -64,8 +58,8 @@ class Checkpoint:
             self._map = mmap.mmap(descriptor, total)
         except OSError as error:
             raise InputError(
-                f"{path}: no room for {total} bytes ({error.strerror}): name another place, or let nobody be started "
-                "again (--restarts 0)"
+                f"{path}: no room for {total} bytes ({error.strerror}): give another directory, or allow no restarts "
+                "(--restarts 0)"
             ) from error
         finally:
             os.close(descriptor)

@@ -32,8 +32,8 @@ _LATE = 1 << 30  # sequence number: higher than that of any announcement that th
 _REPEATS = 3  # datagrams may be lost
 
 
-class Succession:
-    """The right to run a node, which one process has at a time: a lock on the file ``path``, made if there is none.
+class Takeover:
+    """The right to run a node, which one process has at a time: a lock on the file ``path``, created if missing.
 
     ``predecessor``: GUID prefix of the last process; empty if there was none. InputError: another process has the lock.
     """
@@ -45,31 +45,31 @@ class Succession:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(
-                f"--checkpoint: another process is running {path.stem}: end it, or give another directory"
+                f"--checkpoint: another process is running {path.stem}: end that process, or give another directory"
             ) from None
         self.predecessor = os.read(self._descriptor, PREFIX_SIZE)
 
-    def enter(self, prefix: bytes) -> None:
+    def store_prefix(self, prefix: bytes) -> None:
         """Store the GUID prefix of this process for its successor."""
         os.pwrite(self._descriptor, prefix, 0)
 
 
-def succeed(directory: Path | None, names: Iterable[str]) -> list[Succession]:
-    """Take the right to run these nodes, and take the processes that ran them before off the network.
+def take_over(directory: Path | None, names: Iterable[str]) -> list[Takeover]:
+    """Get the right to run these nodes, and remove the processes that ran them before from the network.
 
     ``directory`` has a file per node; None: no takeover. InputError: another process is running one of the nodes.
     """
     if directory is None:
         return []
-    successions = [Succession(directory / f"{name}.participant") for name in names]
+    takeovers = [Takeover(directory / f"{name}.participant") for name in names]
     domain = int(os.environ.get("ROS_DOMAIN_ID") or 0)
-    for prefix in {s.predecessor for s in successions if len(s.predecessor) == PREFIX_SIZE}:
-        bury(prefix, domain)
-    return successions
+    for prefix in {t.predecessor for t in takeovers if len(t.predecessor) == PREFIX_SIZE}:
+        remove_participant(prefix, domain)
+    return takeovers
 
 
-def farewell(prefix: bytes, number: int = _LATE) -> bytes:
-    """The message by which the participant with this GUID prefix (12 bytes) takes itself off the network."""
+def disposal_message(prefix: bytes, number: int = _LATE) -> bytes:
+    """The message by which the participant with this GUID prefix (12 bytes) removes itself from the network."""
     parameters = (
         struct.pack("<HH", _KEY_HASH, 16)
         + prefix
@@ -85,13 +85,13 @@ def farewell(prefix: bytes, number: int = _LATE) -> bytes:
     return _HEADER + prefix + struct.pack("<BBH", _DATA, _LITTLE_ENDIAN | _INLINE_QOS, len(body)) + body
 
 
-def bury(prefix: bytes, domain: int) -> None:
-    """Tell every participant on the hosts of the run that one is gone; other machines wait for its lease to end."""
+def remove_participant(prefix: bytes, domain: int) -> None:
+    """Tell every participant on the hosts of the run that one has gone; on other machines its lease has to end."""
     base = PORT_BASE + PORTS_PER_DOMAIN * domain + 10  # the RTPS rule for the ports of discovery
     addresses = {"127.0.0.1", *os.environ.get(PEERS_VARIABLE, "").split()}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for repeat in range(_REPEATS):
-            message = farewell(prefix, _LATE + repeat)
+            message = disposal_message(prefix, _LATE + repeat)
             for address, participant in product(addresses, range(MOST_PARTICIPANTS)):
                 with contextlib.suppress(OSError):  # no participant there
                     sender.sendto(message, (address, base + 2 * participant))

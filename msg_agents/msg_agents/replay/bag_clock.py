@@ -9,7 +9,7 @@ from collections.abc import Callable
 from msg_analysis.model.arithmetic.step_clock import SECOND
 
 
-class PlayClock:
+class BagClock:
     """Time of a bag [ns], at ``rate`` seconds of the bag per second of wall time (inf: as fast as possible).
 
     It can be paused, and held back while nothing is played.

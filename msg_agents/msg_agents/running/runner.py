@@ -16,10 +16,10 @@ from msg_agents.processes.core_pinning import available_cores, place
 from msg_agents.processes.environment import RESTARTS, node_environment
 from msg_agents.processes.process_plan import Share, count_processes, plan_network
 from msg_agents.processes.ros_domain import free_domain
-from msg_agents.recovery.checkpoint import longest_heard, room_for
+from msg_agents.recovery.checkpoint import room_for
 from msg_agents.running.run_folder import workshop
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, Supervisor
-from msg_agents.stepping.stall_detection import Pace
+from msg_agents.stepping.stall_detection import StallDetector
 from msg_agents.terminal.interruption import Interruption
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.reader import read_bag
@@ -30,7 +30,7 @@ from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.messages import StateFrame
+from msg_analysis.wire.receiving import state_frame
 
 if TYPE_CHECKING:
     from msg_agents.watching.run_view import RunView
@@ -159,7 +159,7 @@ def run_network(
     result = RunResult(bag)
     try:
         record = record or new_record(experiment)
-        longest = StateFrame(record.run.bytes, experiment.width, longest_heard(record)).size
+        longest = state_frame(record, whole=True).size
         keeping = workshop(experiment.agents * room_for(longest)) if restarts else nullcontext()
         with workshop() as folder, keeping as checkpoints:
             run_file = folder / "run.json"
@@ -212,15 +212,15 @@ def _watch(
 ) -> None:
     """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
     began: float | None = None
-    pace = Pace()
+    stall = StallDetector()
     while interruption.caught is None and _revive(supervisor, result, restarts, on_note) and supervisor.awaited:
         time.sleep(POLL)
         supervisor.read_status()
         if view is not None:
             view.look(supervisor.steps)
         reached = min(supervisor.steps, default=-1)
-        if pace.look(sum(supervisor.steps)) and 0 <= reached < steps:
-            on_note(f"no step for {pace.stalled:.0f} s: {_standstill(supervisor)}")
+        if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
+            on_note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor)}")
         if reached < 0:
             continue
         now = time.monotonic()

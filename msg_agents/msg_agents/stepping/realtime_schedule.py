@@ -6,7 +6,7 @@ import math
 
 from msg_analysis.model.arithmetic.step_clock import SECOND, StepClock
 
-MARGIN = 1.0
+CLOCK_MARGIN = 1.0
 """s of the clock by which the clock of another host, or a message from there, may be ahead of ours."""
 
 
@@ -46,4 +46,4 @@ class Schedule:
 
     def reach(self, now: int) -> int:
         """Newest state that any agent can have when the clock says ``now`` [ns], if clocks agree to the margin."""
-        return max(0, math.floor(self.simulated(now + round(MARGIN * SECOND)) / self._dt) + 1)
+        return max(0, math.floor(self.simulated(now + round(CLOCK_MARGIN * SECOND)) / self._dt) + 1)

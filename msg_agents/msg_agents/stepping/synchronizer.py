@@ -9,34 +9,21 @@ the agent that is furthest behind is ahead of none, and all that it waits for ha
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any
 
-Value = TypeVar("Value")
+from msg_agents.stepping.agent_inputs import AgentInputs, Value
+from msg_analysis.wire.refusals import Refusal
 
-WINDOW = 64
+LOCKSTEP_WINDOW = 64
 """Steps that an agent may be ahead of a peer; small enough for a burst to fit a socket's receive buffer."""
 
-AGAIN = 6000
+RESEND_LIMIT = 6000
 """Most steps that an agent keeps, and sends again when another one was killed; older ones are never sent again."""
 
-KEPT = WINDOW
+KEPT_AFTER_USE = LOCKSTEP_WINDOW
 """Steps for which a value is kept after its use, to notice a different one for the same step: one of the two is forged.
 The true one may come second, when its sender, up to a window behind, makes that step."""
-
-
-class Refusal:
-    """Why a state or a sojourn was not taken."""
-
-    STRANGER = "not a peer"
-    OLD = "a step already done or already here"
-    PAST = "a step long past"
-    FAR = "a step that a peer cannot have reached"
-    SEQUENCE = "a sojourn out of sequence"
-    KNOWN = "a sojourn known already"
-    EARLY = "a sojourn before its time"
-    CONTRADICTION = "contradicts an earlier copy"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,37 +34,19 @@ class _Known:
     last: int
 
 
-class Synchronizer(Generic[Value]):
-    """The lockstep of one agent. Steps count from 0; x(0) is the start, the run ends at x(steps)."""
+class Synchronizer(AgentInputs[Value]):
+    """The lockstep of one agent; it may be ``window`` steps (>= 0) ahead of a peer. Other options as in AgentInputs."""
 
-    def __init__(
-        self,
-        *,
-        agent: int,
-        steps: int,  # N
-        inputs: Sequence[Sequence[int]],  # per mode, the other agents that the agent's row uses, ascending
-        peers: Collection[int],  # every other agent that it ever hears or is heard by; includes ``inputs``
-        window: int = WINDOW,  # steps that it may be ahead of a peer, >= 0
-        start: int = 0,  # the current step, after a takeover
-    ) -> None:
-        self.agent = agent
-        self.step = start
-        self.steps = steps
-        self._inputs = [tuple(row) for row in inputs]
+    def __init__(self, *, window: int = LOCKSTEP_WINDOW, **options: Any) -> None:
+        super().__init__(**options)
         self._window = window
-        self._buffers: dict[int, dict[int, Value]] = {j: {} for j in sorted(peers)}
-        self._newest = dict.fromkeys(self._buffers, -1)
-        self._limit = window - 1 if peers else steps
+        self._buffers: dict[int, dict[int, Value]] = {j: {} for j in self._newest}
+        self._limit = window - 1 if self._newest else self.steps
         self._known: deque[_Known] = deque()
-        # Of the next sojourn; None: after a takeover, when the sojourn that contains the step counts as the first.
-        self._sequence: int | None = 0 if start == 0 else None
-        self._unplanned = start  # first step whose graph is not known
+        self._unplanned = self.step  # first step whose graph is not known
         self._mode = 0  # of the next step, if its graph is known
         self._needed: tuple[int, ...] = ()  # by the next step
         self._missing = 1  # of them; never 0 while the graph is not known
-        missing = {j for row in inputs for j in row} - self._buffers.keys()
-        if missing:
-            raise ValueError(f"agent {agent} uses {sorted(missing)}, who are not among its peers {sorted(peers)}")
 
     def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
         """Take a sojourn (steps ``first_step`` to ``last_step``); None if taken, else a ``Refusal``.
@@ -86,13 +55,13 @@ class Synchronizer(Generic[Value]):
         """
         if self._sequence is None:
             if last_step < self.step:
-                return Refusal.KNOWN
+                return Refusal.REPEATED
             if not first_step <= self.step:
-                return Refusal.SEQUENCE
+                return Refusal.OUT_OF_SEQUENCE
         elif sequence < self._sequence:
-            return Refusal.KNOWN
+            return Refusal.REPEATED
         elif sequence != self._sequence or first_step != self._unplanned or last_step < first_step:
-            return Refusal.SEQUENCE
+            return Refusal.OUT_OF_SEQUENCE
         self._sequence = sequence + 1
         self._unplanned = last_step + 1
         self._known.append(_Known(mode, last_step))
@@ -104,19 +73,19 @@ class Synchronizer(Generic[Value]):
         """Take x_agent(step); None if taken, else a ``Refusal``."""
         buffer = self._buffers.get(agent)
         if buffer is None:
-            return Refusal.STRANGER
+            return Refusal.NOT_A_PEER
         if step < self.step or step in buffer:
             # Also of a peer that is behind: its value is of no use, but it shows the progress of the peer.
             if step in buffer and buffer[step] != value:
                 return Refusal.CONTRADICTION
-            if step < self.step - self._window - AGAIN:
-                return Refusal.PAST
+            if step < self.step - self._window - RESEND_LIMIT:
+                return Refusal.TOO_OLD
             if step <= self._newest[agent]:
-                return Refusal.OLD
+                return Refusal.REPEATED
             self._newest[agent] = step
             return None
         if step > self.step + self._window + 1:
-            return Refusal.FAR
+            return Refusal.TOO_NEW
         buffer[step] = value
         if step > self._newest[agent]:
             self._newest[agent] = step
@@ -137,7 +106,7 @@ class Synchronizer(Generic[Value]):
         """Move on to x(step + 1): the step that was ready has been made."""
         step = self.step
         for buffer in self._buffers.values():
-            buffer.pop(step - KEPT, None)
+            buffer.pop(step - KEPT_AFTER_USE, None)
         self.step = step + 1
         if self._known[0].last <= step:
             self._known.popleft()
@@ -158,11 +127,6 @@ class Synchronizer(Generic[Value]):
     def _within_window(self) -> bool:
         self._limit = min(self._newest.values()) + self._window
         return self.step <= self._limit
-
-    @property
-    def finished(self) -> bool:
-        """Whether x(steps) has been reached."""
-        return self.step >= self.steps
 
     def waiting_for(self) -> str:
         """What keeps the agent from its next step, as text (agents from 1)."""

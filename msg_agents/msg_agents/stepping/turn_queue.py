@@ -1,4 +1,4 @@
-"""Lets the agents of one process that can step do so one after the other. No ROS."""
+"""The agents of one process that can step do so one after the other. No ROS."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-SLICE = 0.02
+TURN_SLICE = 0.02
 """s of steps without a break, after which the executor gets its turn: messages, timers, signals."""
 
 
@@ -18,7 +18,7 @@ class Member(Protocol):
         """Make every step that can be made now."""
 
 
-class Turns:
+class TurnQueue:
     """Gives turns in the order in which they were asked for, once all ``members`` (a number) have joined.
 
     A step of one agent lets others step, and theirs others again: the queue replaces nested calls, which would go as
@@ -46,7 +46,7 @@ class Turns:
 
     def _give(self) -> None:
         self._given = True
-        queue, until = self._queue, time.monotonic() + SLICE
+        queue, until = self._queue, time.monotonic() + TURN_SLICE
         while queue:
             queue.popleft().advance()
             if time.monotonic() > until and queue:

@@ -10,23 +10,24 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_agents.processes.process_plan import agent_name
-from msg_agents.recovery.checkpoint import MARK, longest_heard, room_for
+from msg_agents.recovery.checkpoint import MARK, room_for
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
-from msg_analysis.wire.messages import STATE_MODE, StateFrame
+from msg_analysis.wire.messages import STATE_MODE
+from msg_analysis.wire.receiving import state_frame
+from msg_analysis.wire.topics import agent_name
 
 BLOCK = 2000
 """Steps that are taken at once: limits the memory that a large network needs."""
 
 
-class Tap:
+class CheckpointReader:
     """Reads whole steps from the checkpoints of the agents, each at most once, in order."""
 
     def __init__(self, record: RunRecord, directory: Path) -> None:
         experiment = record.experiment
         self._directory, self._agents, self._width = directory, experiment.agents, experiment.width
-        size = StateFrame(record.run.bytes, experiment.width, longest_heard(record)).size
+        size = state_frame(record, whole=True).size
         self._total, self._slot = room_for(size), size + MARK.size
         self._size, self._capacity = size, self._total // self._slot
         self._rings: list[AnyArray] = []  # (capacity, slot) bytes of each agent

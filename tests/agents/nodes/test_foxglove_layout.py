@@ -17,18 +17,15 @@ from diagnostic_msgs.msg import DiagnosticArray
 from msg_agents_interfaces.msg import ActiveGraph, AgentState, Estimate
 from visualization_msgs.msg import MarkerArray
 
-from msg_agents.nodes.diagnostics import DIAGNOSTICS_TOPIC
-from msg_agents.nodes.network_node import GRAPH_TOPIC, state_topic
-from msg_agents.nodes.watching.live import ESTIMATE_TOPIC
-from msg_agents.nodes.watching.markers import MARKERS_TOPIC
+from msg_analysis.wire import topics
 
 LAYOUT = Path(__file__).parents[3] / "ros_ws/src/msg_agents_bringup/foxglove/five_agents.json"
 TOPICS: dict[str, Any] = {
-    **{f"/{state_topic(agent)}": AgentState for agent in range(5)},
-    f"/{GRAPH_TOPIC}": ActiveGraph,
-    f"/{ESTIMATE_TOPIC}": Estimate,
-    f"/{MARKERS_TOPIC}": MarkerArray,
-    DIAGNOSTICS_TOPIC: DiagnosticArray,
+    **{f"/{topics.STATE.of(agent)}": AgentState for agent in range(5)},
+    f"/{topics.GRAPH.name}": ActiveGraph,
+    f"/{topics.ESTIMATE.name}": Estimate,
+    f"/{topics.MARKERS.name}": MarkerArray,
+    topics.DIAGNOSTICS.name: DiagnosticArray,
 }
 
 

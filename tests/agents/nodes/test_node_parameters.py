@@ -121,9 +121,9 @@ def test_the_command_line_wins_over_a_file_for_all_nodes(run_file: Path, tmp_pat
     }
     file.write_text(yaml.safe_dump(sections))
     by_file = start("agent", "--ros-args", "--params-file", file)
-    assert "after 1 s agent_1 had not found: agent_2" in by_file.stderr
+    assert "after 1 s agent_1 did not discover: agent_2" in by_file.stderr
     by_command = start("agent", "--agent", "2", "--ros-args", "--params-file", file)
-    assert "after 1 s agent_2 had not found: agent_1" in by_command.stderr
+    assert "after 1 s agent_2 did not discover: agent_1" in by_command.stderr
     assert (by_file.returncode, by_command.returncode) == (2, 2)
 
 
@@ -131,7 +131,7 @@ def test_the_command_line_wins_over_a_file_for_all_nodes(run_file: Path, tmp_pat
 def test_nodes_keep_their_names(run_file: Path, tmp_path: Path, rule: str) -> None:
     process = start("recorder", run_file, "--out", tmp_path / "bag", "--ros-args", "-r", rule)
     assert process.returncode == 2
-    assert "the nodes of a run know each other by their names" in process.stderr
+    assert "the nodes of a run find each other by name" in process.stderr
     assert not (tmp_path / "bag").exists()
 
 
@@ -139,14 +139,16 @@ QOS = """
 import sys
 import rclpy
 from msg_agents.nodes.ros.node_parameters import PROCESS
-from msg_agents.nodes.ros.qos import LATCHED, STREAM
-from msg_agents.nodes.ros.lean_node import QuietNode
+from msg_agents.nodes.ros.qos import ros_profile
+from msg_agents.nodes.ros.lean_node import LeanNode
 from msg_analysis.errors import InputError
+from msg_analysis.wire import topics
 from std_msgs.msg import String
 rclpy.init(args=sys.argv)
 PROCESS.qos_overrides = True
-node = QuietNode("one")
-for name, profile in (("state", STREAM), ("graph", LATCHED), ("free", 10)):
+node = LeanNode("one")
+STREAM = ros_profile(topics.STREAM)
+for name, profile in (("state", STREAM), ("graph", ros_profile(topics.LATCHED)), ("free", 10)):
     for create in (
         lambda: node.create_publisher(String, name, profile),
         lambda: node.create_subscription(String, name, print, profile),

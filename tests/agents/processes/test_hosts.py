@@ -126,7 +126,7 @@ def with_host(name: str, **host: Any) -> dict[str, Any]:
         (with_host("base", address="192.0.2.1", agents=[6]), "agents: [6]: expected numbers from 1 to 5"),
         (with_host("base", address="192.0.2.1", agents=[2]), "agents: [2]: expected each agent once: 2 is on base and"),
         (document(hosts={name: HOSTS[name] for name in ("base", "left")}), "agents: [2, 3, 5]: on no host"),
-        (with_host("base", address="192.0.2.3"), "hosts.right.address: 192.0.2.3: is that of another host too"),
+        (with_host("base", address="192.0.2.3"), "hosts.right.address: 192.0.2.3: duplicate address"),
         (with_host("base", address="300.0.2.1"), "hosts.base.address: 300.0.2.1: expected an IPv4 address"),
     ],
     ids=range(12),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from msg_agents.recovery.checkpoint import LEAST, Checkpoint
+from msg_agents.recovery.checkpoint import LEAST_KEPT, Checkpoint
 from msg_analysis.errors import InputError
 
 LARGE = 100_000  # bytes of a message, so that the ring has its least length
@@ -21,12 +21,12 @@ def message(step: int, size: int = LARGE) -> bytes:
     return step.to_bytes(8, "little") * (size // 8)
 
 
-@pytest.mark.parametrize("steps", [0, 1, 5, LEAST - 1, LEAST, LEAST + 1, 3 * LEAST + 7])
+@pytest.mark.parametrize("steps", [0, 1, 5, LEAST_KEPT - 1, LEAST_KEPT, LEAST_KEPT + 1, 3 * LEAST_KEPT + 7])
 def test_the_newest_are_kept(tmp_path: Path, steps: int) -> None:
     written = Checkpoint(tmp_path / "states", LARGE)
     for step in range(steps):
         written.write(step, message(step))
-    kept = range(max(0, steps - LEAST + 1), steps)
+    kept = range(max(0, steps - LEAST_KEPT + 1), steps)
     for ring in (written, Checkpoint(tmp_path / "states", LARGE)):
         assert ring.read() == [(step, message(step)) for step in kept]
         assert [step for step, _ in ring.read(steps - 3)] == [step for step in kept if step >= steps - 3]
@@ -36,11 +36,11 @@ def test_the_newest_are_kept(tmp_path: Path, steps: int) -> None:
 def test_messages_of_different_length(tmp_path: Path) -> None:
     """With lost messages, some list what was heard."""
     ring = Checkpoint(tmp_path / "states", LARGE)
-    for step in range(LEAST + 5):
+    for step in range(LEAST_KEPT + 5):
         ring.write(step, message(step, LARGE - 8 * (step % 3)))
     for again in (ring, Checkpoint(tmp_path / "states", LARGE)):
         assert all(data == message(step, LARGE - 8 * (step % 3)) for step, data in again.read())
-        assert len(again.read()) == LEAST - 1
+        assert len(again.read()) == LEAST_KEPT - 1
 
 
 def test_in_memory() -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from msg_agents.replay.bag_clock import PlayClock
+from msg_agents.replay.bag_clock import BagClock
 from msg_agents.replay.topic_selection import parse_remaps, select_topics
 from msg_analysis.errors import InputError
 from msg_analysis.model.arithmetic.step_clock import SECOND
@@ -30,7 +30,7 @@ def wall() -> Wall:
 
 
 def test_time_runs_at_the_rate(wall: Wall) -> None:
-    clock = PlayClock(5 * SECOND, 2.0, wall=wall)
+    clock = BagClock(5 * SECOND, 2.0, wall=wall)
     assert clock.until(6 * SECOND) == 0.5
     wall.time += 0.25
     assert clock.now(10 * SECOND) == 5.5 * SECOND
@@ -40,7 +40,7 @@ def test_time_runs_at_the_rate(wall: Wall) -> None:
 
 
 def test_time_never_passes_what_comes_next(wall: Wall) -> None:
-    clock = PlayClock(0, 1.0, wall=wall)
+    clock = BagClock(0, 1.0, wall=wall)
     wall.time += 9.0
     assert clock.now(3 * SECOND) == 3 * SECOND
     clock.pause(True, 3 * SECOND)
@@ -48,7 +48,7 @@ def test_time_never_passes_what_comes_next(wall: Wall) -> None:
 
 
 def test_paused_time_stands(wall: Wall) -> None:
-    clock = PlayClock(0, 1.0, paused=True, wall=wall)
+    clock = BagClock(0, 1.0, paused=True, wall=wall)
     wall.time += 5.0
     assert (clock.now(SECOND), clock.until(SECOND)) == (0, math.inf)
     clock.jump(SECOND)
@@ -63,14 +63,14 @@ def test_paused_time_stands(wall: Wall) -> None:
 
 
 def test_a_reader_that_holds_back_costs_no_time_of_the_bag(wall: Wall) -> None:
-    clock = PlayClock(0, 4.0, wall=wall)
+    clock = BagClock(0, 4.0, wall=wall)
     wall.time += 2.0
     clock.hold(1.5)
     assert clock.now(9 * SECOND) == 2 * SECOND
 
 
 def test_the_rate_changes_from_now_on(wall: Wall) -> None:
-    clock = PlayClock(0, 1.0, wall=wall)
+    clock = BagClock(0, 1.0, wall=wall)
     wall.time += 1.0
     clock.change_rate(2.0, 9 * SECOND)
     assert (clock.rate, clock.until(3 * SECOND)) == (2.0, 1.0)
@@ -79,7 +79,7 @@ def test_the_rate_changes_from_now_on(wall: Wall) -> None:
 
 
 def test_as_fast_as_it_goes(wall: Wall) -> None:
-    clock = PlayClock(0, math.inf, wall=wall)
+    clock = BagClock(0, math.inf, wall=wall)
     assert (clock.until(10**15), clock.now(7)) == (0.0, 7)
     clock.change_rate(1.1, 7)
     assert clock.rate == math.inf

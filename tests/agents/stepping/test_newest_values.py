@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.stepping.newest_values import NOTHING, Newest
-from msg_agents.stepping.synchronizer import Refusal
+from msg_agents.stepping.agent_inputs import NOTHING
+from msg_agents.stepping.newest_values import NewestValues
+from msg_analysis.wire.refusals import Refusal
 
 STEPS = 40
 INPUTS = [[1, 3], [3], []]
@@ -26,8 +27,8 @@ class Clock:
         return self.reach
 
 
-def newest(clock: Clock, start: int = 0) -> Newest[Any]:
-    return Newest(agent=0, steps=STEPS, inputs=INPUTS, peers=PEERS, reach=clock, start=start)
+def newest(clock: Clock, start: int = 0) -> NewestValues[Any]:
+    return NewestValues(agent=0, steps=STEPS, inputs=INPUTS, peers=PEERS, reach=clock, start=start)
 
 
 offers = st.tuples(st.just("offer"), st.integers(0, 5), st.integers(0, STEPS + 5))
@@ -49,11 +50,11 @@ def test_the_newest_that_can_be(script: list[tuple[Any, ...]]) -> None:
             agent, step = arguments
             reason = node.offer(agent, step, (agent, step))
             if agent not in PEERS:
-                assert reason == Refusal.STRANGER
+                assert reason == Refusal.NOT_A_PEER
             elif step <= max(taken[agent], default=-1):
-                assert reason == Refusal.OLD
+                assert reason == Refusal.REPEATED
             elif step > min(clock.reach, STEPS):
-                assert reason == Refusal.FAR
+                assert reason == Refusal.TOO_NEW
             else:
                 assert reason is None
                 taken[agent].append(step)
@@ -69,9 +70,9 @@ def test_graphs_come_in_sequence(offered: list[tuple[int, int, int, int]]) -> No
     for sojourn in path:
         for other in offered:
             if other[:3:2] != sojourn[:3:2]:  # neither number nor first step fit
-                assert node.learn(*other) in (Refusal.KNOWN, Refusal.SEQUENCE)
+                assert node.learn(*other) in (Refusal.REPEATED, Refusal.OUT_OF_SEQUENCE)
         assert node.learn(*sojourn) is None
-        assert node.learn(*sojourn) in (Refusal.KNOWN, Refusal.SEQUENCE)
+        assert node.learn(*sojourn) in (Refusal.REPEATED, Refusal.OUT_OF_SEQUENCE)
         mode, inputs = node.inputs()
         assert mode == sojourn[1]
         assert inputs == [(NOTHING, None) for _ in INPUTS[mode]]
@@ -85,10 +86,10 @@ def test_a_sojourn_before_its_time() -> None:
     assert node.waiting_for() == "the first graph"
     assert node.learn(0, 1, 0, 7) is None
     assert node.ready()
-    assert node.learn(1, 0, 8, 20) == Refusal.EARLY
+    assert node.learn(1, 0, 8, 20) == Refusal.TOO_EARLY
     assert node.inputs()[0] == 1
     clock.reach = 30
-    assert node.learn(0, 1, 0, 7) == Refusal.KNOWN
+    assert node.learn(0, 1, 0, 7) == Refusal.REPEATED
     assert node.learn(2, 2, 21, STEPS - 1) is None
     assert node.inputs()[0] == 2
 
@@ -97,7 +98,7 @@ def test_who_takes_over_comes_into_the_middle() -> None:
     node = newest(Clock(), start=17)
     assert node.learn(3, 0, 12, 14) is None
     assert node.learn(4, 1, 15, 22) is None
-    assert node.learn(6, 1, 30, 32) == Refusal.SEQUENCE
+    assert node.learn(6, 1, 30, 32) == Refusal.OUT_OF_SEQUENCE
     assert (node.step, node.inputs()) == (17, (1, [(NOTHING, None)]))
     assert node.offer(3, 16, "a") is None
     assert node.offer(3, 18, "b") is None
@@ -127,10 +128,10 @@ def test_the_end() -> None:
     assert node.finished
     assert not node.ready()
     assert node.waiting_for() == "nothing, it has finished"
-    assert node.learn(1, 0, STEPS, STEPS) == Refusal.SEQUENCE
-    assert node.offer(1, STEPS + 1, "") == Refusal.FAR
+    assert node.learn(1, 0, STEPS, STEPS) == Refusal.OUT_OF_SEQUENCE
+    assert node.offer(1, STEPS + 1, "") == Refusal.TOO_NEW
 
 
 def test_inputs_must_be_peers() -> None:
     with pytest.raises(ValueError, match="agent 0 uses"):
-        Newest(agent=0, steps=STEPS, inputs=[[2]], peers=[1], reach=Clock())
+        NewestValues(agent=0, steps=STEPS, inputs=[[2]], peers=[1], reach=Clock())

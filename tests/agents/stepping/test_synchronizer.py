@@ -17,7 +17,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from msg_agents.stepping.synchronizer import AGAIN, WINDOW, Refusal, Synchronizer
+from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, RESEND_LIMIT, Synchronizer
+from msg_analysis.wire.refusals import Refusal
 
 PRIME = 2**61 - 1
 Sojourn = tuple[int, int, int, int]  # sequence, mode, first step, last step
@@ -113,10 +114,10 @@ class Network:
         node = self.nodes[target]
         if kind == "state":
             refused = node.offer(source, *self.links[source, target].popleft())
-            assert refused in ((None, Refusal.OLD) if self.killed else (None,))
+            assert refused in ((None, Refusal.REPEATED) if self.killed else (None,))
         elif kind == "graph":
             refused = node.learn(*self.graphs[target].popleft())
-            assert refused in ((None, Refusal.KNOWN) if self.killed else (None,))
+            assert refused in ((None, Refusal.REPEATED) if self.killed else (None,))
         elif kind == "again":
             self.unheard.discard((source, target))
             first = max(0, node.step - self.case.window - 1)
@@ -264,13 +265,13 @@ def everything(node: Synchronizer[str]) -> object:
 @pytest.mark.parametrize(
     ("agent", "step", "reason"),
     [
-        (2, 0, Refusal.STRANGER),
-        (0, 0, Refusal.STRANGER),
-        (-1, 0, Refusal.STRANGER),
+        (2, 0, Refusal.NOT_A_PEER),
+        (0, 0, Refusal.NOT_A_PEER),
+        (-1, 0, Refusal.NOT_A_PEER),
         (1, 0, Refusal.CONTRADICTION),
         (1, 1, Refusal.CONTRADICTION),
-        (1, 5, Refusal.FAR),
-        (1, 2**64 - 1, Refusal.FAR),
+        (1, 5, Refusal.TOO_NEW),
+        (1, 2**64 - 1, Refusal.TOO_NEW),
     ],
 )
 def test_refused_states_change_nothing(agent: int, step: int, reason: str) -> None:
@@ -282,40 +283,40 @@ def test_refused_states_change_nothing(agent: int, step: int, reason: str) -> No
     before = everything(node)
     assert node.offer(agent, step, "forged") == reason
     assert everything(node) == before
-    assert [node.offer(1, 0, "zero"), node.offer(1, 1, "one")] == [Refusal.OLD] * 2  # the true ones again
+    assert [node.offer(1, 0, "zero"), node.offer(1, 1, "one")] == [Refusal.REPEATED] * 2  # the true ones again
     assert everything(node) == before
     assert make_step(node) == (0, ["one"])
 
 
 def test_another_value_is_noticed_for_as_long_as_the_true_one_can_take() -> None:
     """Whoever forges a message is heard first and used; the true one comes at most a window of steps later."""
-    node = pair(window=WINDOW, steps=10 * WINDOW)
-    node.learn(0, 0, 0, 10 * WINDOW - 1)
-    for k in range(2 * WINDOW):
+    node = pair(window=LOCKSTEP_WINDOW, steps=10 * LOCKSTEP_WINDOW)
+    node.learn(0, 0, 0, 10 * LOCKSTEP_WINDOW - 1)
+    for k in range(2 * LOCKSTEP_WINDOW):
         assert node.offer(1, k, f"{k}") is None
         make_step(node)
-    assert node.offer(1, WINDOW, "forged") == Refusal.CONTRADICTION
-    assert node.offer(1, WINDOW - 1, "forged") == Refusal.OLD
+    assert node.offer(1, LOCKSTEP_WINDOW, "forged") == Refusal.CONTRADICTION
+    assert node.offer(1, LOCKSTEP_WINDOW - 1, "forged") == Refusal.REPEATED
     assert node.buffered == 0
 
 
 def test_what_is_long_past_is_no_repetition() -> None:
     node: Synchronizer[str] = Synchronizer(
-        agent=0, steps=10**6, inputs=[[1]], peers=[1], start=AGAIN + 100, window=WINDOW
+        agent=0, steps=10**6, inputs=[[1]], peers=[1], start=RESEND_LIMIT + 100, window=LOCKSTEP_WINDOW
     )
-    assert node.offer(1, AGAIN + 100, "now") is None
-    assert node.offer(1, 100 - WINDOW, "the oldest that is sent again") == Refusal.OLD
-    assert node.offer(1, 99 - WINDOW, "forged") == Refusal.PAST
+    assert node.offer(1, RESEND_LIMIT + 100, "now") is None
+    assert node.offer(1, 100 - LOCKSTEP_WINDOW, "the oldest that is sent again") == Refusal.REPEATED
+    assert node.offer(1, 99 - LOCKSTEP_WINDOW, "forged") == Refusal.TOO_OLD
 
 
 @pytest.mark.parametrize(
     ("sequence", "first", "last", "reason"),
     [
-        (0, 0, 4, Refusal.KNOWN),
-        (2, 5, 9, Refusal.SEQUENCE),
-        (1, 6, 9, Refusal.SEQUENCE),
-        (1, 4, 9, Refusal.SEQUENCE),
-        (1, 5, 4, Refusal.SEQUENCE),
+        (0, 0, 4, Refusal.REPEATED),
+        (2, 5, 9, Refusal.OUT_OF_SEQUENCE),
+        (1, 6, 9, Refusal.OUT_OF_SEQUENCE),
+        (1, 4, 9, Refusal.OUT_OF_SEQUENCE),
+        (1, 5, 4, Refusal.OUT_OF_SEQUENCE),
     ],
     ids=["again", "one left out", "gap", "overlap", "empty"],
 )
@@ -332,7 +333,7 @@ def test_the_farthest_possible_step_is_taken() -> None:
     node = pair(window=2)
     assert [node.offer(1, k, str(k)) for k in range(4)] == [None] * 4
     assert node.buffered == 4
-    assert node.offer(1, 4, "4") == Refusal.FAR
+    assert node.offer(1, 4, "4") == Refusal.TOO_NEW
 
 
 def test_a_peer_without_a_link_still_holds_back() -> None:
@@ -342,7 +343,7 @@ def test_a_peer_without_a_link_still_holds_back() -> None:
     assert not node.ready()
     assert node.waiting_for() == "agents too far behind: 2"
     assert node.offer(1, 0, "0") is None  # of no use any more, but it shows that the peer moves
-    assert node.offer(1, 0, "0") == Refusal.OLD
+    assert node.offer(1, 0, "0") == Refusal.REPEATED
     assert node.ready()
     assert node.buffered == 0
 

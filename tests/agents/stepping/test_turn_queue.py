@@ -1,4 +1,4 @@
-"""Turns of the agents of one process."""
+"""TurnQueue of the agents of one process."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from msg_agents.stepping import turn_queue
-from msg_agents.stepping.turn_queue import Turns
+from msg_agents.stepping.turn_queue import TurnQueue
 
 
 class Player:
@@ -25,7 +25,7 @@ class Player:
 class Game:
     def __init__(self, players: int, length: int) -> None:
         self.deferred: list[Callable[[], None]] = []
-        self.turns = Turns(players, self.deferred.append)
+        self.turns = TurnQueue(players, self.deferred.append)
         self.seen: list[int] = []
         self.length = length
         self.players = [Player(self, number) for number in range(players)]
@@ -46,7 +46,7 @@ def test_nobody_before_all_have_joined() -> None:
 
 def test_as_long_as_it_takes_without_nesting(monkeypatch: pytest.MonkeyPatch) -> None:
     """Many more turns than Python allows nested calls."""
-    monkeypatch.setattr(turn_queue, "SLICE", 1e9)
+    monkeypatch.setattr(turn_queue, "TURN_SLICE", 1e9)
     game = Game(3, 50_000)
     for player in game.players:
         game.turns.join(player)
@@ -56,7 +56,7 @@ def test_as_long_as_it_takes_without_nesting(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_the_middleware_gets_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     """A slice that is over at once: one turn, then everything else; whoever asks meanwhile waits for his."""
-    monkeypatch.setattr(turn_queue, "SLICE", -1.0)
+    monkeypatch.setattr(turn_queue, "TURN_SLICE", -1.0)
     game = Game(2, 6)
     for player in game.players:
         game.turns.join(player)

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_agents.processes.process_plan import agent_name
-from msg_agents.recovery.checkpoint import Checkpoint, longest_heard
-from msg_agents.watching.checkpoint_reader import BLOCK, Tap
+from msg_agents.recovery.checkpoint import Checkpoint
+from msg_agents.watching.checkpoint_reader import BLOCK, CheckpointReader
 from msg_agents.watching.run_observer import Observer
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.arithmetic.payload import to_payload
@@ -18,7 +17,9 @@ from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.simulate import simulate
-from msg_analysis.wire.messages import StateCodec, StateFrame
+from msg_analysis.wire.messages import StateCodec
+from msg_analysis.wire.receiving import state_frame
+from msg_analysis.wire.topics import agent_name
 
 
 def _experiment(duration: float = 20, **changes: Any) -> Experiment:
@@ -37,7 +38,7 @@ class Writers:
     def __init__(self, trajectory: Trajectory, directory: Path) -> None:
         self.record: RunRecord = trajectory.record
         experiment, run = self.record.experiment, self.record.run.bytes
-        frame = StateFrame(run, experiment.width, longest_heard(self.record))
+        frame = state_frame(self.record, whole=True)
         self._trajectory, self._done = trajectory, -1
         self._files = [Checkpoint(directory / f"{agent_name(i)}.states", frame.size) for i in range(experiment.agents)]
         self._codecs = [
@@ -58,38 +59,38 @@ class Writers:
 @pytest.mark.parametrize("noise", [{}, {"loss": 0.1}])
 def test_gives_what_was_written(tmp_path: Path, noise: dict[str, float]) -> None:
     trajectory = simulate(_experiment(noise={"process": 1.0, **noise}))
-    tap = Tap(trajectory.record, tmp_path)
-    assert not tap.ready()
+    reader = CheckpointReader(trajectory.record, tmp_path)
+    assert not reader.ready()
     writers = Writers(trajectory, tmp_path)
-    assert tap.ready()
-    assert not len(tap.take(-1)[0])
+    assert reader.ready()
+    assert not len(reader.take(-1)[0])
     seen = []
     for last in (0, 1, 2, 150, 150, 400):
         writers.write(last)
-        steps, modes, states, after = tap.take(last)
+        steps, modes, states, after = reader.take(last)
         seen += steps.tolist()
         assert np.array_equal(modes, trajectory.modes[steps])
         assert np.array_equal(states, trajectory.states[steps])
         assert np.array_equal(after, trajectory.states[steps + 1])
     assert seen == list(range(400))
-    assert tap.missed == 0
+    assert reader.missed == 0
 
 
 def test_what_was_written_over_is_missed(tmp_path: Path) -> None:
     """The ring has room for 6000 steps; half of that is read, so that nothing is read while it is written over."""
     trajectory = simulate(_experiment(duration=500))
     writers = Writers(trajectory, tmp_path)
-    tap = Tap(trajectory.record, tmp_path)
+    reader = CheckpointReader(trajectory.record, tmp_path)
     writers.write(100)
-    assert tap.ready()
-    assert tap.take(100)[0].tolist() == list(range(100))
+    assert reader.ready()
+    assert reader.take(100)[0].tolist() == list(range(100))
     writers.write(9000)
     seen = []
-    while len(found := tap.take(9000)[0]):
+    while len(found := reader.take(9000)[0]):
         assert len(found) <= BLOCK
         seen += found.tolist()
     assert seen == list(range(6000, 9000))
-    assert tap.missed == 5900
+    assert reader.missed == 5900
 
 
 def test_half_written_states_do_not_count(tmp_path: Path) -> None:
@@ -97,15 +98,15 @@ def test_half_written_states_do_not_count(tmp_path: Path) -> None:
     writers = Writers(trajectory, tmp_path)
     writers.write(50)
     path = tmp_path / "agent_2.states"
-    size = StateFrame(trajectory.record.run.bytes, 2).size
+    size = state_frame(trajectory.record, whole=True).size
     data = bytearray(path.read_bytes())
     data[20 * (size + 16) + size + 8 : 20 * (size + 16) + size + 16] = bytes(8)  # the mark of step 20
     path.write_bytes(data)
-    tap = Tap(trajectory.record, tmp_path)
-    assert tap.ready()
-    steps = tap.take(50)[0].tolist()
+    reader = CheckpointReader(trajectory.record, tmp_path)
+    assert reader.ready()
+    steps = reader.take(50)[0].tolist()
     assert steps == [k for k in range(50) if k not in (19, 20)]  # a step needs the state after it, too
-    assert tap.missed == 2
+    assert reader.missed == 2
 
 
 def test_the_observer_has_the_numbers_of_the_comparison(tmp_path: Path) -> None:

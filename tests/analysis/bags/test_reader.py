@@ -229,7 +229,7 @@ def test_copies_with_another_graph_contradict(tmp_path: Path, make_run: MakeRun)
     copies = [("/agent_1/state", AGENT_STATE.full_name, forged.encode(), 5)]
     copies += [("/agent_2/state", AGENT_STATE.full_name, deaf.encode(), 5)]
     found = read_bag(_mcap(tmp_path / "x.mcap", _messages(run) + copies))
-    assert found.completeness.refused == {"contradicts an earlier copy": 1, "heard what it cannot have": 1}
+    assert found.completeness.refused == {"contradicts an earlier copy": 1, "impossible entry in heard": 1}
     assert (found.completeness.duplicates, found.completeness.missing) == (1, 1)
     assert np.argwhere(~found.present).tolist() == [[4, 0]]
 

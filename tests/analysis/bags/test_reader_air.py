@@ -126,7 +126,7 @@ def test_what_cannot_have_been_heard_is_refused(tmp_path: Path, run: Trajectory,
         return dataclasses.replace(state, heard=steps) if (state.agent, state.step, kind) == (2, k, "truth") else state
 
     found = read_bag(bag(tmp_path / "x.mcap", messages(run, change)))
-    assert found.completeness.refused == {"heard what it cannot have": 1}
+    assert found.completeness.refused == {"impossible entry in heard": 1}
     assert found.completeness.missing == 1
     assert np.isnan(found.states[k, 1]).all()
     assert found.prefix == k - 1

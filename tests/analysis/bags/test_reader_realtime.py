@@ -117,7 +117,7 @@ def test_what_cannot_have_been_heard_is_refused(tmp_path: Path, run: Trajectory,
         return dataclasses.replace(state, heard=np.array(heard, np.uint64)) if there else state
 
     found = read_bag(bag(tmp_path / "x.mcap", messages(run, change)))
-    assert found.completeness.refused == {"heard what it cannot have": 1}
+    assert found.completeness.refused == {"impossible entry in heard": 1}
     assert found.completeness.missing == 1
     assert found.made is not None
     assert found.used is not None

@@ -116,7 +116,7 @@ def _rules(messages: list[Any], kind: str) -> dict[str, Any]:
             "unknown mode": message.mode > 2,
             "not finite": not np.isfinite(message.state).all(),
             "stamped before the start": kind == "realtime" and stamp < 0,
-            "heard what it cannot have": not silent
+            "impossible entry in heard": not silent
             and (len(heard) != expected or any(step not in possible for step in heard)),
         }
         reason = next((reason for reason, holds in reasons.items() if holds), None)

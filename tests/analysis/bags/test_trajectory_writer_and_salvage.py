@@ -27,7 +27,7 @@ from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.wire.messages import encode_string
-from msg_analysis.wire.schemas import network_topics
+from msg_analysis.wire.topics import network_topics
 
 MakeRun = Callable[..., Trajectory]
 

@@ -23,7 +23,7 @@ from msg_analysis.bags.writer import BagWriter, recording_pid
 from msg_analysis.errors import BagError
 from msg_analysis.report.documents.info import describe_bag
 from msg_analysis.wire.messages import StateCodec, encode_string, stamp_ns
-from msg_analysis.wire.schemas import network_topics
+from msg_analysis.wire.topics import network_topics
 
 RUN = bytes(range(16))
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import msg_analysis.wire
-from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType, network_topics
+from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType
 
 DEFINITIONS = Path(msg_analysis.wire.__file__).parent / "definitions"
 INTERFACES = Path(__file__).parents[3] / "ros_ws" / "src" / "msg_agents_interfaces"
@@ -43,21 +43,3 @@ def test_schema_lists_every_dependency_once() -> None:
     parts = AGENT_STATE.schema.split("\n" + "=" * 80 + "\nMSG: ")
     assert [part.split("\n", 1)[0] for part in parts[1:]] == ["std_msgs/Header", "builtin_interfaces/Time"]
     assert "=====" not in STRING.schema
-
-
-def test_topics() -> None:
-    assert [topic.name for topic in network_topics(2)] == [
-        "/experiment",
-        "/graph",
-        "/agent_1/state",
-        "/agent_2/state",
-    ]
-    assert [topic.name for topic in network_topics(2, truth=True)][2:] == [
-        "/agent_1/state",
-        "/agent_2/state",
-        "/agent_1/truth",
-        "/agent_2/truth",
-    ]
-    named = network_topics(1, "/lab/")
-    assert [topic.name for topic in named] == ["/lab/experiment", "/lab/graph", "/lab/agent_1/state"]
-    assert [topic.qos[0]["durability"] for topic in named] == ["transient_local", "transient_local", "volatile"]

@@ -8,14 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.wire.refusals import Refusal
 
 SPREAD = 64  # steps that neighbours can be apart in lockstep
-RESENT = 5_000  # states of one agent that may arrive late because they have to be sent again: a writer's history
+WRITER_HISTORY = 5_000  # states of one agent that may arrive late, after they were sent again
 MOST_WAITING = 20_000  # incomplete steps kept, at most
-
-LATE, AGAIN, OUT_OF_RANGE = "too late", "received again", "step out of range"
-CONTRADICTION = "contradicts an earlier copy"
-NOT_FINITE, DISAGREEMENT = "not finite", "agents used different graphs"
 
 
 @dataclass(slots=True)
@@ -38,7 +35,7 @@ class StepCollector:
 
     def __init__(self, agents: int, modes: int, last: int, *, lockstep: bool) -> None:
         self._agents, self._modes, self._last, self._lockstep = agents, modes, last, lockstep
-        self._window = min(SPREAD * (agents + 1) + RESENT, MOST_WAITING)
+        self._window = min(SPREAD * (agents + 1) + WRITER_HISTORY, MOST_WAITING)
         self._rows: dict[int, _Row] = {}
         self._low = 0  # earlier steps are no longer kept
         self._ready: list[tuple[int, int, bytes, bytes]] = []  # step, mode, states, those after it
@@ -53,7 +50,7 @@ class StepCollector:
         row = self._rows.get(step)
         if row is None:
             if not self._low <= step <= self._last:
-                self.refused[LATE if step < self._low else OUT_OF_RANGE] += 1
+                self.refused[Refusal.TOO_LATE if step < self._low else Refusal.OUT_OF_RANGE] += 1
                 return
             if step > self.newest:
                 self.newest = step
@@ -61,17 +58,17 @@ class StepCollector:
             row = self._rows[step] = _Row([None] * self._agents, self._agents, mode)
         before = row.payloads[agent]
         if before is not None:
-            self.refused[AGAIN] += 1
+            self.refused[Refusal.REPEATED] += 1
             differs = before != payload or (self._lockstep and mode != row.mode)
             if differs and row.usable:
                 row.usable = False  # which copy is genuine is unknown
-                self.refused[CONTRADICTION] += 1
+                self.refused[Refusal.CONTRADICTION] += 1
             return
         row.payloads[agent] = payload
         row.left -= 1
         if mode != row.mode and self._lockstep and row.usable:
             row.usable = False
-            self.refused[DISAGREEMENT] += 1
+            self.refused[Refusal.OTHER_MODES] += 1
         if not row.left:
             self._complete(step, row)
 
@@ -88,7 +85,7 @@ class StepCollector:
         states = np.frombuffer(b"".join([entry[2] for entry in ready]), "<f8").reshape(shape)
         after = np.frombuffer(b"".join([entry[3] for entry in ready]), "<f8").reshape(shape)
         good = np.isfinite(states).all(axis=(1, 2)) & np.isfinite(after).all(axis=(1, 2))
-        self.refused[NOT_FINITE] += int((~good).sum())
+        self.refused[Refusal.NOT_FINITE] += int((~good).sum())
         return steps[good], modes[good], states[good], after[good]
 
     def _complete(self, step: int, row: _Row) -> None:

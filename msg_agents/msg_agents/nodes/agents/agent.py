@@ -5,31 +5,30 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from msg_agents_interfaces.msg import AgentState as AgentStateMsg
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 
-from msg_agents.nodes.network_node import NetworkNode, state_topic, truth_topic
-from msg_agents.nodes.ros.qos import STREAM
-from msg_agents.processes.process_plan import RECORDER, agent_name
-from msg_agents.recovery.checkpoint import Checkpoint, longest_heard
-from msg_agents.stepping.stall_detection import Pace
-from msg_agents.stepping.turn_queue import Turns
+from msg_agents.nodes.network_node import NetworkNode
+from msg_agents.processes.process_plan import RECORDER
+from msg_agents.recovery.checkpoint import Checkpoint
+from msg_agents.stepping.stall_detection import StallDetector
+from msg_agents.stepping.turn_queue import TurnQueue
 from msg_analysis.errors import InputError
 from msg_analysis.model.run.agent_law import agent_law
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.step_model import Wiring
-from msg_analysis.wire.messages import ActiveGraph, StateCodec, StateFrame, with_state
-
-NOT_FINITE = "not finite"
+from msg_analysis.wire import topics
+from msg_analysis.wire.messages import ActiveGraph, StateCodec, with_state
+from msg_analysis.wire.receiving import state_frame, state_receiver
+from msg_analysis.wire.topics import agent_name
 
 
 class Group(Protocol):
     """What an agent needs from the agents of its process together: see AgentGroup."""
 
-    turns: Turns
+    turns: TurnQueue
     progress_period: float
 
     def report(self, agent: int, step: int) -> None:
@@ -65,8 +64,8 @@ class Agent(NetworkNode):
         experiment = record.experiment
         self._law = agent_law(record, model, agent)
         self._codec = StateCodec(self.run, agent + 1, experiment.width, experiment.step_length)
-        self._frame = StateFrame(self.run, experiment.run.replicas, longest_heard(record))
-        self._whole = StateFrame(self.run, experiment.width, longest_heard(record))
+        self._frame = state_frame(record, whole=False)
+        self._whole = state_frame(record, whole=True)
         self._published = Checkpoint(checkpoints and checkpoints / f"{agent_name(agent)}.states", self._whole.size)
         self._resumed = self._take_over()
         self._group = group
@@ -75,32 +74,32 @@ class Agent(NetworkNode):
         near = set(peers).intersection(colleagues)
         self._far = [j for j in peers if j not in near]
         self._near = [j for j in peers if j in near]
-        self._listeners: list[Callable[[int, int, Any], None]] = []
+        self._listeners: list[Callable[[int, int, int, bytes, bytes], str | None]] = []
         self._expected = [*map(agent_name, self._far), *readers]
         self._next_progress = 0.0
-        self._pace = Pace()
-        self._states = self.create_publisher(AgentStateMsg, state_topic(agent), STREAM)
+        self._stall = StallDetector()
+        self._states = self.publisher_of(topics.STATE, agent)
         self._truth: Publisher | None = None
         if experiment.truth:
-            self._truth = self.create_publisher(AgentStateMsg, truth_topic(agent), STREAM)
+            self._truth = self.publisher_of(topics.TRUTH, agent)
             self._awaits_truth = [name for name in readers if name == RECORDER]  # others need only what agents hear
 
-    def meet(self, colleagues: Mapping[int, Agent]) -> None:
+    def connect(self, colleagues: Mapping[int, Agent]) -> None:
         """Connect to the peers: agents of this process (by index) by direct calls, the others by topics."""
         self._listeners = [colleagues[j].hear for j in self._near]
         for j in self._far:
-            self.create_subscription(AgentStateMsg, state_topic(j), self._receiver(j), STREAM, raw=True)
+            self.subscribe(topics.STATE, self._receiver(j), agent=j)
 
-    def host(self, agents: Sequence[Agent]) -> None:
+    def create_shared(self, agents: Sequence[Agent]) -> None:
         """Create what a process needs only once. Called on its first agent, with all its agents."""
 
-    def found(self) -> bool:
+    def discovered_all(self) -> bool:
         """See NetworkNode."""
         return self.has_readers(self._states, self._expected) and (
             self._truth is None or self.has_readers(self._truth, self._awaits_truth)
         )
 
-    def awaited(self) -> list[str]:
+    def missing_nodes(self) -> list[str]:
         """See NetworkNode."""
         missing = self.missing_readers(self._states, self._expected)
         if self._truth is not None:
@@ -110,7 +109,7 @@ class Agent(NetworkNode):
     def finish(self, *, complete: bool, deadline: float) -> None:
         """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""
         for writer in (self._states, self._truth):
-            if complete and writer is not None and self.has_guests(writer):
+            if complete and writer is not None and self.has_other_readers(writer):
                 writer.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
 
     def begin(self) -> None:
@@ -130,8 +129,8 @@ class Agent(NetworkNode):
             frame = self._whole.unwrap(message)
             if frame is None or frame[:2] != (self._law.agent + 1, step):
                 raise InputError(
-                    f"--checkpoint: what is kept for {self.get_name()} is of another run than the run record: remove "
-                    "it, or give another directory"
+                    f"--checkpoint: the file of {self.get_name()} belongs to another run: remove it, or "
+                    "give another directory"
                 )
             self._law.resume(step, frame[3])
             return message
@@ -141,9 +140,9 @@ class Agent(NetworkNode):
         law = self._law
         message = self._codec.wrap(law.step, mode, law.state, law.heard)
         self._published.write(law.step, message)
-        self._send(law.step, law.state, message)
+        self._send(law.step, mode, law.state, message)
 
-    def _send(self, step: int, state: bytes, message: bytes) -> None:
+    def _send(self, step: int, mode: int, state: bytes, message: bytes) -> None:
         """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it."""
         if self._truth is not None:
             self.publish(self._truth, message)
@@ -151,7 +150,7 @@ class Agent(NetworkNode):
             message = with_state(message, state, len(whole))
         self.publish(self._states, message)
         for hear in self._listeners:
-            hear(self._law.agent, step, state)
+            hear(self._law.agent, step, mode, state, message)
 
     def send_again(self, since: int) -> None:
         """Repeat the states from step ``since`` on, for a reader that may have missed them."""
@@ -161,23 +160,26 @@ class Agent(NetworkNode):
         """Repeat the kept states from step ``since`` on; what others hear is derived from the exact states."""
         for step, message in self._published.read(since):
             frame = self._whole.unwrap(message)
-            assert frame is not None, "of our own making"
-            self._send(step, frame[3], message)
+            assert frame is not None, "written by this software"
+            self._send(step, frame[2], frame[3], message)
 
     def _ask_again(self) -> None:
         """Ask the peers in other processes for states that may have been missed."""
         raise NotImplementedError
 
     def _receiver(self, peer: int) -> Callable[[bytes], None]:
-        """The callback for a peer's states (hot path)."""
-        raise NotImplementedError
+        """The callback for a peer's states."""
+        topic = topics.STATE.of(peer)
+        return state_receiver(
+            self.record, peer, self._frame, self.hear, lambda reason: self.refuse(reason, topic), finite=True
+        )
 
-    def hear(self, peer: int, step: int, value: Any) -> None:
-        """Take x_peer(step) by a direct call from an agent of the same process (index from 0)."""
+    def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:
+        """Take x_peer(step), from a topic or a direct call; the reason if refused, else None. ``peer``: from 0."""
         raise NotImplementedError
 
     def learn(self, graph: ActiveGraph) -> str | None:
-        """Take note of a sojourn of the graph; the reason if it is refused, else None."""
+        """Take a sojourn of the graph; the reason if it is refused, else None."""
         raise NotImplementedError
 
     def _report(self) -> None:

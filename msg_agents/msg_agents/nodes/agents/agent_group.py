@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from msg_agents_interfaces.msg import ActiveGraph as ActiveGraphMsg
-from msg_agents_interfaces.msg import Progress as ProgressMsg
 from rclpy.publisher import Publisher
 
 from msg_agents.nodes.agents.agent import Agent
 from msg_agents.nodes.agents.lockstep_agent import LockstepAgent
 from msg_agents.nodes.agents.realtime_agent import RealtimeAgent
-from msg_agents.nodes.network_node import GRAPH_TOPIC, OTHER_RUN, PROGRESS_TOPIC, RESEND_TOPIC, UNDECODABLE
-from msg_agents.nodes.ros.qos import LATCHED
-from msg_agents.stepping.synchronizer import AGAIN, Refusal
-from msg_agents.stepping.turn_queue import Turns
+from msg_agents.stepping.synchronizer import RESEND_LIMIT
+from msg_agents.stepping.turn_queue import TurnQueue
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.step_model import Wiring
-from msg_analysis.wire.cdr_fields import CdrError
+from msg_analysis.wire import topics
 from msg_analysis.wire.messages import ActiveGraph
+from msg_analysis.wire.refusals import Refusal
 
 AGENTS: dict[str, type[Agent]] = {"lockstep": LockstepAgent, "realtime": RealtimeAgent}  # by pace
 PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages of an agent, in a small network
@@ -27,12 +24,10 @@ MOST_REPORTS = 250.0  # Progress messages a second from a whole network: the swi
 
 
 class AgentGroup:
-    """Agents as nodes of one process.
+    """Agents as nodes of one process: states pass directly between them, and on topics to all other nodes."""
 
-    Every endpoint is announced to every process. So what agents can share exists once per group, on the node of its
-    first agent: graph, progress, end, resend. States pass directly between agents of the group, as in ROS's own
-    intra-process communication, and on topics to all other nodes.
-    """
+    # Every endpoint is announced to every process. So what agents can share exists once per group, on the node of its
+    # first agent: graph, progress, end, resend.
 
     def __init__(
         self,
@@ -43,7 +38,7 @@ class AgentGroup:
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None = None,  # directory of the published states, from which agents resume
     ) -> None:
-        self.turns = Turns(len(agents), self._defer)
+        self.turns = TurnQueue(len(agents), self._defer)
         self.progress_period = max(PROGRESS_PERIOD, model.agents / MOST_REPORTS)
         listens = model.listens()
         exchanges = listens | listens.T
@@ -62,15 +57,15 @@ class AgentGroup:
             )
         self.nodes = list(self._agents.values())  # in the order of ``agents``
         for agent in self.nodes:
-            agent.meet(self._agents)
+            agent.connect(self._agents)
         self._host = self.nodes[0]
-        self._host.host(self.nodes)
-        self._progress = self._host.create_publisher(ProgressMsg, PROGRESS_TOPIC, LATCHED)
+        self._host.create_shared(self.nodes)
+        self._progress = self._host.publisher_of(topics.PROGRESS)
         self._resend: Publisher | None = None
         self._sojourns: dict[int, tuple[int, int, int]] = {}  # accepted (mode, first, last step) by sequence number
-        self._host.create_subscription(ActiveGraphMsg, GRAPH_TOPIC, self._receive_graph, LATCHED, raw=True)
-        self._host.create_subscription(ProgressMsg, RESEND_TOPIC, self._receive_resend, LATCHED, raw=True)
-        self._host.leave_at_end(self.nodes)
+        self._host.subscribe(topics.GRAPH, self._receive_graph)
+        self._host.subscribe(topics.RESEND, self._receive_resend)
+        self._host.finish_at_end(self.nodes)
 
     def _defer(self, callback: Callable[[], None]) -> None:
         self._host.executor.create_task(callback)
@@ -87,32 +82,27 @@ class AgentGroup:
     def ask_again(self, agent: int, step: int) -> None:
         """Ask an agent of another process (index from 0) for its states from a step on."""
         if self._resend is None:  # rarely needed; latched, so a late discovery does no harm
-            self._resend = self._host.create_publisher(ProgressMsg, RESEND_TOPIC, LATCHED)
+            self._resend = self._host.publisher_of(topics.RESEND)
         self._host.publish(self._resend, self._host.progress(agent + 1, step))
 
     def _receive_resend(self, data: bytes) -> None:
-        request = self._host.decode_progress(data, RESEND_TOPIC)
+        request = self._host.decode_progress(data, topics.RESEND)
         agent = request and self._agents.get(request.agent - 1)
         if request and agent:
             agent.send_again(request.step)
 
     def _receive_graph(self, data: bytes) -> None:
-        try:
-            graph = ActiveGraph.decode(data)
-        except CdrError:
-            self._host.refuse(UNDECODABLE, GRAPH_TOPIC)
-            return
-        if graph.run != self._host.run:
-            self._host.refuse(OTHER_RUN, GRAPH_TOPIC)
+        graph = self._host.decode(ActiveGraph, data, topics.GRAPH)
+        if graph is None:
             return
         # Agents that take over are at different steps: what is new to one may be known to another.
         reasons = {agent.learn(graph) for agent in self.nodes}
         claim = (graph.mode, graph.first_step, graph.last_step)
         if None in reasons:
             self._sojourns[graph.sequence] = claim
-            self._sojourns.pop(graph.sequence - AGAIN, None)
+            self._sojourns.pop(graph.sequence - RESEND_LIMIT, None)
         elif self._sojourns.get(graph.sequence, claim) != claim:
             reasons = {Refusal.CONTRADICTION}
         for reason in reasons:
             if reason:
-                self._host.refuse(reason, GRAPH_TOPIC)
+                self._host.refuse(reason, topics.GRAPH.name)

@@ -5,14 +5,11 @@ from __future__ import annotations
 import sys
 import time
 import traceback
-from collections.abc import Callable
 from typing import Any
 
-from msg_agents.nodes.agents.agent import NOT_FINITE, Agent
+from msg_agents.nodes.agents.agent import Agent
 from msg_agents.nodes.diagnostics import Health
-from msg_agents.nodes.network_node import state_topic, why_not
-from msg_agents.stepping.synchronizer import WINDOW, Synchronizer
-from msg_analysis.model.arithmetic.payload import all_finite
+from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, Synchronizer
 from msg_analysis.model.experiment.protocol_binding import ProtocolError
 from msg_analysis.wire.messages import ActiveGraph
 
@@ -37,54 +34,36 @@ class LockstepAgent(Agent):
         self._turns.join(self)
 
     def _ask_again(self) -> None:
-        """Ask the peers in other processes for their states of the last WINDOW + 1 steps: none is further behind."""
-        since = max(0, self._law.step - WINDOW - 1)
+        """Ask the peers in other processes for the states of the window and one step more: none is further behind."""
+        since = max(0, self._law.step - LOCKSTEP_WINDOW - 1)
         for j in self._far:
             self._group.ask_again(j, since)
 
     def health(self) -> Health:
         """See NetworkNode. A stalled agent says what it waits for, and asks for it again from time to time."""
-        step, pace = self._law.step, self._pace
-        overdue = pace.look(step)
-        values = {"step": str(step), "steps per second": f"{pace.rate:.1f}"}
+        step, stall = self._law.step, self._stall
+        overdue = stall.update(step)
+        values = {"step": str(step), "steps per second": f"{stall.rate:.1f}"}
         if self._synchronizer.finished:
             return Health("has made all steps", values=values)
-        if not pace.stalled:
+        if not stall.stalled:
             return Health(f"at step {step}", values=values)
         waiting = self._synchronizer.waiting_for()
-        if overdue and step == 0 and self.get_name() in self.namesakes():
-            self._group.fail(self.clash([self.get_name()], pace.stalled))  # the others have started without this one
+        if overdue and step == 0 and self.get_name() in self.duplicate_names():
+            self._group.fail(
+                self.duplicate_name_error([self.get_name()], stall.stalled)
+            )  # the others have started without this one
         elif overdue:
-            self.get_logger().warning(f"no step for {pace.stalled:.0f} s at step {step}: waiting for {waiting}")
+            self.get_logger().warning(f"no step for {stall.stalled:.0f} s at step {step}: waiting for {waiting}")
             self._ask_again()
         return Health(f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting})
 
-    def _receiver(self, peer: int) -> Callable[[bytes], None]:
-        """The callback for a peer's states (hot path)."""
-        unwrap = self._frame.unwrap
-        offer = self._synchronizer.offer
-        ready = self._synchronizer.ready
-        ask = self._turns.ask
-        topic, replicas = state_topic(peer), self.record.experiment.run.replicas
-
-        def receive(data: bytes) -> None:
-            frame = unwrap(data)
-            if frame is None or frame[0] != peer + 1:
-                self.refuse(why_not(data, self.record, peer, replicas), topic)
-                return
-            state = frame[3]
-            reason = offer(peer, frame[1], state) if all_finite(state) else NOT_FINITE
-            if reason:
-                self.refuse(reason, topic)
-            elif ready():
-                ask(self)
-
-        return receive
-
-    def hear(self, peer: int, step: int, value: bytes) -> None:
+    def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002
         """See Agent."""
-        if not self._synchronizer.offer(peer, step, value) and self._synchronizer.ready():
+        reason = self._synchronizer.offer(peer, step, state)
+        if not reason and self._synchronizer.ready():
             self._turns.ask(self)
+        return reason
 
     def learn(self, graph: ActiveGraph) -> str | None:
         """See Agent."""

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from msg_agents.nodes.ros.lean_node import message_class
 from msg_analysis.bags.playback import BagTopic
 from msg_analysis.errors import InputError
-
-
-def message_class(type_name: str) -> Any:
-    """Class of a type such as std_msgs/msg/String; ImportError, AttributeError or ValueError without one."""
-    package, kind, name = type_name.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 
 def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Callable[[str], None]) -> dict[str, Any]:
@@ -27,14 +21,16 @@ def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Ca
     found, unplayable = {}, []
     for topic in topics:
         if topic.encoding != "cdr":
-            unplayable.append(f"{topic.name} (its messages are {topic.encoding or 'of no known encoding'}, not cdr)")
+            unplayable.append(f"{topic.name} (the encoding of its messages is {topic.encoding or 'unknown'}, not cdr)")
             continue
         try:
             found[topic.name] = message_class(topic.type_name)
         except (ImportError, AttributeError, ValueError):
             unplayable.append(f"{topic.name} (the type {topic.type_name or '?'} is not installed here)")
     if unplayable and (all_wanted or not found):
-        raise InputError(f"cannot be played: {', '.join(unplayable)}: install it, or leave it out with --exclude")
+        raise InputError(
+            f"cannot be played: {', '.join(unplayable)}: install the type, or leave the topic out with --exclude"
+        )
     for line in unplayable:
         on_note(f"not played: {line}")
     return found
@@ -51,7 +47,6 @@ def check_definitions(node: Node, writers: Mapping[str, Publisher], topics: Mapp
         }
         if recorded and ours and recorded not in ours:
             raise InputError(
-                f"topic {name}: was recorded with another definition of {topics[name].type_name} than is "
-                f"installed here ({recorded}, here {ours.pop()}): install that version, or leave it out with "
-                "--exclude"
+                f"topic {name}: was recorded with another definition of {topics[name].type_name} ({recorded}) than the "
+                f"installed one ({ours.pop()}): install that version, or leave the topic out with --exclude"
             )

@@ -14,17 +14,16 @@ from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
-from rclpy.time_source import CLOCK_TOPIC
 from rosgraph_msgs.msg import Clock
 
 from msg_agents.nodes.node_process import leave
 from msg_agents.nodes.replay.message_types import check_definitions, message_classes
-from msg_agents.nodes.replay.readers import Audience
-from msg_agents.nodes.ros.lean_node import QuietNode
+from msg_agents.nodes.replay.readers import RequiredReaders
+from msg_agents.nodes.ros.lean_node import LeanNode
 from msg_agents.nodes.ros.node_parameters import ros_arguments
-from msg_agents.nodes.ros.qos import LATCHED, STREAM
+from msg_agents.nodes.ros.qos import ros_profile
 from msg_agents.nodes.ros.rclpy_error import RCLError
-from msg_agents.replay.bag_clock import PlayClock
+from msg_agents.replay.bag_clock import BagClock
 from msg_agents.replay.topic_selection import parse_remaps, select_topics
 from msg_agents.terminal.interruption import Interruption
 from msg_agents.terminal.job_control import JobControl
@@ -32,15 +31,16 @@ from msg_agents.terminal.keyboard import Keyboard
 from msg_analysis.bags.playback import Message, Playback
 from msg_analysis.errors import InputError
 from msg_analysis.model.arithmetic.step_clock import SECOND
+from msg_analysis.wire.topics import CLOCK, LATCHED, STREAM
 
-POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
-LOOK = 0.05  # s between two checks of the keyboard
-STOPPED = 1.0  # s without a check, after which the process is taken to have been stopped
-SHOW = 0.2  # s between two reports of progress
+DISCOVERY_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
+CHECK_PERIOD = 0.05  # s between two checks of keyboard and clock
+STOPPED_AFTER = 1.0  # s without a check, after which the process is taken to have been stopped
+PROGRESS_PERIOD = 0.2  # s between two reports of progress
 ACK_SLICE = 0.2  # s
-PATIENCE = 5.0  # s for readers to acknowledge the end before a note; the middleware may ask them only after 3 s
-BLOCKED = 0.05  # s to publish one message, from which on a reader is holding the player back
-REFUSED = 0.05  # s; an error that comes sooner is final: a slow reader blocks for 100 ms
+ACK_NOTE_DELAY = 5.0  # s for readers to acknowledge the end before a note; the middleware may ask them only after 3 s
+BLOCKED_AFTER = 0.05  # s to publish one message, from which on a reader is holding the player back
+FINAL_BEFORE = 0.05  # s; an error that comes sooner is final: a slow reader blocks for 100 ms
 RATE_STEP = 1.1
 
 
@@ -76,13 +76,15 @@ class Played:
     begun: bool = False  # whether the required readers were there
 
 
-class Player(QuietNode):
+class Player(LeanNode):
     """Publishes the messages of a bag: the same bytes, in the same order on each topic, without loss.
 
-    All topics are reliable and keep-all, however they were recorded: best-effort readers match too, and a slow reliable
-    one holds the player back. Topics recorded as latched are latched. The node receives nothing, so nothing spins.
     InputError: nothing to play from ``start_offset`` on or among the topics, or a bad remapping.
     """
+
+    # All topics are reliable and keep-all, however they were recorded: best-effort readers match too, and a slow
+    # reliable one holds the player back. Topics recorded as latched are latched. The node receives nothing, so nothing
+    # spins.
 
     def __init__(
         self,
@@ -106,38 +108,38 @@ class Player(QuietNode):
             length = (bag.end - bag.start) / SECOND
             raise InputError(f"--start-offset: {options.start_offset:g} s: the bag is only {length:g} s long")
         chosen = select_topics(bag.topics, options.topics, options.exclude)
-        if options.clock is not None and CLOCK_TOPIC in chosen:
-            chosen.remove(CLOCK_TOPIC)
+        if options.clock is not None and CLOCK.name in chosen:
+            chosen.remove(CLOCK.name)
             if not chosen:
                 raise InputError(
-                    f"--clock: publishes {CLOCK_TOPIC} itself, and nothing else is chosen: leave it out to play "
-                    f"{CLOCK_TOPIC} as it was recorded, or choose more with --topics"
+                    f"--clock: publishes {CLOCK.name} itself, and nothing else is chosen: leave it out to play "
+                    f"{CLOCK.name} as it was recorded, or choose more with --topics"
                 )
-            on_note(f"{CLOCK_TOPIC} of the bag is not played: --clock publishes its own")
+            on_note(f"{CLOCK.name} of the bag is not played: --clock publishes its own")
         types = message_classes([bag.topics[name] for name in chosen], all_wanted=bool(options.topics), on_note=on_note)
         names = parse_remaps(options.remaps, chosen)
         self._latched = {name for name in types if bag.topics[name].latched}
         self._writers: dict[str, Publisher] = {}
         for name, kind in types.items():
             try:
-                qos = LATCHED if name in self._latched else STREAM
+                qos = ros_profile(LATCHED if name in self._latched else STREAM)
                 self._writers[name] = self.create_publisher(kind, names[name], qos)
             except InvalidTopicNameException as error:
                 raise InputError(f"--remap: {name}:={names[name]}: {error}") from error
         check_definitions(self, self._writers, bag.topics)
-        self._ticker = self.create_publisher(Clock, CLOCK_TOPIC, 10) if options.clock else None
-        self._time = PlayClock(self._first, options.rate, paused=options.paused)
+        self._ticker = self.publisher_of(CLOCK) if options.clock else None
+        self._time = BagClock(self._first, options.rate, paused=options.paused)
         self._steps = 0  # messages to be played one by one
         self._began = self._shown = self._looked = self._ticked = 0.0
         self._awake = time.monotonic()  # when it was last known not to be stopped
         self.played = Played(length=(bag.end - bag.start) / SECOND)
 
     def play(self) -> None:
-        """Play the bag, once or (``loop``) until a signal ends it; InputError: required readers did not come."""
+        """Play the bag, once or (``loop``) until a signal ends it; InputError: required readers are missing."""
         early = self._publish_early()
         self._on_progress(self.played)
         options = self._options
-        audience = Audience(
+        required = RequiredReaders(
             self,
             self._writers,
             self._latched,
@@ -145,7 +147,7 @@ class Player(QuietNode):
             readers=options.readers,
             timeout=options.wait_timeout,
         )
-        audience.wait(self._bide, self._on_note)
+        required.wait(self._pause, self._on_note)
         self.played.begun = True
         self._jobs.continued()
         self._time.jump(self._first)
@@ -157,17 +159,17 @@ class Player(QuietNode):
             if not self._options.loop:
                 break
             self._time.jump(self._first)
-        self._wait_until_taken()
+        self._wait_for_acknowledgements()
 
-    def _heed(self) -> None:
+    def _check_signals(self) -> None:
         """End or stop the process if a signal has asked for it."""
         self._interruption.check()
         self._jobs.check()
 
-    def _bide(self) -> None:
+    def _pause(self) -> None:
         """Wait a little before the start: signals, keyboard, progress."""
-        self._heed()
-        self._press(self._keyboard.wait(POLL), self._first)
+        self._check_signals()
+        self._press(self._keyboard.wait(DISCOVERY_POLL), self._first)
         self._on_progress(self.played)
 
     def _publish_early(self) -> int:
@@ -178,7 +180,7 @@ class Player(QuietNode):
         count = 0
         if self._latched:
             for message in self._bag.messages(self._latched, self._first):
-                self._heed()
+                self._check_signals()
                 self._send(message)
                 count += 1
         self.played.messages += count
@@ -187,7 +189,7 @@ class Player(QuietNode):
     def _play_once(self, early: int) -> None:
         """Play the bag without its first ``early`` messages of latched topics, which have been published."""
         for message in self._bag.messages(self._writers.keys(), self._last):
-            self._heed()
+            self._check_signals()
             latched = message.topic in self._latched
             if latched and early:
                 early -= 1
@@ -198,7 +200,7 @@ class Player(QuietNode):
             before = time.monotonic()
             self._send(message)
             took = time.monotonic() - before
-            if took > BLOCKED:
+            if took > BLOCKED_AFTER:
                 self._time.hold(took)
                 self._jobs.continued()  # a stop in that time is not counted again
                 self.played.held_back += took
@@ -214,22 +216,22 @@ class Player(QuietNode):
                 writer.handle.publish_raw(message.data)
                 return
             except RCLError as error:
-                if time.monotonic() - before < REFUSED:
+                if time.monotonic() - before < FINAL_BEFORE:
                     kind = self._bag.topics[message.topic].type_name
                     raise InputError(
-                        f"topic {message.topic}: a message of {len(message.data)} bytes is no {kind} "
+                        f"topic {message.topic}: {len(message.data)} bytes: not a valid {kind} message "
                         f"({error}): leave the topic out with --exclude"
                     ) from error
-            self._heed()
+            self._check_signals()
 
     def _wait_for(self, message: Message) -> None:
         """Wait until a message is due; handle signals, keyboard, ``/clock`` and progress meanwhile."""
         while True:
             now = time.monotonic()
             wait = self._time.until(message.time)
-            if wait <= 0 and now < self._looked + LOOK and (self._ticker is None or now < self._next_tick()):
+            if wait <= 0 and now < self._looked + CHECK_PERIOD and (self._ticker is None or now < self._next_tick()):
                 return
-            self._look_around(now, message.time)
+            self._update(now, message.time)
             wait = self._time.until(message.time)
             if self._steps and wait > 0:
                 self._steps -= 1
@@ -237,13 +239,15 @@ class Player(QuietNode):
                 return
             if wait <= 0:
                 return
-            soonest = min(wait, LOOK) if self._ticker is None else min(wait, LOOK, self._next_tick() - now)
+            soonest = (
+                min(wait, CHECK_PERIOD) if self._ticker is None else min(wait, CHECK_PERIOD, self._next_tick() - now)
+            )
             self._press(self._keyboard.wait(soonest), message.time)
-            self._heed()
+            self._check_signals()
 
-    def _look_around(self, now: float, next_time: int) -> None:
+    def _update(self, now: float, next_time: int) -> None:
         # The time of a stop does not count. We may notice it late: any thread of the process may get the signal.
-        if self._jobs.continued() or now - self._awake > STOPPED:
+        if self._jobs.continued() or now - self._awake > STOPPED_AFTER:
             now = time.monotonic()
             self._time.hold(now - self._awake)
         self._looked = self._awake = now
@@ -253,7 +257,7 @@ class Player(QuietNode):
             self._ticked = now
             seconds, nanoseconds = divmod(here, SECOND)
             self._ticker.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
-        if now >= self._shown + SHOW:
+        if now >= self._shown + PROGRESS_PERIOD:
             self._shown = now
             self._report(here)
 
@@ -278,19 +282,19 @@ class Player(QuietNode):
         played.rate, played.paused = self._time.rate, self._time.paused
         self._on_progress(played)
 
-    def _wait_until_taken(self) -> None:
+    def _wait_for_acknowledgements(self) -> None:
         """Wait until all readers have acknowledged everything: the rest would be lost with this process."""
         self._report(self._last)
         waiting = list(self._writers.values())
         began, noted = time.monotonic(), False
         while waiting:
-            self._heed()
+            self._check_signals()
             each_waits = Duration(seconds=ACK_SLICE / len(waiting))
             waiting = [writer for writer in waiting if not writer.wait_for_all_acked(each_waits)]
-            if waiting and not noted and time.monotonic() > began + PATIENCE:
+            if waiting and not noted and time.monotonic() > began + ACK_NOTE_DELAY:
                 noted = True
                 names = ", ".join(writer.topic_name for writer in waiting)
-                self._on_note(f"waiting until the readers of {names} have taken all")
+                self._on_note(f"waiting until the readers of {names} have received everything")
 
 
 def play(

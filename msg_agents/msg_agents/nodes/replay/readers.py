@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from msg_agents.processes.environment import discovery_scope
 from msg_analysis.errors import InputError
 
 SETTLED = 0.8  # s without a change in the readers, after which discovery counts as finished
 SETTLE_LIMIT = 5.0  # s after which it counts as finished in any case
-SAID = 2.0  # s after which a note says what is missing
-AWAKE = 1.0  # s; a longer gap between two looks counts as this much: the process was stopped
+NOTE_DELAY = 2.0  # s after which a note says what is missing
+LONGEST_POLL = 1.0  # s; a longer gap between two looks counts as this much: the process was stopped
 
 
-class Audience:
+class RequiredReaders:
     """The readers of a player's topics. Latched topics are not waited for, unless all are latched."""
 
     def __init__(
@@ -42,10 +42,10 @@ class Audience:
         looked = time.monotonic()
         waited = changed = 0.0
         counts: list[int] = []
-        said = False
+        noted = False
         while True:
             now = time.monotonic()
-            waited, looked = waited + min(now - looked, AWAKE), now
+            waited, looked = waited + min(now - looked, LONGEST_POLL), now
             missing = self._missing()
             before, counts = counts, [each.get_subscription_count() for each in self._writers]
             if counts != before:
@@ -54,17 +54,15 @@ class Audience:
                 break
             if missing and waited > self._timeout:
                 raise InputError(
-                    f"after {self._timeout:g} s {'; '.join(missing)}. Are they running, in the same "
-                    f"ROS_DOMAIN_ID ({os.environ.get('ROS_DOMAIN_ID', '0')}) and within ROS_AUTOMATIC_DISCOVERY_RANGE "
-                    f"({os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')})?"
+                    f"after {self._timeout:g} s {'; '.join(missing)}. Are they running {discovery_scope()}?"
                 )
-            if missing and not said and waited > SAID:
-                said = True
+            if missing and not noted and waited > NOTE_DELAY:
+                noted = True
                 on_note(f"waiting for readers, {self._timeout:g} s at most: {'; '.join(missing)}")
             pause()
         others = [each.topic_name for each in self._writers if self._node.count_publishers(each.topic_name) > 1]
         if others:
-            on_note(f"somebody else publishes too: {', '.join(others)}")
+            on_note(f"other nodes publish as well: {', '.join(others)}")
 
     def _missing(self) -> list[str]:
         """Unmet requirements in words."""

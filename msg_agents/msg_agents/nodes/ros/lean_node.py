@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib
 from collections.abc import Callable
 from typing import Any
 
@@ -15,18 +16,26 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from rclpy.subscription import Subscription
 
 from msg_agents.nodes.ros.node_parameters import PROCESS
+from msg_agents.nodes.ros.qos import ros_profile
 from msg_agents.nodes.ros.rclpy_error import RCLError
 from msg_analysis.errors import InputError
+from msg_analysis.wire.topics import Qos, Topic
 
 LOSSLESS = ("history", "reliability", "durability", "lifespan")
 """Policies that must not change where nothing may be lost, except that a publisher may become latched."""
 
 
-class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
+def message_class(type_name: str) -> Any:
+    """Class of a type such as std_msgs/msg/String; ImportError, AttributeError or ValueError without one."""
+    package, kind, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), name)
+
+
+class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
     """A node without parameter services, type descriptions and /rosout.
 
     Each node would have seven services and /rosout, which cost more than the network if there are many nodes.
-    Parameters are declared all the same; the option ``parameter_services`` brings their services back.
+    Parameters are declared all the same; the option ``parameter_services`` adds their services.
     """
 
     def __init__(self, name: str) -> None:
@@ -39,6 +48,17 @@ class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that myp
         )
         self._takes_overrides = PROCESS.qos_overrides
         PROCESS.declare(self)
+
+    def publisher_of(self, topic: Topic, agent: int = 0) -> Publisher:
+        """A publisher of a topic; ``agent`` (index from 0) where every agent has one."""
+        return self.create_publisher(message_class(topic.type.full_name), topic.of(agent), ros_profile(topic.qos))
+
+    def subscribe(
+        self, topic: Topic, callback: Callable[[bytes], None], *, agent: int = 0, qos: Qos | None = None
+    ) -> Subscription:
+        """Pass the messages of a topic on as CDR bytes; ``qos``: if not that of the topic."""
+        kind, profile = message_class(topic.type.full_name), ros_profile(qos or topic.qos)
+        return self.create_subscription(kind, topic.of(agent), callback, profile, raw=True)
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Publisher:
         """As in rclpy; with the user's overrides of the quality of service, as far as no message would be lost."""
@@ -56,7 +76,7 @@ class QuietNode(Node):  # type: ignore[misc]  # rclpy has no type hints that myp
         """As in rclpy; overrides as in ``create_publisher``."""
 
         def create(msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Subscription:
-            return super(QuietNode, self).create_subscription(msg_type, topic, callback, qos_profile, **options)
+            return super(LeanNode, self).create_subscription(msg_type, topic, callback, qos_profile, **options)
 
         return self._create(create, [], msg_type, topic, qos_profile, **options)
 
@@ -118,5 +138,5 @@ def objection(before: QoSProfile, after: QoSProfile, *, publishes: bool) -> str:
         latched_as_well = policy == "durability" and publishes and theirs.name == "TRANSIENT_LOCAL"
         if theirs != ours and not latched_as_well:
             names = [str(getattr(value, "name", value)).lower() for value in (theirs, ours)]
-            return f"{policy}: {names[0]}: messages of the run would be lost, or not come at all: expected {names[1]}"
+            return f"{policy}: {names[0]}: messages of the run would be lost or never arrive: expected {names[1]}"
     return ""

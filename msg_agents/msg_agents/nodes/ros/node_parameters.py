@@ -132,7 +132,7 @@ def ros_arguments() -> Iterator[None]:
     except RuntimeError as error:
         if type(error).__name__ != "UnknownROSArgsError":
             raise
-        raise InputError(f"--ros-args: {error}: ROS 2 knows no such argument") from error
+        raise InputError(f"--ros-args: {error}: not an argument that ROS 2 knows") from error
 
 
 def mention_qos(arguments: Sequence[str]) -> bool:
@@ -203,7 +203,7 @@ def merge(
         if name not in known:
             close = difflib.get_close_matches(name, sorted(known), 1)
             hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(sorted(own))}"
-            raise InputError(f"parameter {name}: no node of msg_agents has it: {hint}")
+            raise InputError(f"parameter {name}: no node of msg_agents has this parameter: {hint}")
         option = own.get(name)
         if option is None or ctx.get_parameter_source(option.name or "") is ParameterSource.COMMANDLINE:
             continue

@@ -1,25 +1,15 @@
-"""Quality of service of the topics of a run, as ROS objects.
-
-STREAM and LATCHED are reliable and keep-all: a slow reader holds the writer back end to end (``publish`` raises when no
-reader takes what it wrote). Keep-last, of any depth, loses messages silently to a busy reader.
-
-Rare messages that late readers need are latched (transient-local). States are not: the start gate waits for their
-readers, and a writer that keeps thousands of old ones works in cold memory, which costs a network a tenth of its speed.
-"""
+"""Quality of service as ROS objects; the profiles of all topics are in ``msg_analysis.wire.topics``."""
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-STREAM = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL,
-    depth=0,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
-LATCHED = QoSProfile(
-    history=HistoryPolicy.KEEP_ALL,
-    depth=0,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""For values that replace earlier ones: the writer never waits, and a late reader gets the newest."""
+from msg_analysis.wire.topics import Qos
+
+
+def ros_profile(qos: Qos) -> QoSProfile:
+    """The profile for rclpy."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL if qos.depth is None else HistoryPolicy.KEEP_LAST,
+        depth=qos.depth or 0,
+        reliability=ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE,
+    )

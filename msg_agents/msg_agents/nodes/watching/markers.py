@@ -7,32 +7,22 @@ import time
 from collections.abc import Callable, Sequence
 
 from geometry_msgs.msg import Point, Pose, Vector3
-from msg_agents_interfaces.msg import AgentState as AgentStateMsg
-from rclpy.duration import Duration
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from msg_agents.nodes.network_node import state_topic
-from msg_agents.nodes.ros.qos import NEWEST
 from msg_agents.nodes.ros.timers import every
 from msg_agents.nodes.watching.watch_process import Watcher, run_watcher
-from msg_agents.recovery.checkpoint import longest_heard
 from msg_analysis.errors import InputError
-from msg_analysis.wire.messages import AgentState, StateFrame
+from msg_analysis.wire import topics
+from msg_analysis.wire.messages import AgentState
 
-MARKERS_TOPIC = "markers"
 RATE = 10.0  # pictures per second of wall time
-LOOK = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Only the newest state is drawn, and no writer waits for this reader."""
-
 SPACING = 1.0  # m between neighbours on the circle
 AGENT_SIZE, EDGE_WIDTH, TEXT_SIZE = 0.4, 0.05, 0.35  # m
 MOST_NAMES = 100  # agents up to which each one is labelled with its number
 FULL_COLOUR = 2.0  # distance from the middle with full colour, in root mean squares of all distances
 FADING = 0.02  # weight of the newest picture in that mean square
-FAREWELL = 2.0  # s for readers to acknowledge the last picture
-SILENCE = 3.0  # s without a newer state, once the run has ended or has no publishers
+SILENT_TIME = 3.0  # s without a newer state, once the run has ended or has no publishers
 Colour = tuple[float, float, float]
 LOW, MIDDLE, HIGH = (0.13, 0.40, 0.67), (0.97, 0.97, 0.97), (0.70, 0.09, 0.17)
 
@@ -58,8 +48,10 @@ class Markers(Watcher):
     ``rate``: pictures per second of wall time. ``replica`` counts from 0. ``frame``: frame id of the markers.
     """
 
+    ack_timeout = 2.0
+
     def __init__(self, *, rate: float, replica: int, frame: str, on_note: Callable[[str], None]) -> None:
-        super().__init__("markers", on_note=on_note)
+        super().__init__("markers", topics.MARKERS, on_note=on_note)
         self._rate, self._replica, self._frame = rate, replica, frame
         self._newest: list[bytes | None] = []  # raw messages by agent: most are never decoded
         self._places: list[tuple[float, float]] = []
@@ -67,7 +59,6 @@ class Markers(Watcher):
         self._square = 0.0  # mean square of the distance from the middle
         self._drawn: list[int] = []  # steps of the last picture
         self._moved = time.monotonic()
-        self._writer = self.create_publisher(MarkerArray, MARKERS_TOPIC, NEWEST)
 
     def follow(self) -> None:
         """See Watcher; InputError if there is no such replica."""
@@ -82,23 +73,12 @@ class Markers(Watcher):
             for source, target, _ in graph.arcs:
                 heard[target - 1].append(source - 1)
             self._links.append(heard)
-        self._frame_of_states = StateFrame(self.record.run.bytes, experiment.run.replicas, longest_heard(self.record))
-        for agent in range(agents):
-            name = self.resolve_topic_name(state_topic(agent))
-            self._topics.append(name)
-            self.create_subscription(AgentStateMsg, name, self._keeper(agent), LOOK, raw=True)
+        self._subscribe_to_states(topics.STATE, topics.PASSIVE_NEWEST, whole=False)
         self._moved = time.monotonic()
         every(self, 1.0 / self._rate, self._draw)
 
-    def _keeper(self, agent: int) -> Callable[[bytes], None]:
-        newest, unwrap = self._newest, self._frame_of_states.unwrap
-
-        def keep(data: bytes) -> None:
-            frame = unwrap(data)
-            if frame is not None and frame[0] == agent + 1:  # else not a state of this agent
-                newest[agent] = data
-
-        return keep
+    def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:  # noqa: ARG002  see Watcher
+        self._newest[agent] = message
 
     def _draw(self) -> None:
         assert self.record is not None
@@ -107,14 +87,10 @@ class Markers(Watcher):
         if steps != self._drawn:
             self._drawn, self._moved = steps, time.monotonic()
             self._writer.publish(self._picture(states))
-        quiet = time.monotonic() - self._moved > SILENCE
-        over = min(steps) >= self.record.experiment.steps or (quiet and (self._ended or not self._anybody()))
+        quiet = time.monotonic() - self._moved > SILENT_TIME
+        over = min(steps) >= self.record.experiment.steps or (quiet and (self._ended or not self._has_publishers()))
         if over and not self.done.done():
             self.done.set_result(None)
-
-    def farewell(self) -> None:
-        """See Watcher."""
-        self._writer.wait_for_all_acked(Duration(seconds=FAREWELL))
 
     def _picture(self, states: Sequence[AgentState | None]) -> MarkerArray:
         markers = [self._agents(states), self._edges(states), self._title(states)]
@@ -196,7 +172,7 @@ def show_markers(
     rate: float = RATE,
     replica: int = 0,  # from 0
     frame: str = "network",
-    timeout: float | None = None,  # s to wait for a network; None: forever
+    timeout: float | None = None,  # s to wait for a network; None: no limit
     on_note: Callable[[str], None] = lambda _: None,
 ) -> bool:
     """Publish markers of the network until it is over or a signal ends it; whether it was seen to be over.

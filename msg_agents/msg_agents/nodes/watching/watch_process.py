@@ -9,61 +9,81 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import rclpy
-from msg_agents_interfaces.msg import Progress as ProgressMsg
+from rclpy.duration import Duration
 from rclpy.executors import Executor
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
-from std_msgs.msg import String
 
-from msg_agents.nodes.network_node import END_TOPIC, EXPERIMENT_TOPIC, OTHER_RUN, UNDECODABLE
 from msg_agents.nodes.node_process import SPIN_SLICE, leave, make_executor
-from msg_agents.nodes.ros.lean_node import QuietNode
+from msg_agents.nodes.ros.lean_node import LeanNode
 from msg_agents.nodes.ros.node_parameters import ros_arguments
-from msg_agents.nodes.ros.qos import LATCHED
-from msg_agents.processes.environment import without_shared_memory
+from msg_agents.processes.environment import discovery_scope, without_shared_memory
 from msg_agents.terminal.interruption import Interruption
 from msg_analysis.errors import InputError
 from msg_analysis.model.run.record import RunRecord
+from msg_analysis.wire import topics
 from msg_analysis.wire.cdr_fields import CdrError
 from msg_analysis.wire.messages import Progress, decode_string
+from msg_analysis.wire.receiving import decode_of_run, state_frame, state_receiver
+from msg_analysis.wire.refusals import Refusal
+from msg_analysis.wire.topics import Qos, Topic
 
-PATIENCE = 1.0  # s after which a note says that there is no network
-LISTEN = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""How states are read by default: a writer never waits for such a reader, which misses messages if it is too slow."""
+NOTE_DELAY = 1.0  # s after which a note says that there is no network
 
 
-class Watcher(QuietNode):
-    """Follows the first run that it hears of; ``known`` is set then, and ``done`` (by subclasses) at its end."""
+class Watcher(LeanNode):
+    """Follows the first run that it discovers; ``known`` is set then, and ``done`` (by subclasses) at its end."""
 
-    def __init__(self, name: str, *, on_note: Callable[[str], None]) -> None:
+    ack_timeout = 5.0  # s for readers to acknowledge the last message of this node
+
+    def __init__(self, name: str, output: Topic, *, on_note: Callable[[str], None]) -> None:
         super().__init__(name)
         self._on_note = on_note
+        self._writer: Publisher = self.publisher_of(output)
         self.record: RunRecord | None = None
         self.known, self.done = Future(), Future()
         self._refused: Counter[str] = Counter()
         self._others: set[str] = set()
         self._ended = False
         self._topics: list[str] = []  # topics of states: the run is there while they have publishers
-        self.create_subscription(String, EXPERIMENT_TOPIC, self._receive_experiment, LATCHED, raw=True)
-        self.create_subscription(ProgressMsg, END_TOPIC, self._receive_end, LATCHED, raw=True)
+        self.subscribe(topics.EXPERIMENT, self._receive_experiment)
+        self.subscribe(topics.END, self._receive_end)
 
     def follow(self) -> None:
         """Read the states of the run that has been found; InputError: not possible with this run."""
         raise NotImplementedError
 
-    def farewell(self) -> None:
-        """Wait until the readers of this node's own topics have the last messages."""
+    def _subscribe_to_states(self, topic: Topic, qos: Qos, *, whole: bool) -> None:
+        """Pass the states of the run to ``_take``; messages that are not of the run are counted."""
+        assert self.record is not None
+        frame = state_frame(self.record, whole=whole)
+        for agent in range(self.record.experiment.agents):
+            self._topics.append(self.resolve_topic_name(topic.of(agent)))
+            receive = state_receiver(self.record, agent, frame, self._take, self._refuse)
+            self.subscribe(topic, receive, agent=agent, qos=qos)
+
+    def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:
+        """Take a state of an agent (index from 0). Hot path."""
         raise NotImplementedError
+
+    def _refuse(self, reason: str) -> None:
+        self._refused[reason] += 1
+
+    def wait_for_readers(self) -> None:
+        """Wait until the readers of this node's own topic have the last message."""
+        self._writer.wait_for_all_acked(Duration(seconds=self.ack_timeout))
 
     def conclude(self) -> None:
         """Prepare the final result from what has been received; must be quick, since leaving has a time limit."""
 
     def _receive_experiment(self, data: bytes) -> None:
         try:
-            record = RunRecord.from_json(decode_string(data), f"topic {self.resolve_topic_name(EXPERIMENT_TOPIC)}")
+            record = RunRecord.from_json(
+                decode_string(data), f"topic {self.resolve_topic_name(topics.EXPERIMENT.name)}"
+            )
         except (CdrError, InputError) as error:
-            self._refused[UNDECODABLE] += 1
+            self._refused[Refusal.UNDECODABLE] += 1
             self._on_note(str(error))
             return
         if self.record is None:
@@ -71,17 +91,14 @@ class Watcher(QuietNode):
             self.known.set_result(None)
         elif record.run != self.record.run and str(record.run) not in self._others:
             self._others.add(str(record.run))
-            self._refused[OTHER_RUN] += 1
-            self._on_note(f"another run is there too, {record.run}: only {self.record.run} is watched")
+            self._refused[Refusal.OTHER_RUN] += 1
+            self._on_note(f"there is a second run, {record.run}: only {self.record.run} is watched")
 
     def _receive_end(self, data: bytes) -> None:
-        try:
-            run = Progress.decode(data).run
-        except CdrError:
-            return
-        self._ended |= self.record is not None and run == self.record.run.bytes
+        if self.record is not None and isinstance(decode_of_run(Progress, data, self.record.run.bytes), Progress):
+            self._ended = True
 
-    def _anybody(self) -> bool:
+    def _has_publishers(self) -> bool:
         return any(self.count_publishers(topic) for topic in self._topics)
 
 
@@ -100,7 +117,7 @@ def run_watcher(
     If the run was seen to be over, the node is still on the network: end the process at once. InputError: no network
     within ``timeout`` s (None: no limit), or it cannot be followed.
     """
-    nobody = _nobody()
+    no_network = f"no network {discovery_scope()}"
     os.environ.update(without_shared_memory())
     with ros_arguments():
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
@@ -115,13 +132,13 @@ def run_watcher(
             executor.spin_until_future_complete(node.known, timeout_sec=SPIN_SLICE)
             waited = time.monotonic() - began
             if timeout is not None and waited > timeout and not node.known.done():
-                raise InputError(f"after {timeout:g} s {nobody}: is one running there, or being played?")
-            if waited > PATIENCE and not noted and not node.known.done():
+                raise InputError(f"after {timeout:g} s {no_network}: is one running or being played there?")
+            if waited > NOTE_DELAY and not noted and not node.known.done():
                 noted = True
-                on_note(f"{nobody} yet: waiting for one")
+                on_note(f"{no_network} yet: waiting for one")
         node.follow()
         _spin(executor, node.done, on_look)
-        node.farewell()
+        node.wait_for_readers()
     except (KeyboardInterrupt, SystemExit):
         pass
     finally:
@@ -143,8 +160,3 @@ def _spin(executor: Executor, done: Future, on_look: Callable[[], None]) -> None
             interruption.check()
             on_look()
             executor.spin_until_future_complete(done, timeout_sec=SPIN_SLICE)
-
-
-def _nobody() -> str:
-    domain, reach = os.environ.get("ROS_DOMAIN_ID", "0"), os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
-    return f"no network in ROS_DOMAIN_ID {domain}, within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}"

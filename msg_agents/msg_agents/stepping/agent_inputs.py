@@ -1,0 +1,36 @@
+"""What one agent knows of the others, in lockstep and in real time. No ROS, no arithmetic, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Generic, TypeVar
+
+Value = TypeVar("Value")
+NOTHING = -1  # in place of a step: no state received yet
+
+
+class AgentInputs(Generic[Value]):
+    """Steps count from 0; x(0) is the start, the run ends at x(steps). Agents count from 0, in texts from 1."""
+
+    def __init__(
+        self,
+        *,
+        agent: int,
+        steps: int,  # N
+        inputs: Sequence[Sequence[int]],  # per mode, the other agents that the agent's row uses, ascending
+        peers: Collection[int],  # every other agent that it ever hears or is heard by; includes ``inputs``
+        start: int = 0,  # the current step, after a takeover
+    ) -> None:
+        self.agent, self.step, self.steps = agent, start, steps
+        self._inputs = [tuple(row) for row in inputs]
+        self._newest = dict.fromkeys(sorted(peers), NOTHING)  # newest step received of each peer
+        # Of the next sojourn; None: any, since a process that takes over starts in the middle.
+        self._sequence: int | None = 0 if start == 0 else None
+        missing = {j for row in inputs for j in row} - self._newest.keys()
+        if missing:
+            raise ValueError(f"agent {agent} uses {sorted(missing)}, which are not among its peers {sorted(peers)}")
+
+    @property
+    def finished(self) -> bool:
+        """Whether x(steps) has been reached."""
+        return self.step >= self.steps
