@@ -115,7 +115,7 @@ def test_what_is_not_available_is_refused(tmp_path: Path) -> None:
 def test_real_time_is_predicted_in_turn(tmp_path: Path) -> None:
     file = tmp_path / "file.yaml"
     file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nrun: {pace: realtime}\n")
-    assert "steps in turn" in call("predict", file).stdout
+    assert "sequential steps" in call("predict", file).stdout
     document = json.loads(call("predict", file, "--json").stdout)
     assert document["emulated"]["law"] == "sequential"
 
