@@ -260,7 +260,7 @@ def test_salvage_of_a_torn_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert f"All states are there up to step {verdict['completeness']['stretch'][1]}" in call("compare", out).stdout
     shown = " ".join(call("salvage", torn, tmp_path / "two").stdout.split())
     assert f"kept {document['kept_messages']} messages" in shown
-    assert "behind the last whole record" in shown
+    assert "after the last complete record" in shown
 
 
 def test_salvage_of_nothing(bag: Path, tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ def _print_errors(document: dict[str, Any], console: Console) -> None:
     given = document.get("given_path")
     row("system", document["system_error"], end_section=not given)
     if given:
-        row("system, given the graph path", given["system_error"], end_section=True)
+        row("system, given the path", given["system_error"], end_section=True)
     for agent, entry in enumerate(first_rows(table, document["node_errors"] or [], "agents"), start=1):
         row(f"agent {agent}", entry)
     console.print(table)

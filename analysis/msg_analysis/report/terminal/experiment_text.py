@@ -35,7 +35,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     facts.add_row("memory", f"states {amount(memory['states'])}, graphs {amount(memory['matrices'])}")
     facts.add_row("can be run", "yes" if not document["unavailable"] else "no")
     console.print(facts)
-    columns = ("connectivity", "share", "mean time", "dt limit")
+    columns = ("connectivity", "share", "held for", "dt limit")
     graphs = number_table(console, "Graphs", "graph", *columns)
     graphs.add_column("links", overflow="fold")
     for graph in document["graphs"]:

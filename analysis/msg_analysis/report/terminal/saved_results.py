@@ -192,12 +192,12 @@ def to_markdown(rows: Sequence[Result]) -> str:
 def print_results(rows: Sequence[Result], level: float, console: Console) -> None:
     """Print the results as a table, and which system errors differ at ``level`` (all pairs together)."""
     heads, body = _shown(rows)
-    kept = [
-        place for place, head in enumerate(heads) if head not in ("experiment", "seed", "time", "smallest p")
-    ]  # 80 columns
-    table = number_table(console, "Results", *(heads[place] for place in kept))
+    wide = ("experiment", "seed", "time", "smallest p")  # too much for 80 columns
+    columns = [column for column in zip(heads, *body, strict=True) if column[0] not in wide and set(column[1:]) != {"-"}]
+    heads, *body = zip(*columns, strict=True)
+    table = number_table(console, "Results", *heads)
     for line in body:
-        table.add_row(*(Text(line[place]) for place in kept))
+        table.add_row(*map(Text, line))
     console.print(table)
     for row in rows:
         if row.blame:

@@ -62,7 +62,7 @@ def _summary(document: dict[str, Any]) -> str:
     what = {"predict": "predictions", "simulate": "runs simulated", "network": "networks run"}[document["kind"]]
     text = f"{count} {what}"
     if document["kept"]:
-        text += f", {document['kept']} of them earlier"
+        text += f", {document['kept']} of them from an earlier sweep"
     if document["failed"]:
         text += f"; {document['failed']} without a result"
     tested = [row["p_holm"] for row in document["points"] if row.get("p_holm") is not None]
