@@ -257,7 +257,7 @@ def test_salvage_of_a_torn_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert verdict["verdict"] == "incomplete"
     assert verdict["steps"] == document["prefix"] > 100
     assert verdict["system_error"]["measured"] > 0
-    assert f"All states are there up to step {verdict['completeness']['stretch'][1]}" in call("compare", out).stdout
+    assert f"All steps up to step {verdict['completeness']['stretch'][1]}" in call("compare", out).stdout
     shown = " ".join(call("salvage", torn, tmp_path / "two").stdout.split())
     assert f"kept {document['kept_messages']} messages" in shown
     assert "after the last complete record" in shown

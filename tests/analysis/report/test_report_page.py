@@ -139,7 +139,7 @@ def test_report(tmp_path: Path, agents: int) -> None:
     assert "1.235" in page.text
     assert "z = −1.31" in page.text
     for i in range(agents):
-        assert f"{0.3 + i / 100:.4g}" in page.text
+        assert f"{0.3 + i / 100:#.4g}" in page.text
     assert _plots(page) == 6
     assert page.tags.count("svg") == 3  # two graphs and the chain
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]

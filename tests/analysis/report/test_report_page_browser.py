@@ -167,7 +167,7 @@ def _tracking() -> tuple[Any, Trajectory]:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (_in_real_time, ["age of the values used", "Real time"]),
+        (_in_real_time, ["age of values used", "Real time"]),
         (_disagreeing, ["The gain of edge 1-4 in both directions"]),
         (_incomplete, ["too early to compute"]),
         (_pooled, ["bag_2", "1, 2, 3"]),

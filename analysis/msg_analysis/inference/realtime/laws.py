@@ -122,7 +122,7 @@ def _departures(timing: Timing) -> list[str]:
 def _sequential(
     error: Estimate, p: float | None, level: float, departures: list[str], effect: float | None, late: bool
 ) -> Law:
-    why = "it assumes that every step is on time and every message arrives at once"
+    why = "assumes that every step is on time and every message arrives at once"
     if not departures:
         why += ", as in this log"
     else:
@@ -157,7 +157,7 @@ def _continuous(observation: Observation, sequential: Estimate, level: float, la
     error = Estimate(sequential.measured, predicted, sequential.standard_error, z, p)
     effect = observation.prediction.emulated.system_error / predicted - 1.0
     why = (
-        f"it ignores that the agents make steps of {observation.step.dt:g}, one after the other, which changes the "
+        f"ignores that the agents make steps of {observation.step.dt:g}, one after the other, which changes the "
         f"system error by {_change(effect)}"
     )
     if p < level:

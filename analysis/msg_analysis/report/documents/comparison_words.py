@@ -17,10 +17,10 @@ VERDICTS = {
 TIMES = {
     "lateness_ms": "lateness [ms]",
     "jitter_ms": "error of the period [ms]",
-    "staleness_ms": "age of the values used [ms]",
-    "staleness_steps": "age of the values used [steps]",
+    "staleness_ms": "age of values used [ms]",
+    "staleness_steps": "age of values used [steps]",
 }
-QUANTILES = {"p50": "median", "p95": "95 % quantile", "p99": "99 % quantile", "max": "largest"}
+QUANTILES = {"p50": "median", "p95": "95 %", "p99": "99 %", "max": "largest"}
 REAL_TIME_LAWS = {key: LAW_NAMES[key] for key in ("pattern", "sequential", "continuous")}
 
 

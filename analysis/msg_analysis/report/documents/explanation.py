@@ -70,8 +70,8 @@ def _switching(experiment: Experiment) -> str:
     times = [time for time in experiment.chain.holding_times if time is not None]
     held = f"{min(times):.3g}" if max(times) - min(times) < 1e-9 else f"{min(times):.3g} to {max(times):.3g}"
     return (
-        f"The graph switches between {modes} graphs: a Markov chain in continuous time, with mean holding times of "
-        f"{held} units of time. {begin}"
+        f"The graph switches between {modes} graphs: a Markov chain in continuous time, with mean holding time "
+        f"{held} [units of simulated time]. {begin}"
     )
 
 

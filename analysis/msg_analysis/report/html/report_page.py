@@ -19,7 +19,7 @@ from bokeh.resources import Resources
 from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
-from msg_analysis.common.number_words import number_text, p_text, z_text
+from msg_analysis.common.number_words import p_text, z_text
 from msg_analysis.errors import InputError
 from msg_analysis.inference.observed.observation import bounded
 from msg_analysis.inference.realtime.laws import SUPPORT
@@ -201,7 +201,7 @@ def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _number(value: float | None, digits: int = 4) -> str:
-    return _typeset(number_text(value, digits))
+    return "–" if value is None else _typeset(f"{value:#.{digits}g}".rstrip("."))
 
 
 def _z(z: float | None) -> str:

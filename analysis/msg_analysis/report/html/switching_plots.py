@@ -73,7 +73,7 @@ def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> 
     shares = new_figure(
         _height(names),
         "save",
-        title="share of the time",
+        title="share of time",
         y_range=Range1d(len(names) - 0.4, -0.6),
         toolbar_location=None,
         x_axis_label="line: predicted",

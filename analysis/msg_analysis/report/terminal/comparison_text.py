@@ -121,7 +121,7 @@ def _print_timing(document: dict[str, Any], console: Console) -> None:
     timing, laws = document.get("timing"), document.get("laws")
     if not timing or not laws:
         return
-    table = number_table(console, "Timing", "", *QUANTILES.values())
+    table = number_table(console, "Timing: quantiles", "", *QUANTILES.values())
     for key, title in TIMES.items():
         values = timing[key]
         table.add_row(Text(title), *(number_text(values[quantile], 3) for quantile in QUANTILES))
