@@ -193,11 +193,10 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
     """Print the results as a table, and which system errors differ at ``level`` (all pairs together)."""
     heads, body = _shown(rows)
     wide = ("experiment", "seed", "time", "smallest p")  # too much for 80 columns
-    columns = [column for column in zip(heads, *body, strict=True) if column[0] not in wide and set(column[1:]) != {"-"}]
-    heads, *body = zip(*columns, strict=True)
-    table = number_table(console, "Results", *heads)
+    kept = [place for place, head in enumerate(heads) if head not in wide and {line[place] for line in body} != {"-"}]
+    table = number_table(console, "Results", *(heads[place] for place in kept))
     for line in body:
-        table.add_row(*map(Text, line))
+        table.add_row(*(Text(line[place]) for place in kept))
     console.print(table)
     for row in rows:
         if row.blame:
