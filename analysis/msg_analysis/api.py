@@ -26,11 +26,10 @@ from msg_analysis.model.experiment import experiment as model
 from msg_analysis.model.experiment.problems import ExperimentError
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.report.documents.transient_and_facts import TransientLaw, solve_transient
 from msg_analysis.theory.leaders.search import SearchProgress, ignore
 from msg_analysis.theory.leaders.selection import SearchMethod, Selection, SelectionLaw, select_leaders
 from msg_analysis.theory.prediction import Moments, Prediction, predict
-from msg_analysis.theory.transient import Transient
+from msg_analysis.theory.transient import Transient, TransientLaw, solve_transient
 from msg_analysis.twin.simulate import simulate
 from msg_analysis.types import FloatArray
 

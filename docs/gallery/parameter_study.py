@@ -19,7 +19,7 @@ for rate in rates.tolist():
 figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
 axes.semilogx(rates, [p.continuous.system_error for p in predictions], label="continuous time")
 axes.semilogx(rates, [p.emulated.system_error for p in predictions], label="steps of 0.05")
-axes.axhline(predictions[0].static.system_error, color="black", linestyle="--", label="graphs held for ever")
+axes.axhline(predictions[0].static.system_error, color="black", linestyle="--", label="graphs held fixed")
 axes.set(xlabel="rate of switching", ylabel="system error")
 axes.legend()
 figure.savefig("parameter_study.png", dpi=120)

@@ -24,7 +24,7 @@ import msg_agents.cli.main
 import msg_analysis.api
 import msg_analysis.cli.main
 import msg_analysis.paper.figures
-import msg_analysis.report.terminal.result_text
+import msg_analysis.report.terminal.comparison_text
 import msg_analysis.twin.check
 
 PROGRAMS = {"msg-analysis": msg_analysis.cli.main.main, "msg-agents": msg_agents.cli.main.main}

@@ -39,7 +39,7 @@ def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level
     if as_json:
         print_json(comparison.to_json())
     else:
-        from msg_analysis.report.terminal.result_text import print_comparison
+        from msg_analysis.report.terminal.comparison_text import print_comparison
 
         print_comparison(comparison.to_json(), result_console())
     context.exit(comparison.exit_code)

@@ -54,7 +54,7 @@ def predict(experiment: Path, as_json: bool) -> None:
     if as_json:
         print_json(document)
     else:
-        from msg_analysis.report.terminal.result_text import print_prediction
+        from msg_analysis.report.terminal.theory_text import print_prediction
 
         print_prediction(document, result_console())
 
@@ -150,7 +150,7 @@ def leaders(experiment: Path, count: int, method: str, law: str | None, gain: fl
     if as_json:
         print_json(document)
     else:
-        from msg_analysis.report.terminal.result_text import print_leaders
+        from msg_analysis.report.terminal.theory_text import print_leaders
 
         print_leaders(document, result_console())
 
@@ -217,12 +217,12 @@ def info(source: Path, as_json: bool) -> None:
     """Explain an experiment file, or say what a bag holds."""
     from msg_analysis.model.experiment.experiment import Experiment
     from msg_analysis.report.documents.info import describe_bag, describe_experiment
-    from msg_analysis.report.terminal import bag_text, result_text
+    from msg_analysis.report.terminal import bag_text, experiment_text
 
     if source.is_dir() or ".mcap" in source.suffixes:
         document, show = describe_bag(source), bag_text.print_bag
     else:
-        document, show = describe_experiment(Experiment.load(source)), result_text.print_experiment
+        document, show = describe_experiment(Experiment.load(source)), experiment_text.print_experiment
     if as_json:
         print_json(document)
     else:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from msg_analysis.cli.console import examples, print_json, result_console
 from msg_analysis.cli.options import FILE, experiment_argument, json_option
 from msg_analysis.common.files import require_place
+from msg_analysis.errors import InputError
+
+if TYPE_CHECKING:
+    from msg_analysis.types import FloatArray
 
 
 @click.command(
@@ -44,14 +49,14 @@ def transient(
 ) -> None:
     """Predict the errors of EXPERIMENT over time, from its own start, exactly."""
     from msg_analysis.model.experiment.experiment import Experiment
-    from msg_analysis.report.documents.transient_and_facts import describe_transient, parse_times, write_transient_csv
+    from msg_analysis.report.documents.transient_and_facts import describe_transient, write_transient_csv
 
     require_place(table)
     loaded = Experiment.load(experiment)
     loaded.require_available("predict")
     document = describe_transient(
         loaded,
-        parse_times(times),
+        _parse_times(times),
         law=law,  # type: ignore[arg-type]  # click has checked it
         unreduced=unreduced,
         moments=moments,
@@ -65,6 +70,26 @@ def transient(
         from msg_analysis.report.terminal.theory_text import print_transient
 
         print_transient(document, result_console())
+
+
+def _parse_times(text: str) -> FloatArray:
+    """Times (T,) from ``START:STOP:STEP`` (STOP included if met) or ``t1,t2,...``; InputError for anything else."""
+    import numpy as np
+
+    wanted = "expected START:STOP:STEP or t1,t2,..., ascending numbers >= 0: for example 0:10:0.5"
+    try:
+        parts = [float(part) for part in text.replace(":", ",").split(",")]
+    except ValueError:
+        raise InputError(f"--times {text}: {wanted}") from None
+    if not np.isfinite(parts).all():
+        raise InputError(f"--times {text}: {wanted}")
+    if ":" not in text:
+        return np.array(parts)
+    if len(parts) != 3 or text.count(":") != 2 or parts[2] <= 0.0 or parts[1] < parts[0]:
+        raise InputError(f"--times {text}: {wanted}")
+    start, stop, step = parts
+    count = int((stop - start) / step * (1.0 + 1e-12) + 1e-9) + 1
+    return np.asarray(start + step * np.arange(count), dtype=float)
 
 
 @click.command(

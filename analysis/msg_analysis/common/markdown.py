@@ -1,4 +1,4 @@
-"""Markdown tables for notebooks, and numbers as text."""
+"""Markdown tables for notebooks."""
 
 from __future__ import annotations
 
@@ -9,8 +9,3 @@ def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]], names: i
     """A Markdown table; the first ``names`` columns hold words, the others right-aligned numbers."""
     lines = [heads, ["---"] * names + ["---:"] * (len(heads) - names), *rows]
     return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
-
-
-def number_text(value: float | None) -> str:
-    """Six significant digits; "-" for None."""
-    return "-" if value is None else f"{value:.6g}"

@@ -1,6 +1,35 @@
-"""Numbers as words of a sentence."""
+"""Numbers as text: in tables, and as words of a sentence."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def number_text(value: float | None, digits: int = 6) -> str:
+    """Significant digits, six unless told otherwise; "-" for None."""
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
+def z_text(value: float | None) -> str:
+    """A z with its sign; "-" for None."""
+    return "-" if value is None else f"{value:+.2f}"
+
+
+def p_text(value: float | None) -> str:
+    """Three significant digits; "-" for None."""
+    return number_text(value, 3)
+
+
+def half_width_text(interval: Sequence[float | None] | None) -> str:
+    """Half the width of an interval around a measured value, two digits: the number after ±; "-" if not known."""
+    low, high = interval or (None, None)
+    return "-" if low is None or high is None else number_text((high - low) / 2, 2)
+
+
+def measured_text(value: float | None, interval: Sequence[float | None] | None) -> str:
+    """A measured value with its 95 % interval: ``1.72 ± 0.15 (95 %)``; without one, the value alone."""
+    half = half_width_text(interval)
+    return number_text(value) + ("" if half == "-" else f" ± {half} (95 %)")
 
 
 def percent(share: float) -> str:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -147,24 +145,21 @@ COLUMNS = (
 
 
 def csv_text(number: int, points: Sequence[Measured]) -> str:
-    """The points of one example as CSV: comment lines that begin with ``#``, a header, a row per point."""
-    text = io.StringIO()
-    text.write(
-        f"# Example {number}: networks of ROS 2 processes in lockstep, dt = {DT:g}, {REPLICAS} replicas, F = I\n"
+    """The points of one example as CSV: comment lines, a header, a row per point."""
+    comments = (
+        f"Example {number}: networks of ROS 2 processes in lockstep, dt = {DT:g}, {REPLICAS} replicas, F = I",
+        "agent 0 is the system; low to high is the 95 % interval; predicted is exact for the steps of the run",
     )
-    text.write(
-        "# agent 0 is the system; low to high is the 95 % interval; predicted is exact for the steps of the run\n"
-    )
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(COLUMNS)
-    for point in points:
-        run = point.run
-        if run.example == number:
-            agent = 0 if point.agent is None else point.agent + 1
-            rates = (run.epsilon, run.r12, run.r21)
-            numbers = (point.value, point.low, point.high, point.predicted, point.z, point.p, point.p_holm)
-            rows.writerow([run.network, point.quantity, agent, *rates, *numbers])
-    return text.getvalue()
+    rows = [
+        (
+            *(point.run.network, point.quantity, 0 if point.agent is None else point.agent + 1),
+            *(point.run.epsilon, point.run.r12, point.run.r21),
+            *(point.value, point.low, point.high, point.predicted, point.z, point.p, point.p_holm),
+        )
+        for point in points
+        if point.run.example == number
+    ]
+    return examples.commented_csv(comments, COLUMNS, rows)
 
 
 def summary(points: Sequence[Measured], runs: int, level: float = LEVEL) -> str:
@@ -174,8 +169,8 @@ def summary(points: Sequence[Measured], runs: int, level: float = LEVEL) -> str:
     least = min(point.p_holm for point in points)
     verdict = f"{len(apart)} disagree with theory" if apart else "all agree with theory"
     return (
-        f"{len(points)} points of {runs} networks: {verdict} (Holm over all points, level {level:g}; least adjusted p "
-        f"{least:.3g}); {100 * within:.0f} % of the 95 % intervals hold the prediction"
+        f"{len(points)} points of {runs} networks: {verdict} (Holm over all points, level {level:g}; smallest adjusted "
+        f"p {least:.3g}); {100 * within:.0f} % of the 95 % intervals contain the prediction"
     )
 
 

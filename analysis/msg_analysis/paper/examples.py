@@ -6,7 +6,9 @@ and are marked as such wherever they are shown.
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -237,6 +239,22 @@ COLUMNS = (
     "q21 [1/time]",
     "value [1/variance]",
 )
+
+
+def csv_text(example: Example) -> str:
+    """The curves as CSV: comment lines, a header with units, a row per point."""
+    comments = (f"Example {example.number}: {example.title}", "agent 0 is the system", *example.remarks)
+    return commented_csv(comments, COLUMNS, table(example))
+
+
+def commented_csv(comments: Iterable[str], columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """CSV below comment lines that begin with ``#``."""
+    text = io.StringIO()
+    text.writelines(f"# {line}\n" for line in comments)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
 
 
 def table(example: Example) -> Iterable[tuple[str | int | float, ...]]:

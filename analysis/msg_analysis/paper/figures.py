@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,8 +20,17 @@ from msg_analysis.model.network.graphs import Graph
 from msg_analysis.paper import emulation, examples
 from msg_analysis.paper.emulation import Measured
 from msg_analysis.paper.examples import CENTRALITY, NODE, SYSTEM, Curve, Example
-from msg_analysis.report.figures.matplotlib_style import STYLE, draw_graph
-from msg_analysis.report.figures.palette import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILLION
+from msg_analysis.report.figures.matplotlib_style import STYLE, draw_graph, rendered
+from msg_analysis.report.figures.palette import (
+    BLACK,
+    BLUE,
+    DARK_GREY,
+    GREEN,
+    INK,
+    ORANGE,
+    PURPLE,
+    VERMILLION,
+)
 
 FORMATS = ("png", "svg", "pdf")
 WIDTH = 7.16  # inches: two columns of a journal
@@ -33,7 +40,7 @@ _STYLE = STYLE | {
     "axes.titlesize": 8,
     "axes.labelsize": 8,
     "axes.labelcolor": BLACK,
-    "axes.edgecolor": "#4b5563",
+    "axes.edgecolor": DARK_GREY,
     "axes.linewidth": 0.6,
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,
@@ -60,12 +67,11 @@ _LOOKS = (
     (PURPLE, (0, (8, 2)), "v"),
 )
 _MARKERS = 5  # on a curve
-_GREY = "#4b5563"
 _LINE = 0.125  # inches between labels
 _SIDE = 0.05  # inches between points at the same rate
 _NOTE = (
     "Curves: continuous time.  Points: networks of ROS 2 processes, 95 % intervals.  "
-    f"Dashes: exact for their steps (dt = {emulation.DT:g})."
+    f"Dashes: prediction for their steps (dt = {emulation.DT:g})."
 )
 
 
@@ -89,8 +95,8 @@ def write_figures(
             with mpl.rc_context(_STYLE):
                 figure = draw(example, measured)
                 for name in formats:
-                    written.append(write_whole(directory / f"{stem}.{name}", _rendered(figure, name)))
-            text = emulation.csv_text(number, measured) if measured else csv_text(example)
+                    written.append(write_whole(directory / f"{stem}.{name}", rendered(figure, name, _DPI)))
+            text = emulation.csv_text(number, measured) if measured else examples.csv_text(example)
             written.append(write_whole(directory / f"{stem}.csv", text.encode()))
     except OSError as error:
         place = error.filename or directory
@@ -98,22 +104,11 @@ def write_figures(
     return written
 
 
-def csv_text(example: Example) -> str:
-    """The curves as CSV: comment lines that begin with ``#``, a header with units, a row per point."""
-    text = io.StringIO()
-    for line in (f"Example {example.number}: {example.title}", "agent 0 is the system", *example.remarks):
-        text.write(f"# {line}\n")
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(examples.COLUMNS)
-    rows.writerows(examples.table(example))
-    return text.getvalue()
-
-
 def draw(example: Example, measured: Sequence[Measured] = ()) -> Figure:
     """The figure of an example, with measured points on its curves; the caller sets the style."""
     figure = {1: _draw_1, 2: _draw_2, 3: _draw_3}[example.number](example, measured)
     if measured:
-        figure.supxlabel(_NOTE, size=7.5, color=_GREY)
+        figure.supxlabel(_NOTE, size=7.5, color=DARK_GREY)
     _settle(figure)
     return figure
 
@@ -126,8 +121,10 @@ def _draw_1(example: Example, measured: Sequence[Measured]) -> Figure:
     for row, (swept, held) in enumerate((("r12", "r21"), ("r21", "r12"))):
         system, node = figure.add_subplot(grid[row, 1]), figure.add_subplot(grid[row, 2])
         for value, name, side in ((0.5, "$G_1$ held", "top"), (1.0, "$G_2$ held", "bottom")):
-            system.axhline(value, color=_GREY, lw=0.7, zorder=1)
-            system.text(2.5, value + (0.012 if side == "bottom" else -0.012), name, color=_GREY, va=side, ha="center")
+            system.axhline(value, color=DARK_GREY, lw=0.7, zorder=1)
+            system.text(
+                2.5, value + (0.012 if side == "bottom" else -0.012), name, color=DARK_GREY, va=side, ha="center"
+            )
         system.set(ylabel="system certainty $1/E$", ylim=(0.43, 1.07), xlim=(0, 5), xlabel=_rate(swept))
         node.set(ylabel="node certainty $1/E_i$", ylim=(1.3, 5.4), xlim=(0, 5), xlabel=_rate(swept))
         curves = [c for c in example.select("line_ring", SYSTEM) if np.ptp(getattr(c, swept)) > 0]
@@ -196,12 +193,12 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
             high = max([c.value.max() for c in curves] + [point.high for point in found])
             axes.set_ylim(low - 0.06 * (high - low), high + 0.36 * (high - low))
             _plot(axes, "epsilon", [(_agent(c), c) for c in curves], heading="agent", height=1.8, measured=measured)
-            axes.text(0.03, 0.985, _orders(curves), transform=axes.transAxes, va="top", size=7, color=_GREY)
+            axes.text(0.03, 0.985, _orders(curves), transform=axes.transAxes, va="top", size=7, color=DARK_GREY)
         lead.set(ylabel="agent 1 above agent 3 [%]", ylim=(-2, 2))
         lead.set_yscale("symlog", linthresh=0.01, linscale=0.6)
         lead.set_yticks([-1, -0.1, -0.01, 0, 0.01, 0.1, 1], ["−1", "−0.1", "−0.01", "0", "0.01", "0.1", "1"])
         lead.yaxis.set_minor_locator(NullLocator())
-        lead.axhline(0, color=_GREY, lw=0.7, zorder=1)
+        lead.axhline(0, color=DARK_GREY, lw=0.7, zorder=1)
         ahead = [
             (name, dataclasses.replace(curves[0], value=100 * (curves[0].value / curves[2].value - 1)))
             for name, curves in (("centrality", central), ("certainty", certain))
@@ -322,7 +319,7 @@ def _note_reconstruction(axes: Axes) -> None:
     """Write below the axes that the graphs are reconstructed."""
     axes.annotate(
         "reconstructed", (0.5, 0.0), (0, -5), xycoords="axes fraction", textcoords="offset points", size=7,
-        color=_GREY, style="italic", ha="center", va="top",
+        color=DARK_GREY, style="italic", ha="center", va="top",
     )  # fmt: skip
 
 
@@ -337,7 +334,7 @@ def _settle(figure: Figure) -> None:
 def _draw_network(axes: Axes, graph: Graph, title: str) -> None:
     angles = np.pi / 2 - 2 * np.pi * np.arange(graph.agents) / graph.agents
     places = {agent: np.array([np.cos(angle), np.sin(angle)]) for agent, angle in enumerate(angles)}
-    draw_graph(axes, graph, places, "#374151", size=110)
+    draw_graph(axes, graph, places, INK, size=110)
     for artist in axes.collections:
         artist.set_clip_on(False)
     axes.set_title("")
@@ -366,12 +363,3 @@ def _agent(curve: Curve) -> str:
 
 def _rate(name: str) -> str:
     return f"$r_{{{name[1:]}}}$"
-
-
-def _rendered(figure: Figure, name: str) -> bytes:
-    stream = io.BytesIO()
-    metadata: dict[str, None] = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}.get(
-        name, {"CreationDate": None, "Creator": None, "Producer": None}
-    )
-    figure.savefig(stream, format=name, metadata=metadata, dpi=_DPI)
-    return stream.getvalue()

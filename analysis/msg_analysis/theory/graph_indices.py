@@ -45,6 +45,13 @@ class GraphIndices:
         }
 
 
+def algebraic_connectivity(graph: Graph) -> float:
+    """Second smallest real part of the Laplacian's eigenvalues, at least 0: the rate of agreement under this graph."""
+    laplacian = graph.laplacian
+    values = np.linalg.eigvalsh(laplacian) if graph.symmetric else np.linalg.eigvals(laplacian)
+    return max(float(np.sort(values.real)[1]), 0.0)
+
+
 def graph_indices(graph: Graph) -> GraphIndices | None:
     """Kirchhoff index and information centrality; None for a directed or disconnected graph.
 

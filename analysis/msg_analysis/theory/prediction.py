@@ -15,7 +15,8 @@ import networkx as nx
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.common.markdown import markdown_table, number_text
+from msg_analysis.common.markdown import markdown_table
+from msg_analysis.common.number_words import number_text
 from msg_analysis.errors import InputError
 from msg_analysis.model.step.sequential_law import StepLaw, build_run_model, step_law
 from msg_analysis.model.step.step_model import StepModel, build_step_model
@@ -30,6 +31,14 @@ if TYPE_CHECKING:
 
 
 ERROR_ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding
+LAW_NAMES = {
+    "continuous": "continuous time",
+    "emulated": "steps of the run",
+    "discrete": "discrete time",
+    "static": "graphs held fixed",
+    "sequential": "sequential steps",
+    "pattern": "logged pattern",
+}  # of laws in texts
 SHOWN_AGENTS = 30  # most agents in a notebook's table; the arrays have all of them
 WEAK_NOISE = 1e-6  # directions with less noise, relative to the noisiest one, do not show whether steps are stable
 
@@ -145,9 +154,9 @@ class Prediction:
 
     def _laws(self) -> dict[str, Moments]:
         """Those moments that there are, by the name that texts give them."""
-        steps = "steps in turn" if self.emulated.law == "sequential" else "steps of the run"
-        laws = {steps: self.emulated, "continuous time": self.continuous, "graphs held fixed": self.static}
-        return {name: law for name, law in laws.items() if law is not None}
+        steps = "sequential" if self.emulated.law == "sequential" else "emulated"
+        laws = {steps: self.emulated, "continuous": self.continuous, "static": self.static}
+        return {LAW_NAMES[key]: law for key, law in laws.items() if law is not None}
 
     def __repr__(self) -> str:
         errors = ", ".join(f"{law.system_error:.6g} ({name})" for name, law in self._laws().items())

@@ -7,20 +7,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from msg_analysis.errors import InputError
+from msg_analysis.model.step.sequential_law import build_run_model
+from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.solvers.moment_operators import mean_propagator, second_moment_propagator
 from msg_analysis.theory.solvers.propagator import Flow
 from msg_analysis.theory.solvers.rational_krylov import RationalFlow, slowest_rate
+from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
     from msg_analysis.model.experiment.experiment import Experiment
+
+TransientLaw = Literal["emulated", "continuous"]
 
 MAX_UNKNOWNS = 300  # largest n p + n, with p = d (d + 1) / 2, whose matrix is propagated as a whole
 MAX_BYTES = 2e9  # largest result
@@ -116,6 +121,42 @@ def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray)
         return Snapshot(law, np.zeros((system.modes, system.dimension)), shares[:, None, None] * stationary)
     place = np.zeros(experiment.agents) if start == "zero" else np.array(start, dtype=float)
     return point_start(system, place - experiment.reference, law)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedTransient:
+    """Moments over time, and what they were computed with."""
+
+    course: Transient
+    system: JumpSystem  # reduced, also where the course is not
+    steady: FloatArray  # (n, d, d) steady second moments of the system
+    unit: float | None  # [units of simulated time] of a step; None in continuous time
+
+
+def solve_transient(
+    experiment: Experiment,
+    times: FloatArray,  # (T,) ascending [units of simulated time]
+    *,
+    law: TransientLaw = "emulated",
+    unreduced: bool = False,
+) -> SolvedTransient:
+    """Moments over time from the experiment's start; ``unreduced`` (consensus only): those of the states, which grow.
+
+    InputError: times or a law that do not fit, too large, or no finite steady errors.
+    """
+    system, unit = _system(experiment, law)
+    steady = MomentSolver(system).steady()
+    if not unreduced:
+        found = transient(system, start_of(experiment, system, steady), _steps(times, unit), steady)
+        return SolvedTransient(found, system, steady, unit)
+    if experiment.problem != "consensus":
+        raise InputError("--unreduced: expected problem: consensus (tracking has no reduction): leave it out")
+    if unit is None:
+        whole = unreduced_consensus(experiment)
+    else:
+        whole = systems.emulated(build_run_model(experiment), "tracking")
+    start = start_of(experiment, whole, system.lift @ steady @ system.lift.T)
+    return SolvedTransient(transient(whole, start, _steps(times, unit)), system, steady, unit)
 
 
 def unreduced_consensus(experiment: Experiment) -> JumpSystem:
@@ -268,3 +309,32 @@ def _check_times(system: JumpSystem, times: FloatArray) -> None:
             f"times: {len(times)} second moments of {system.modes} graphs of {len(system.output)} agents need "
             f"{size / 1e9:.1f} GB, expected at most {MAX_BYTES / 1e9:.0f} GB: give fewer times"
         )
+
+
+def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, float | None]:
+    """The reduced system of a law, and the time of a step (None in continuous time)."""
+    if law == "emulated":
+        return systems.emulated(build_run_model(experiment), experiment.problem), experiment.step_length
+    if experiment.time == "discrete":
+        raise InputError("--law continuous: expected an experiment in continuous time: leave --law out")
+    noise = experiment.noise
+    if experiment.protocol:
+        raise InputError(f"--law continuous: {experiment.protocol.info} has steps only: leave --law out")
+    if noise.broadcast or noise.link or noise.loss or noise.delay:
+        raise InputError(
+            "--law continuous: noise.broadcast, link, loss and delay belong to steps, expected 0: leave --law out"
+        )
+    return systems.continuous(experiment), None
+
+
+def _steps(times: FloatArray, unit: float | None) -> FloatArray:
+    """Times in the unit of the system: in the emulated law, whole numbers of steps."""
+    if unit is None:
+        return times
+    steps = np.round(times / unit)
+    wrong = np.abs(times - steps * unit) > 1e-9 * np.maximum(np.abs(times), unit)
+    if wrong.any():
+        raise InputError(
+            f"--times: {times[wrong][0]:g} is not a multiple of the step {unit:g}: correct it, or use --law continuous"
+        )
+    return np.asarray(steps)

@@ -212,7 +212,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         print_json(document)
         return
     if result.comparison is not None:
-        from msg_analysis.report.terminal.result_text import print_comparison
+        from msg_analysis.report.terminal.comparison_text import print_comparison
 
         print_comparison(document, result_console())
         click.echo(f"bag:    {document['bag']}\nreport: {document['report']}")

@@ -115,7 +115,7 @@ def test_what_is_not_available_is_refused(tmp_path: Path) -> None:
 def test_real_time_is_predicted_in_turn(tmp_path: Path) -> None:
     file = tmp_path / "file.yaml"
     file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nrun: {pace: realtime}\n")
-    assert "steps in turn" in call("predict", file).stdout
+    assert "sequential steps" in call("predict", file).stdout
     document = json.loads(call("predict", file, "--json").stdout)
     assert document["emulated"]["law"] == "sequential"
 
@@ -257,10 +257,10 @@ def test_salvage_of_a_torn_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert verdict["verdict"] == "incomplete"
     assert verdict["steps"] == document["prefix"] > 100
     assert verdict["system_error"]["measured"] > 0
-    assert f"All states are there up to step {verdict['completeness']['stretch'][1]}" in call("compare", out).stdout
+    assert f"All steps up to step {verdict['completeness']['stretch'][1]}" in call("compare", out).stdout
     shown = " ".join(call("salvage", torn, tmp_path / "two").stdout.split())
     assert f"kept {document['kept_messages']} messages" in shown
-    assert "behind the last whole record" in shown
+    assert "after the last complete record" in shown
 
 
 def test_salvage_of_nothing(bag: Path, tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def test_tabulate_takes_the_directory_of_a_run(results: list[Path], tmp_path: Pa
     ("text", "expected"),
     [
         ("", "not JSON"),
-        ("[]", "no JSON object"),
+        ("[]", "not a JSON object"),
         ("{}", "system_error: None"),
         ('{"system_error": {"interval": 3}}', "system_error.interval: 3"),
         ('{"system_error": {"interval": [1, "x"]}, "experiment": "a", "verdict": "agrees"}', "interval: 'x'"),

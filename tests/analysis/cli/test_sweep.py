@@ -96,7 +96,7 @@ def test_tables_hold_what_theory_says_and_nothing_is_done_again(tmp_path: Path) 
     # A changed file: what is new is done, the rest kept.
     over["run.dt"] = [0.05, 0.1, 0.2]
     code, stdout, stderr = call(file(tmp_path, over=over), "--out", out, "--workers", "1")
-    assert "15 predictions, 10 of them before." in " ".join(stdout.split())
+    assert "15 predictions, 10 of them from an earlier sweep." in " ".join(stdout.split())
     assert (out / "points.jsonl").read_bytes().startswith(journal)
 
 

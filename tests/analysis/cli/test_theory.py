@@ -98,12 +98,12 @@ def test_without_noise_nothing_settles(tmp_path):
         ("line_ring", ["--times", "1:0:0.5"], "expected START:STOP:STEP"),
         ("line_ring", ["--times", "0,nan"], "expected START:STOP:STEP"),
         ("line_ring", ["--times", "2,1"], "ascending"),
-        ("line_ring", ["--times", "0.51"], "0.51 is no whole number of steps of 0.05"),
+        ("line_ring", ["--times", "0.51"], "0.51 is not a multiple of the step 0.05"),
         ("line_ring", ["--times", "1", "--fraction", "2"], "settling fraction"),
         ("line_ring", ["--times", "1", "--csv", "/nowhere/file.csv"], "no such directory /nowhere"),
         ("air", ["--times", "1", "--law", "continuous"], "belong to steps"),
         ("discrete", ["--times", "1", "--law", "continuous"], "expected an experiment in continuous time"),
-        ("tracking", ["--times", "1", "--unreduced"], "tracking reduces nothing"),
+        ("tracking", ["--times", "1", "--unreduced"], "tracking has no reduction"),
     ],
 )
 def test_transient_refuses(file, options, message):

@@ -154,7 +154,7 @@ def test_copied_noise_is_named():
     trajectory.record.start[:] = trajectory.record.start[:, :1]
     result = compare(trajectory)
     assert result.verdict == "disagrees"
-    assert any("goes together" in cause.words or cause.kind != "unknown" for cause in result.blame)
+    assert any("is correlated" in cause.words or cause.kind != "unknown" for cause in result.blame)
 
 
 def test_a_forbidden_jump():

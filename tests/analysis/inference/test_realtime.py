@@ -214,7 +214,7 @@ def test_ideal_timers_go_with_the_sequential_law():
     assert result.laws.pattern.supported
     assert result.laws.sequential.supported
     assert result.laws.continuous.supported is False  # steps of 0.1 are seen in a run of this length
-    assert "and so it was" in result.laws.sequential.why
+    assert "as in this log" in result.laws.sequential.why
     assert result.laws.sequential.system_error.predicted == pytest.approx(predict(LONG).emulated.system_error)
     assert result.laws.continuous.system_error.predicted == predict(LONG).continuous.system_error
 
@@ -328,11 +328,11 @@ def test_runs_cut_short(late_timers):
 
 def test_logs_that_do_not_say_enough(late_timers):
     trajectory = late_timers.run(CASES["consensus"])
-    with pytest.raises(InputError, match="expected that every state says the graph"):
+    with pytest.raises(InputError, match="expected graph, values used and time in every state"):
         compare(dataclasses.replace(trajectory, used=None))
     graphs = trajectory.agent_modes.copy()
     graphs[8, 1] = -1
-    with pytest.raises(InputError, match="agent 2: does not say which graph it used in step 7"):
+    with pytest.raises(InputError, match="agent 2: graph or time of step 7 missing"):
         compare(dataclasses.replace(trajectory, agent_modes=graphs))
 
 

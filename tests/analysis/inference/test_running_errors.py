@@ -163,7 +163,7 @@ def test_too_many_agents_for_standard_errors_of_each(monkeypatch: pytest.MonkeyP
     for message in messages(trajectory):
         live.add(*message)
     report = live.report()
-    assert report.note == "too many agents for standard errors of each"
+    assert report.note == "too many agents for intervals of the agent errors"
     assert report.system.z is not None
     assert [node.standard_error for node in report.nodes] == [None] * 4
     assert sum(node.measured or 0.0 for node in report.nodes) == pytest.approx(report.system.measured)

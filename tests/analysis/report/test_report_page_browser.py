@@ -167,11 +167,11 @@ def _tracking() -> tuple[Any, Trajectory]:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (_in_real_time, ["age of the values used", "Real time"]),
-        (_disagreeing, ["The gain of the edge 1-4"]),
-        (_incomplete, ["Too little came"]),
+        (_in_real_time, ["age of values used", "Real time"]),
+        (_disagreeing, ["The gain of edge 1-4 in both directions"]),
+        (_incomplete, ["too early to compute"]),
         (_pooled, ["bag_2", "1, 2, 3"]),
-        (_tracking, ["the leader, agent 2, knows the reference 3", "Probabilities"]),
+        (_tracking, ["the leader, agent 2, is held at the reference 3", "Probabilities"]),
     ],
 )
 def test_every_kind(browser: Any, tmp_path: Path, make: Any, words: list[str]) -> None:

@@ -146,14 +146,14 @@ def _gain_words(one: Selected, accused: Accused) -> Cause:
         return Cause("reference", words, None, None, None, at + one.estimate, (at + low, at + high), at, p)
     if part == "offset":
         value, interval = one.estimate / accused.dt, (low / accused.dt, high / accused.dt)
-        words = f"agent {what + 1} drifts by {_numbers(value, interval)} per unit of time, for no reason"
+        words = f"agent {what + 1} has an additional drift of {_numbers(value, interval)} per unit of time"
         return Cause("offset", words, what + 1, None, None, value, interval, 0.0, p)
     factor, interval = 1.0 + one.estimate, (1.0 + low, 1.0 + high)
     if part in ("all", "sender") and -1.2 < one.estimate < 0.0:
         share, around = -one.estimate, (max(-high, 0.0), -low)
         whose = "all messages" if part == "all" else f"the messages of agent {what + 1}"
         shown = f"{percent(share)} ({100 * around[0]:.3g} to {100 * around[1]:.3g} %)"
-        words = f"{shown} of {whose} have no effect: they are ignored, or all gains on them are that much too small"
+        words = f"{shown} of {whose} have no effect: they are ignored, or all gains on them are too small by this share"
         return Cause("ignored", words, None if part == "all" else what + 1, None, None, share, around, 0.0, p)
     whose, agent, link, graph = _whose_gain(part, what)
     name = None if graph is None else names[graph]
@@ -170,7 +170,7 @@ def _whose_gain(part: str, what: Any) -> tuple[str, int | None, tuple[int, int] 
     if part == "edge":
         pair, graph = what
         first, second = sorted(pair)
-        return f"the gain of the edge {first + 1}-{second + 1}, both ways,", None, (first + 1, second + 1), graph
+        return f"the gain of edge {first + 1}-{second + 1} in both directions", None, (first + 1, second + 1), graph
     if part == "receiver in graph":
         return f"agent {what[0] + 1}'s gain on all that it hears", what[0] + 1, None, what[1]
     if part == "receiver":
@@ -221,7 +221,7 @@ def _correlations(sums: InnovationSums, pardoned: Sequence[int], families: int, 
             half = float(stats.norm.ppf(0.975)) / math.sqrt(samples - 3)
             interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
             words = (
-                f"the noise of the agents {j + 1} and {i + 1} has the correlation {_numbers(seen, interval)}, "
+                f"the noise of agents {j + 1} and {i + 1} has correlation {_numbers(seen, interval)}, "
                 f"not {expected:.3g}"
             )
             link = (j + 1, i + 1)
@@ -235,7 +235,7 @@ def _switching(accused: Accused, families: int, level: float) -> list[Cause]:
     transition = accused.chain.transition(accused.dt)
     found = []
     for g, h in np.argwhere((counts > 0) & (transition == 0.0)).tolist():
-        words = f"the graph went {counts[g, h]} times from {names[g]} to {names[h]}, which it never should"
+        words = f"the graph jumped {counts[g, h]} times from {names[g]} to {names[h]}, which the law excludes"
         found.append(Cause("switching", words, None, None, [names[g], names[h]], float(counts[g, h]), None, 0.0, 0.0))
     if found:
         return found
@@ -294,13 +294,11 @@ def _broadcast_words(one: Selected) -> Cause:
 def _unknown(rejected: Sequence[str]) -> Cause:
     names = ", ".join(rejected)
     if list(rejected) == ["innovations: whiteness"]:
-        words = "the noise of successive steps, or of replicas, goes together: random numbers are used twice"
+        words = "the noise of successive steps or of replicas is correlated: random numbers are used twice"
     elif set(rejected) <= {"system error", "covariance"} or all(name.startswith("error of") for name in rejected):
-        words = (
-            f"nothing is wrong with the steps themselves: rare chance, or another start than the file says ({names})"
-        )
+        words = f"the steps follow the law, but the errors differ: chance, or another start than in the file ({names})"
     else:
-        words = f"no single gain, noise or rate explains it ({names})"
+        words = f"no single gain, noise variance or rate explains the rejected tests ({names})"
     return Cause("unknown", words)
 
 

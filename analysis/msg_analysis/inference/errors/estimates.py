@@ -122,9 +122,9 @@ def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
     measured = system.lifted(means.second_moments)
     predicted = system.lifted(means.expected_moments)
     if not means.joint:
-        note = "too many agents for a joint test; the node errors are tested one by one"
+        note = "too many agents for a joint test; the agent errors are tested one by one"
         if not len(means.nodes):
-            note = "too many agents for a joint test, and for tests of the node errors in a run of this length"
+            note = "too many agents for a joint test, and for tests of the agent errors in a run of this length"
         return CovarianceTest(measured, predicted, note=note)
     chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
     p: float | None = None

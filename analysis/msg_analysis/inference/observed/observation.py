@@ -100,15 +100,14 @@ def _known_steps(trajectory: Trajectory) -> int:
     steps = trajectory.prefix
     if trajectory.agent_modes is None or trajectory.used is None or trajectory.made is None:
         raise InputError(
-            "the log of a run in real time: expected that every state says the graph and the values that it was made "
-            "from, and when: record it again with this version"
+            "log of a run in real time: expected graph, values used and time in every state: record it again with this "
+            "version"
         )
     unknown = np.argwhere((trajectory.agent_modes[1 : steps + 1] < 0) | (trajectory.made[1 : steps + 1] < 0))
     if len(unknown):
         step, agent = unknown[0].tolist()
         raise InputError(
-            f"agent {agent + 1}: does not say which graph it used in step {step}, or when: expected in the log of a "
-            "run in real time"
+            f"agent {agent + 1}: graph or time of step {step} missing: expected in the log of a run in real time"
         )
     newest = trajectory.used[:steps].max(axis=(1, 2), initial=-1)
     while (beyond := newest[:steps] > steps).any():  # only where the run is not complete

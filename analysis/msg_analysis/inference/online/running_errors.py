@@ -66,9 +66,9 @@ class LiveEstimate:
         self._newest = -1
         self._note = reason
         if prediction is not None and not lockstep:
-            self._note = "in real time, what is expected depends on how late agents are: compare the bag"
+            self._note = "in real time the expected errors depend on the lateness of the agents: compare the bag"
         elif prediction is not None and not self._errors.nodes_judged:
-            self._note = "too many agents for standard errors of each"
+            self._note = "too many agents for intervals of the agent errors"
 
     def add(self, agent: int, step: int, mode: int, payload: bytes) -> None:
         """Add x(step) of an agent (from 0), see ``StepCollector.add``; ``mode`` is from 1, 0 at step 0."""

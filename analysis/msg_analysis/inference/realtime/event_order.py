@@ -35,12 +35,12 @@ def order_events(observation: Observation) -> EventOrder:
     if len(early):
         k, i, d = early[0].tolist()
         contradiction = (
-            f"agent {i + 1} used in step {k} a value of agent {senders[k, i, d] + 1} that was made "
-            f"{(heard[k, i, d] - after[k, i]) / 1e9:.3g} units of time later, {len(early)} cases in all: their clocks "
+            f"in step {k} agent {i + 1} used a value that agent {senders[k, i, d] + 1} computed "
+            f"{(heard[k, i, d] - after[k, i]) / 1e9:.3g} units of time later ({len(early)} such cases): their clocks "
             "disagree"
         )
     elif (np.diff(made, axis=0) < 0).any() or (after <= 0).any():
-        contradiction = "states of an agent were made before earlier ones of the same agent: its clock went back"
+        contradiction = "the times of an agent's states decrease: its clock was set back"
     own = np.argwhere(after == made[:-1])
     own = own[own[:, 0] > 0]
     others = np.argwhere((heard == after[:, :, None]) & (timers.used > 0))
@@ -50,7 +50,7 @@ def order_events(observation: Observation) -> EventOrder:
     source = np.concatenate([own[:, 0] * m + own[:, 1], timers.used[k, i, d] * m + senders[k, i, d]])
     turn, circular = _turns(source, target, made.size)
     if circular:
-        contradiction = contradiction or "states were made of each other at the same time"
+        contradiction = contradiction or "agents used new values of each other at the same time"
     level = turn.reshape(made.shape)
     agents = np.tile(np.arange(made.shape[1]), len(after))
     steps = np.repeat(np.arange(len(after)), made.shape[1])

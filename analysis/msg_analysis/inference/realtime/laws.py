@@ -16,10 +16,14 @@ from msg_analysis.inference.realtime.event_order import EventOrder, sampled
 from msg_analysis.inference.realtime.logged_pattern import PatternUnavailableError, pattern_means, timing_effect
 from msg_analysis.inference.realtime.timing import Timing
 from msg_analysis.inference.statistics.holm import holm
+from msg_analysis.theory.prediction import LAW_NAMES
 
 MAX_MISSED = 0.01  # largest share of missed deadlines with which a law without lateness can be supported
 
 MAX_EFFECT = 0.01  # largest relative change of the system error that a law may leave out and still be supported
+
+
+SUPPORT = {True: "supported", False: "not supported", None: "not decided"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +56,13 @@ class Laws:
     def why(self) -> str:
         """The reasons of all three, in words."""
         laws = {
-            "logged-pattern law": self.pattern,
-            "sequential law": self.sequential,
-            "continuous law": self.continuous,
+            "pattern": self.pattern,
+            "sequential": self.sequential,
+            "continuous": self.continuous,
         }
-        said = {True: "supported", False: "not supported", None: "not decided"}
-        return " ".join(f"The {name} is {said[law.supported]}: {law.why}." for name, law in laws.items())
+        return " ".join(
+            f"{LAW_NAMES[key].capitalize()} ({SUPPORT[law.supported]}): {law.why}." for key, law in laws.items()
+        )
 
     def to_json(self) -> dict[str, Any]:
         """The JSON document."""
@@ -85,7 +90,7 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
         effect = timing_effect(observation, means)
     except PatternUnavailableError as reason:
         means = sequential
-        pattern = Law(Estimate(error.measured), None, f"it is not available: {reason}")
+        pattern = Law(Estimate(error.measured), None, f"not available: {reason}")
     late = timing.missed_share > MAX_MISSED
     law = _sequential(error, p, level, _departures(timing), effect, late)
     return means, Laws(pattern, law, _continuous(observation, error, level, late))
@@ -94,16 +99,12 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
 def _pattern(observation: Observation, means: TimeMeans, level: float) -> Law:
     error, p = _least(observation, means)
     if p is None:
-        return Law(error, None, "without noise there is nothing to measure")
+        return Law(error, None, "without noise the errors cannot be tested")
+    logged = "the prediction for the values and graphs that the agents logged"
     if p >= level:
-        why = "with the values and graphs that the agents say they used, the errors are as they should be"
-    else:
-        why = (
-            "with the values and graphs that the agents say they used, the errors should be others "
-            f"(system error {_z(error)}, least p {p:.2g}); this law holds whatever the timing, so agents did something "
-            "else than their law, or than they say"
-        )
-    return Law(error, p >= level, why)
+        return Law(error, True, f"the errors agree with {logged}")
+    why = "this law holds for any timing, so an agent did not follow its law, or its log is wrong"
+    return Law(error, False, f"the errors differ from {logged} ({_tested(error, p)}); {why}")
 
 
 def _departures(timing: Timing) -> list[str]:
@@ -112,59 +113,60 @@ def _departures(timing: Timing) -> list[str]:
     if timing.missed:
         facts.append(f"{percent(timing.missed_share)} of the deadlines were missed")
     if timing.ideal_uses < timing.uses:
-        facts.append(f"{percent(1.0 - timing.ideal_share)} of the values used were not those that it assumes")
+        facts.append(f"{percent(1.0 - timing.ideal_share)} of the values used were not those of ideal timers")
     if timing.outdated_graphs:
-        facts.append(f"{percent(timing.outdated_share)} of the steps were made with another graph than the network's")
+        facts.append(f"{percent(timing.outdated_share)} of the steps used an outdated graph")
     return facts
 
 
 def _sequential(
     error: Estimate, p: float | None, level: float, departures: list[str], effect: float | None, late: bool
 ) -> Law:
-    why = "it assumes that nobody is late and that all is heard at once; "
+    why = "assumes that every step is on time and every message arrives at once"
     if not departures:
-        why += "and so it was"
+        why += ", as in this log"
     else:
-        why += departures[0] if len(departures) == 1 else ", ".join(departures[:-1]) + " and " + departures[-1]
+        first = ", ".join(departures[:-1])
+        why += ", but " + (f"{first} and " if first else "") + departures[-1]
         if effect is not None:
             why += f", which changes the system error by {_change(effect)}"
     if p is None:
         return Law(error, None, why)
     if p < level:
-        return Law(error, False, f"{why}; the errors are others (system error {_z(error)}, least p {p:.2g})")
+        return Law(error, False, f"{why}; the measured errors differ ({_tested(error, p)})")
     if late:
         return Law(error, False, why)
     if not departures or (effect is not None and abs(effect) <= MAX_EFFECT):
         return Law(error, True, why)
-    return Law(error, None, f"{why}; in a run of this length the errors do not show it")
+    return Law(error, None, f"{why}; the run is too short to show a difference")
 
 
 def _continuous(observation: Observation, sequential: Estimate, level: float, late: bool) -> Law:
     """With the standard error of the sequential law, from which that of the continuous law would hardly differ."""
     law, experiment = observation.prediction.continuous, observation.prediction.experiment
     if law is None:
-        return Law(Estimate(sequential.measured), None, "there is none for this experiment")
+        return Law(Estimate(sequential.measured), None, "not available for this experiment")
     predicted = law.system_error
     if not sequential.standard_error or sequential.measured is None or not predicted:
-        return Law(Estimate(sequential.measured, predicted), None, "without noise there is nothing to measure")
+        return Law(Estimate(sequential.measured, predicted), None, "without noise the errors cannot be tested")
     if experiment.run.start != "stationary":
-        why = "the run did not start in the steady state, which is all that is known of this law here"
+        why = "only its steady state is predicted, and the run did not start there"
         return Law(Estimate(sequential.measured, predicted), None, why)
     z = (sequential.measured - predicted) / sequential.standard_error
     p = float(2.0 * stats.norm.sf(abs(z)))
     error = Estimate(sequential.measured, predicted, sequential.standard_error, z, p)
     effect = observation.prediction.emulated.system_error / predicted - 1.0
     why = (
-        f"it leaves out that the agents make steps (of {observation.step.dt:g}), one after the other, which changes "
-        f"the system error by {_change(effect)}"
+        f"ignores that the agents make steps of {observation.step.dt:g}, one after the other, which changes the "
+        f"system error by {_change(effect)}"
     )
     if p < level:
-        return Law(error, False, f"{why}; the measured one differs ({_z(error)})")
+        return Law(error, False, f"{why}; the measured system error differs ({_z(error)})")
     if late:
         return Law(error, False, f"{why}, and that deadlines were missed")
     if abs(effect) <= MAX_EFFECT:
         return Law(error, True, why)
-    return Law(error, None, f"{why}; a run of this length does not show it")
+    return Law(error, None, f"{why}; the run is too short to show a difference")
 
 
 def _least(observation: Observation, means: TimeMeans) -> tuple[Estimate, float | None]:
@@ -178,6 +180,10 @@ def _least(observation: Observation, means: TimeMeans) -> tuple[Estimate, float 
 
 def _change(effect: float) -> str:
     return f"{100 * effect:+.2g} %"
+
+
+def _tested(error: Estimate, p: float) -> str:
+    return f"system error {_z(error)}, smallest p {p:.2g}"
 
 
 def _z(estimate: Estimate) -> str:

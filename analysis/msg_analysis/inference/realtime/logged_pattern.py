@@ -82,8 +82,8 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
     entries = periods.largest
     if entries > MAX_ENTRIES:
         raise PatternUnavailableError(
-            f"up to {entries} values have to be known at the same time, {MAX_ENTRIES} are allowed: some were used long "
-            "after they were made"
+            f"{entries} values are in use at the same time, expected at most {MAX_ENTRIES}: some were used long after "
+            "they were computed"
         )
     p = packed_symmetric.size(system.dimension)
     for kind in ("joint", "nodes", "system"):
@@ -93,7 +93,7 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
         if work <= MAX_WORK:
             break
     else:
-        raise PatternUnavailableError(f"{steps} steps of {entries} values are too many to follow one by one")
+        raise PatternUnavailableError(f"{steps} steps of {entries} values are too many to compute")
     lifted = packed_symmetric.unpack(forms, system.dimension)
     lifted = system.lift @ lifted @ system.lift.T
 

@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from msg_analysis.common.markdown import markdown_table, number_text
+from msg_analysis.common.markdown import markdown_table
+from msg_analysis.common.number_words import half_width_text, measured_text, number_text, z_text
 from msg_analysis.inference.blame.causes import Cause
 from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.errors.given_path import GivenPath
@@ -152,8 +153,7 @@ class Comparison:
 
     def __repr__(self) -> str:
         total, runs = self.system_error, f"{len(self.pool.members)} runs" if self.pool else "run"
-        numbers = f"measured {number_text(total.measured)} +- {number_text(total.standard_error)}"
-        numbers += f", predicted {number_text(total.predicted)}"
+        numbers = f"measured {measured_text(total.measured, total.interval)}, predicted {number_text(total.predicted)}"
         name = self.trajectory.record.experiment.name
         return f"<Comparison, {runs} of {name!r}: {self.verdict}; system error {numbers}>"
 
@@ -161,8 +161,10 @@ class Comparison:
         rows = [
             (
                 name,
-                *map(number_text, (error.measured, error.standard_error, error.predicted)),
-                "-" if error.z is None else f"{error.z:+.2f}",
+                number_text(error.measured),
+                half_width_text(error.interval),
+                number_text(error.predicted),
+                z_text(error.z),
             )
             for name, error in [
                 ("**system**", self.system_error),
@@ -170,7 +172,7 @@ class Comparison:
             ]
         ]
         rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
-        table = markdown_table(("mean-square error", "measured", "standard error", "predicted", "z"), rows)
+        table = markdown_table(("mean-square error", "measured", "± (95 %)", "predicted", "z"), rows)
         blame = "".join(f"- {cause.words}\n" for cause in self.blame)
         return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
 

@@ -100,7 +100,7 @@ def _require_another(members: list[Member], name: str, record: RunRecord) -> Non
         key, mine, others = differs
         raise InputError(
             f"{name}: {key}: {_shown(mine)}, but {_shown(others)} in {members[0].name}: pool runs of one experiment "
-            "(seed and duration may differ), and put others beside each other with `msg-analysis tabulate`"
+            "(seed and duration may differ), and compare others with `msg-analysis tabulate`"
         )
 
 

@@ -77,6 +77,12 @@ class MarkovChain:
         return stationary_law(self.matrix)
 
     @property
+    def holding_times(self) -> list[float | None]:
+        """Mean time in each graph before it is left [units of simulated time]; None where it is never left."""
+        leaving = (self.matrix - np.diag(np.diag(self.matrix))).sum(axis=1)
+        return [1.0 / rate if rate > 0 else None for rate in leaving.tolist()]
+
+    @property
     def reversed(self) -> MarkovChain:
         """The stationary chain backwards in time: its rates are pi_j Gamma_ji / pi_i, or pi_j P_ji / pi_i."""
         law = self.stationary

@@ -7,7 +7,7 @@ from typing import Any
 
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.model.experiment.problems import show
-from msg_analysis.report.documents.info import algebraic_connectivity, holding_times
+from msg_analysis.theory.graph_indices import algebraic_connectivity
 
 
 def explain(experiment: Experiment) -> list[str]:
@@ -20,7 +20,7 @@ def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
 
     ``held`` is the mean holding time [units of simulated time]; None for a graph that is never left.
     """
-    rows = zip(experiment.graph_list, experiment.chain.stationary, holding_times(experiment), strict=True)
+    rows = zip(experiment.graph_list, experiment.chain.stationary, experiment.chain.holding_times, strict=True)
     return [
         {
             "name": graph.name,
@@ -38,81 +38,76 @@ def _task(experiment: Experiment) -> str:
     agents, leaders = experiment.agents, experiment.leaders
     if experiment.protocol:
         info = experiment.protocol.info
-        kind = "linear" if info.linear else "not linear, so theory predicts nothing for it"
+        kind = "linear" if info.linear else "not linear, so there is no prediction"
         return f"{agents} agents follow the protocol {info.name} of the package {info.package} ({kind})."
-    text = f"{agents} agents hold one number each, and keep moving it towards the numbers that they hear of others"
+    text = f"Each of {agents} agents has a number as its state and moves it towards the states that it receives"
     if leaders is None:
         return (
-            f"{text}, to agree on one (consensus). An agent's error is the mean square of its distance from the "
-            "average of all; the system error is the sum over the agents."
+            f"{text} (consensus). An agent error is the mean square of the distance of a state from the average of all "
+            "states; the system error is the sum of the agent errors."
         )
     one = len(leaders.agents) == 1
-    who = f"agent {leaders.agents[0]}, knows" if one else f"agents {show(leaders.agents)[1:-1]}, know"
-    pull = (
-        f"{'is' if one else 'are'} held at it"
-        if math.isinf(leaders.gain)
-        else f"{'is' if one else 'are'} drawn to it with gain {leaders.gain:g}"
-    )
+    who = f"leader, agent {leaders.agents[0]}, is" if one else f"leaders, agents {show(leaders.agents)[1:-1]}, are"
+    pull = "held at" if math.isinf(leaders.gain) else f"pulled with gain {leaders.gain:g} to"
     return (
-        f"{text}; the {'leader' if one else 'leaders'}, {who} the reference {leaders.reference:g} and {pull}. "
-        "An agent's error is the mean square of its distance from the reference; the system error is the sum over "
-        "the agents."
+        f"{text}; the {who} {pull} the reference {leaders.reference:g} (tracking). An agent error is the mean square "
+        "of the distance of a state from the reference; the system error is the sum of the agent errors."
     )
 
 
 def _switching(experiment: Experiment) -> str:
     modes, chain = len(experiment.graph_list), experiment.chain
     if modes == 1:
-        return f"Who hears whom is always the same: the graph {experiment.graph_list[0].name}."
+        return f"The graph is always {experiment.graph_list[0].name}."
     first = experiment.switching.initial
     begin = (
-        "The first graph is drawn from the law of how much time each has."
+        "The first graph is drawn from the stationary distribution."
         if first == "stationary"
         else f"The first graph is {first}."
     )
     if chain.time == "discrete":
-        return f"Who hears whom is one of {modes} graphs, drawn anew in every step by a Markov chain. {begin}"
-    times = [time for time in holding_times(experiment) if time is not None]
+        return f"The graph switches between {modes} graphs: a Markov chain that may jump in every step. {begin}"
+    times = [time for time in experiment.chain.holding_times if time is not None]
     held = f"{min(times):.3g}" if max(times) - min(times) < 1e-9 else f"{min(times):.3g} to {max(times):.3g}"
     return (
-        f"Who hears whom is one of {modes} graphs, and jumps at random (a Markov chain in continuous time); a graph "
-        f"stays for {held} units of time on average. {begin}"
+        f"The graph switches between {modes} graphs: a Markov chain in continuous time, with mean holding time "
+        f"{held} [units of simulated time]. {begin}"
     )
 
 
 def _noise(experiment: Experiment) -> str:
     noise = experiment.noise
     process = noise.process
-    size = f"of gain {process:g}" if isinstance(process, float | int) else "of a gain of its own, given as a matrix"
+    size = f"gain {process:g}" if isinstance(process, float | int) else "a gain matrix"
     if isinstance(process, dict):
-        size = "whose gain depends on the graph"
+        size = "a gain that depends on the graph"
     elif isinstance(process, list) and not isinstance(process[0], list):
-        size = "of a gain of each agent's own"
-    parts = [f"All the time noise {size} pushes the numbers about"]
+        size = "a different gain for each agent"
+    parts = [f"Process noise with {size} acts on the states"]
     if noise.broadcast:
-        parts.append(f"what an agent says is wrong by {noise.broadcast:g} (standard deviation), the same for all")
+        parts.append(f"published values have noise of standard deviation {noise.broadcast:g}, equal for all receivers")
     if noise.link:
-        parts.append(f"each receiver adds noise of {noise.link:g}")
+        parts.append(f"each receiver adds noise of standard deviation {noise.link:g}")
     if noise.loss:
         parts.append(f"{100 * noise.loss:.3g} % of the messages are lost")
     if noise.delay:
-        parts.append(f"what is heard is {noise.delay} steps old")
+        parts.append(f"received values are {noise.delay} steps old")
     return "; ".join(parts) + "."
 
 
 def _run(experiment: Experiment) -> str:
     run = experiment.run
-    copies = "1 copy" if run.replicas == 1 else f"{run.replicas} independent copies under the same graphs"
-    start = {"stationary": "begun in the steady state", "zero": "begun at 0"}
-    begun = start[run.start] if isinstance(run.start, str) else "begun at given values"
+    replicas = "1 replica" if run.replicas == 1 else f"{run.replicas} independent replicas on the same graph path"
+    start = {"stationary": "the steady state", "zero": "0"}
+    begun = start[run.start] if isinstance(run.start, str) else "given values"
     if run.pace == "realtime":
         pace = (
-            f"In real time: every agent steps by a timer of its own, {run.speed / experiment.step_length:.3g} times a "
-            "second, with the newest values that it has."
+            f"Real time: the timer of each agent starts {run.speed / experiment.step_length:.3g} steps per second, "
+            "with the newest values received."
         )
     else:
-        pace = "In lockstep: all agents make the same step before the next."
+        pace = "Lockstep: all agents use values of the same step."
     return (
-        f"The run makes {experiment.steps} steps of {experiment.step_length:g} ({run.duration:g} units of simulated "
-        f"time) of {copies}, {begun}. {pace}"
+        f"The run has {experiment.steps} steps of {experiment.step_length:g} ({run.duration:g} units of simulated "
+        f"time) and {replicas}, and starts from {begun}. {pace}"
     )

@@ -7,12 +7,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import memory, validation
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.model.network.graphs import Graph
+from msg_analysis.theory.graph_indices import algebraic_connectivity
 from msg_analysis.theory.prediction import predict
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
                 "stability_limit": limit,
             }
             for graph, share, holding_time, limit in zip(
-                experiment.graph_list, chain.stationary, holding_times(experiment), limits, strict=True
+                experiment.graph_list, chain.stationary, chain.holding_times, limits, strict=True
             )
         ],
         "stability_limit": min((limit for limit in limits if limit is not None), default=None),
@@ -160,25 +159,11 @@ def _protocol(experiment: Experiment) -> dict[str, Any] | None:
     }
 
 
-def algebraic_connectivity(graph: Graph) -> float:
-    """Second smallest real part of the Laplacian's eigenvalues, at least 0: the rate of agreement under this graph."""
-    laplacian = graph.laplacian
-    values = np.linalg.eigvalsh(laplacian) if graph.symmetric else np.linalg.eigvals(laplacian)
-    return max(float(np.sort(values.real)[1]), 0.0)
-
-
 def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
     if experiment.time == "discrete" or experiment.noise.delay or experiment.protocol:
         return None
     limit = validation.stability_limit(graph, experiment.leader_gains)
     return limit if math.isfinite(limit) else None
-
-
-def holding_times(experiment: Experiment) -> list[float | None]:
-    """Mean time in each graph before it is left [units of simulated time]; None where it is never left."""
-    matrix = experiment.chain.matrix
-    leaving = (matrix - np.diag(np.diag(matrix))).sum(axis=1)
-    return [1.0 / rate if rate > 0 else None for rate in leaving.tolist()]
 
 
 def _predicted_system_error(experiment: Experiment) -> float | None:

@@ -4,46 +4,24 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import Experiment
-from msg_analysis.model.step.sequential_law import build_run_model
 from msg_analysis.theory.facts import check_facts
 from msg_analysis.theory.graph_indices import error_bounds, graph_indices
-from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.theory.transient import Transient, point_start, start_of, transient, unreduced_consensus
+from msg_analysis.theory.transient import TransientLaw, point_start, solve_transient, start_of
 from msg_analysis.theory.two_topology import two_topology
 from msg_analysis.types import FloatArray
 
-TransientLaw = Literal["emulated", "continuous"]
 Result = TypeVar("Result")
-
-
-def parse_times(text: str) -> FloatArray:
-    """Times (T,) from ``START:STOP:STEP`` (STOP included if met) or ``t1,t2,...``; InputError for anything else."""
-    wanted = "expected START:STOP:STEP or t1,t2,..., ascending numbers >= 0: for example 0:10:0.5"
-    try:
-        parts = [float(part) for part in text.replace(":", ",").split(",")]
-    except ValueError:
-        raise InputError(f"--times {text}: {wanted}") from None
-    if not np.isfinite(parts).all():
-        raise InputError(f"--times {text}: {wanted}")
-    if ":" not in text:
-        return np.array(parts)
-    if len(parts) != 3 or text.count(":") != 2 or parts[2] <= 0.0 or parts[1] < parts[0]:
-        raise InputError(f"--times {text}: {wanted}")
-    start, stop, step = parts
-    count = int((stop - start) / step * (1.0 + 1e-12) + 1e-9) + 1
-    return np.asarray(start + step * np.arange(count), dtype=float)
 
 
 def describe_transient(
@@ -78,72 +56,6 @@ def describe_transient(
         document["mode_means"] = found.mode_means.tolist()
         document["mode_second_moments"] = found.mode_second_moments.tolist()
     return document
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SolvedTransient:
-    """Moments over time, and what they were computed with."""
-
-    course: Transient
-    system: JumpSystem  # reduced, also where the course is not
-    steady: FloatArray  # (n, d, d) steady second moments of the system
-    unit: float | None  # [units of simulated time] of a step; None in continuous time
-
-
-def solve_transient(
-    experiment: Experiment,
-    times: FloatArray,  # (T,) ascending [units of simulated time]
-    *,
-    law: TransientLaw = "emulated",
-    unreduced: bool = False,
-) -> SolvedTransient:
-    """Moments over time from the experiment's start; ``unreduced`` (consensus only): those of the states, which grow.
-
-    InputError: times or a law that do not fit, too large, or no finite steady errors.
-    """
-    system, unit = _system(experiment, law)
-    steady = MomentSolver(system).steady()
-    if not unreduced:
-        found = transient(system, start_of(experiment, system, steady), _steps(times, unit), steady)
-        return SolvedTransient(found, system, steady, unit)
-    if experiment.problem != "consensus":
-        raise InputError("--unreduced: expected problem: consensus, since tracking reduces nothing: leave it out")
-    if unit is None:
-        whole = unreduced_consensus(experiment)
-    else:
-        whole = systems.emulated(build_run_model(experiment), "tracking")
-    start = start_of(experiment, whole, system.lift @ steady @ system.lift.T)
-    return SolvedTransient(transient(whole, start, _steps(times, unit)), system, steady, unit)
-
-
-def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, float | None]:
-    """The reduced system of a law, and the time of a step (None in continuous time)."""
-    if law == "emulated":
-        return systems.emulated(build_run_model(experiment), experiment.problem), experiment.step_length
-    if experiment.time == "discrete":
-        raise InputError("--law continuous: expected an experiment in continuous time: leave --law out")
-    noise = experiment.noise
-    if experiment.protocol:
-        raise InputError(f"--law continuous: {experiment.protocol.info} has steps only: leave --law out")
-    if noise.broadcast or noise.link or noise.loss or noise.delay:
-        raise InputError(
-            "--law continuous: noise.broadcast, link, loss and delay belong to steps, expected 0: leave --law out"
-        )
-    return systems.continuous(experiment), None
-
-
-def _steps(times: FloatArray, unit: float | None) -> FloatArray:
-    """Times in the unit of the system: steps in the emulated law, which must be whole."""
-    if unit is None:
-        return times
-    steps = np.round(times / unit)
-    wrong = np.abs(times - steps * unit) > 1e-9 * np.maximum(np.abs(times), unit)
-    if wrong.any():
-        raise InputError(
-            f"--times: {times[wrong][0]:g} is no whole number of steps of {unit:g}, expected multiples: correct it, "
-            "or use --law continuous"
-        )
-    return np.asarray(steps)
 
 
 def _settling(

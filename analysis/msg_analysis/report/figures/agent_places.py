@@ -1,4 +1,4 @@
-"""Positions of the agents in drawings: the same in every graph of an experiment."""
+"""What drawings of graphs share: places of the agents, the same in every graph, numbers of agents, widths of links."""
 
 from __future__ import annotations
 
@@ -8,6 +8,14 @@ import networkx as nx
 
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.types import FloatArray
+
+LABELLED = 40
+"""Most agents whose numbers are shown."""
+
+
+def line_width(share: float) -> float:
+    """Width of a link whose weight is this share of the heaviest one."""
+    return 0.4 + 1.3 * share
 
 
 def places(graph_list: Sequence[Graph]) -> Mapping[int, FloatArray]:

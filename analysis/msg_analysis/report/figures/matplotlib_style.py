@@ -1,14 +1,17 @@
-"""matplotlib style of the figures, and drawings of graphs."""
+"""matplotlib style of the figures, their files, and drawings of graphs."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Set
 
 import networkx as nx
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from msg_analysis.model.network.graphs import Graph
-from msg_analysis.report.figures.palette import BLACK, shorten
+from msg_analysis.report.figures.agent_places import LABELLED, line_width
+from msg_analysis.report.figures.palette import BLACK, DARK_GREY, INK, LIGHT_GREY, PALE, shorten
 from msg_analysis.types import FloatArray
 
 STYLE = {
@@ -16,19 +19,31 @@ STYLE = {
     "font.size": 9.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.edgecolor": "#9ca3af",
+    "axes.edgecolor": LIGHT_GREY,
     "axes.titlesize": 10,
-    "axes.labelcolor": "#374151",
-    "xtick.color": "#4b5563",
-    "ytick.color": "#4b5563",
+    "axes.labelcolor": INK,
+    "xtick.color": DARK_GREY,
+    "ytick.color": DARK_GREY,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "grid.color": "#e5e7eb",
+    "grid.color": PALE,
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "svg.hashsalt": "msg_analysis",
 }
-_LABELLED = 40  # most agents whose numbers are shown
+
+
+def plain(text: str) -> str:
+    """The text without mathematics, which matplotlib finds between dollars."""
+    return text.replace("$", r"\$")
+
+
+def rendered(figure: Figure, kind: str, dpi: float) -> bytes:
+    """The file of a figure (png, svg or pdf), without times and versions in it."""
+    without = {"png": ("Software",), "svg": ("Date", "Creator")}.get(kind, ("CreationDate", "Creator", "Producer"))
+    stream = io.BytesIO()
+    figure.savefig(stream, format=kind, dpi=dpi, metadata=dict.fromkeys(without))
+    return stream.getvalue()
 
 
 def draw_graph(
@@ -42,13 +57,13 @@ def draw_graph(
 ) -> None:
     """Draw one graph; leaders are squares."""
     agents = graph.agents
-    size = size or (float(min(4200 / agents, 260)) if agents <= _LABELLED else 14.0)
+    size = size or (float(min(4200 / agents, 260)) if agents <= LABELLED else 14.0)
     network = nx.DiGraph() if not graph.symmetric else nx.Graph()
     network.add_nodes_from(range(agents))
     arcs = graph.edges if graph.symmetric else graph.arcs
     network.add_weighted_edges_from((source - 1, target - 1, weight) for source, target, weight in arcs)
     heaviest = max((weight for _, _, weight in arcs), default=1.0)
-    widths = [0.4 + 1.3 * weight / heaviest for _, _, weight in arcs]
+    widths = [line_width(weight / heaviest) for _, _, weight in arcs]
     for shape, members in (("o", [i for i in range(agents) if i not in leaders]), ("s", sorted(leaders))):
         nx.draw_networkx_nodes(
             network, places, nodelist=members, ax=axes, node_size=size, node_color="white",
@@ -58,9 +73,9 @@ def draw_graph(
     nx.draw_networkx_edges(
         network, places, ax=axes, edge_color=colour, width=widths, node_size=size, alpha=0.8, **arrows
     )
-    if agents <= _LABELLED:
+    if agents <= LABELLED:
         names = {i: str(i + 1) for i in range(agents)}
         nx.draw_networkx_labels(network, places, names, ax=axes, font_size=8 if agents <= 20 else 5.5)
-    axes.set_title(shorten(graph.name).replace("$", r"\$"), color=BLACK)  # matplotlib reads $ as mathematics
+    axes.set_title(plain(shorten(graph.name)), color=BLACK)
     axes.margins(0.12)
     axes.set_aspect("equal")

@@ -7,7 +7,8 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
     *("#F0E442", "#0072B2", "#D55E00", "#CC79A7"),
 )
 MODE_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, YELLOW, BLACK)
-GREY, PALE, INK = "#6b7280", "#e5e7eb", "#374151"
+LINE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, "#8a7d00")  # thin lines on white: no yellow
+INK, DARK_GREY, GREY, LIGHT_GREY, PALE = "#374151", "#4b5563", "#6b7280", "#9ca3af", "#e5e7eb"
 
 
 def mode_colour(mode: int) -> str:

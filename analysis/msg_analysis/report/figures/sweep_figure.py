@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,13 @@ from matplotlib.lines import Line2D
 
 from msg_analysis.common.files import write_whole
 from msg_analysis.model.experiment.problems import show
-from msg_analysis.report.figures.matplotlib_style import STYLE
-from msg_analysis.report.figures.palette import BLACK, MODE_COLOURS
+from msg_analysis.report.figures.matplotlib_style import STYLE, plain, rendered
+from msg_analysis.report.figures.palette import BLACK, DARK_GREY, MODE_COLOURS
 from msg_analysis.sweep.figure_series import Picture, Place, Series
+from msg_analysis.theory.prediction import LAW_NAMES
 
 FORMATS = ("svg", "png")
+_DPI = 150
 _SIZE = (7.2, 4.2)  # inches
 _MARKERS = "os^Dv<>p"
 _NAMED = 8
@@ -30,13 +31,7 @@ def write_figure(picture: Picture, title: str, directory: Path) -> list[Path]:
     """Write ``figure.svg`` and ``figure.png``, each whole or not at all."""
     with mpl.rc_context(STYLE):
         figure = draw(picture, title)
-        written = []
-        for name in FORMATS:
-            stream = io.BytesIO()
-            metadata = {"Date": None, "Creator": None} if name == "svg" else {"Software": None}
-            figure.savefig(stream, format=name, dpi=150, metadata=metadata)
-            written.append(write_whole(directory / f"figure.{name}", stream.getvalue()))
-    return written
+        return [write_whole(directory / f"figure.{name}", rendered(figure, name, _DPI)) for name in FORMATS]
 
 
 def draw(picture: Picture, title: str) -> Figure:
@@ -50,13 +45,13 @@ def draw(picture: Picture, title: str) -> Figure:
         x = np.array([float(place.x) if numbers else labels.index(show(place.x)) for place in series.places])
         _draw_series(axes, picture, series, x, colour, _MARKERS[number % len(_MARKERS)])
     if not numbers:
-        axes.set_xticks(range(len(labels)), [label.replace("$", r"\$") for label in labels])
+        axes.set_xticks(range(len(labels)), [plain(label) for label in labels])
         axes.set_xlim(-0.5, len(labels) - 0.5)
     elif picture.logarithmic:
         axes.set_xscale("log")
     _mark_failures(axes, picture, labels, numbers)
     axes.set(xlabel=picture.x, ylabel=picture.y)
-    axes.set_title(title.replace("$", r"\$"), loc="left")
+    axes.set_title(plain(title), loc="left")
     axes.margins(y=0.08)
     _legend(figure, axes, picture, colours)
     return figure
@@ -91,14 +86,13 @@ def _mark_failures(axes: Axes, picture: Picture, labels: Sequence[str], numbers:
 
 def _legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[Any]) -> None:
     """Above the axes: what lines and points mean; beside them: the colours of the series."""
-    grey = "#4b5563"
     entries: list[tuple[Line2D, str]] = []
     if picture.measured:
-        entries.append((Line2D([], [], color=grey, marker="o", ls="", ms=4.5), "measured, 95 % interval"))
-        entries.append((Line2D([], [], color=grey, lw=1.2), "predicted"))
+        entries.append((Line2D([], [], color=DARK_GREY, marker="o", ls="", ms=4.5), "measured, 95 % interval"))
+        entries.append((Line2D([], [], color=DARK_GREY, lw=1.2), "predicted"))
     elif any(place.reference is not None for series in picture.series for place in series.places):
-        entries.append((Line2D([], [], color=grey, marker="o", lw=1.5, ms=4), "steps of the run"))
-        entries.append((Line2D([], [], color=grey, lw=1.0, ls=(0, (4, 2))), "continuous time"))
+        entries.append((Line2D([], [], color=DARK_GREY, marker="o", lw=1.5, ms=4), LAW_NAMES["emulated"]))
+        entries.append((Line2D([], [], color=DARK_GREY, lw=1.0, ls=(0, (4, 2))), LAW_NAMES["continuous"]))
     if any(place.value is None for series in picture.series for place in series.places):
         entries.append((Line2D([], [], color=BLACK, marker="x", ls="", ms=5), "no result"))
     if entries:
@@ -106,7 +100,7 @@ def _legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[Any]
     if len(picture.series) > 1:
         chosen = np.unique(np.linspace(0, len(picture.series) - 1, _NAMED).round().astype(int))
         handles = [Line2D([], [], color=colours[i], marker=_MARKERS[i % len(_MARKERS)], ms=4.5, lw=1.2) for i in chosen]
-        names = [picture.series[i].label.replace("$", r"\$") for i in chosen]
+        names = [plain(picture.series[i].label) for i in chosen]
         axes.legend(handles, names, loc="upper left", bbox_to_anchor=(1.0, 1.02), borderaxespad=0.4)
 
 
@@ -117,7 +111,7 @@ def _colours(count: int) -> list[Any]:
 
 
 def _column(places: Sequence[Place], key: str) -> Any:
-    return np.array([np.nan if getattr(place, key) is None else getattr(place, key) for place in places], dtype=float)
+    return np.array([getattr(place, key) for place in places], dtype=float)  # None: nan
 
 
 def _is_number(value: object) -> bool:

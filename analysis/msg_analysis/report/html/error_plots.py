@@ -23,6 +23,7 @@ from bokeh.models import (
 )
 from bokeh.palettes import PuOr, interp_palette
 
+from msg_analysis.report.documents.comparison_words import TIMES
 from msg_analysis.report.figures.palette import (
     BLACK,
     BLUE,
@@ -35,8 +36,7 @@ from msg_analysis.report.html.plot_style import SANS, new_figure, place_legend, 
 from msg_analysis.types import FloatArray
 
 HALF = 1.959963984540054  # standard errors on each side of a 95 % interval
-MOST_LINES = 8
-"""Most agents whose convergence is drawn at once."""
+MOST_LINES = 8  # agents whose convergence is drawn at once
 _NUMBERED = 8  # most agents with which heat maps show numbers
 _POINTS = 200  # at most, on the line of an agent
 
@@ -49,12 +49,12 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
     plot = new_figure(270, x_axis_label="simulated time", y_axis_label="system error", x_range=(0.0, float(time[-1])))
     data = {"time": time, "mean": mean, "low": low, "high": high, "z": (mean - centre) / np.where(error > 0, error, 1)}
     source = ColumnDataSource(data)
-    rows = [("time", "@time{0.[00]}"), ("measured up to then", "@mean{0.0000}")]
+    rows = [("time", "@time{0.[00]}"), ("measured up to this time", "@mean{0.0000}")]
     if predicted is not None:
         plot.varea("time", "low", "high", source=source, color=SKY, alpha=0.3, legend_label="95 % band")
         plot.line(time, np.full(len(time), predicted), color=BLACK, line_dash="dashed", legend_label="predicted")
         rows += [("predicted", f"{predicted:.4g}"), ("95 % band", "@low{0.0000} … @high{0.0000}"), ("z", "@z{+0.00}")]
-    line = plot.line("time", "mean", source=source, color=BLUE, line_width=2, legend_label="mean up to this time")
+    line = plot.line("time", "mean", source=source, color=BLUE, line_width=2, legend_label="measured up to this time")
     plot.add_tools(HoverTool(renderers=[line], mode="vline", tooltips=rows, line_policy="nearest"))
     # The earliest values are mostly noise, and would flatten the rest.
     late = time >= time[-1] / 50
@@ -118,7 +118,7 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
         plot.y_range = Range1d(max(float(np.nanmin(ends)) - margin, 0.0), float(np.nanmax(ends)) + margin)
     legend = plot.legend[0] if plot.legend else Legend()
     name = "measured" if np.isnan(error).all() else "measured, 95 % interval"
-    for chosen, label in ((~apart, name), (apart, "measured, disagrees")):
+    for chosen, label in ((~apart, name), (apart, "measured, rejected")):
         there = np.flatnonzero(chosen & ~np.isnan(measured))
         if len(there):  # takes shape and colour of one such point
             legend.items.append(LegendItem(label=label, renderers=[points], index=int(there[0])))
@@ -247,9 +247,7 @@ def innovation_sizes(
     plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
     plot.xgrid.grid_line_color = None
     ends = np.array([0.3, len(ratios) + 0.7])
-    plot.varea(
-        ends, np.full(2, 1 - half), np.full(2, 1 + half), color=SKY, alpha=0.3, legend_label="95 of 100 lie here"
-    )
+    plot.varea(ends, np.full(2, 1 - half), np.full(2, 1 + half), color=SKY, alpha=0.3, legend_label="95 % band")
     plot.line(ends, np.ones(2), color=BLACK, line_dash="dashed", legend_label="predicted")
     points = plot.scatter(
         "agent", "ratio", source=data, marker="marker", size=float(np.clip(220 / len(ratios), 5, 10)), color="colour"
@@ -266,12 +264,12 @@ def innovation_sizes(
 def lateness(timing: Mapping[str, Any]) -> UIElement:
     """Histogram of how late the steps of a run in real time were; ``timing`` of a comparison."""
     histogram = timing["histogram"]
-    return _histogram(histogram["lateness_ms"], histogram["steps"], "late by [ms]", "steps", timing["period_ms"])
+    return _histogram(histogram["lateness_ms"], histogram["steps"], TIMES["lateness_ms"], "steps", timing["period_ms"])
 
 
 def staleness(timing: Mapping[str, Any]) -> UIElement:
     """Histogram of the age of the neighbours' values that a run in real time used; ``timing`` of a comparison."""
-    histogram, label = timing["histogram"], "age of the values used [ms]"
+    histogram, label = timing["histogram"], TIMES["staleness_ms"]
     return _histogram(histogram["staleness_ms"], histogram["uses"], label, "values used", timing["period_ms"])
 
 
@@ -308,4 +306,4 @@ def _histogram(
 
 
 def _column(rows: Sequence[Mapping[str, Any]], key: str) -> FloatArray:
-    return np.array([np.nan if entry.get(key) is None else entry[key] for entry in rows], dtype=float)
+    return np.array([entry.get(key) for entry in rows], dtype=float)  # None: nan

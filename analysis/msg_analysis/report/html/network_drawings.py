@@ -10,7 +10,7 @@ from markupsafe import Markup, escape
 
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.model.network.graphs import Graph
-from msg_analysis.report.figures.agent_places import places
+from msg_analysis.report.figures.agent_places import LABELLED, line_width, places
 from msg_analysis.report.figures.palette import GREY, INK, mode_colour, shorten
 from msg_analysis.types import FloatArray
 
@@ -18,7 +18,6 @@ MOST_GRAPHS = 8
 """Most graphs that are drawn."""
 MOST_MODES = 6
 """Most graphs whose chain is drawn; with more, the report has a table of the rates."""
-_LABELLED = 40  # most agents whose numbers are shown
 _SIDE = 200.0
 _WEIGHTS = 5  # different line widths
 
@@ -44,7 +43,7 @@ def _scaled(where: Mapping[int, FloatArray], agents: int) -> FloatArray:
 
 
 def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int]) -> Markup:
-    radius = 11.0 if graph.agents <= 12 else 8.0 if graph.agents <= _LABELLED else 3.0
+    radius = 11.0 if graph.agents <= 12 else 8.0 if graph.agents <= LABELLED else 3.0
     links = graph.edges if graph.symmetric else graph.arcs
     parts = [
         f'<svg viewBox="0 0 {_SIDE:g} {_SIDE:g}" role="img" aria-label="{escape(graph.name)}: {len(links)} links" '
@@ -59,11 +58,11 @@ def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int]) -> M
             else f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"'
         )
         hears: list[int] = (np.flatnonzero(graph.adjacency[agent - 1]) + 1).tolist()
-        heard = ", ".join(map(str, hears[:20])) + (", …" if len(hears) > 20 else "") if hears else "nobody"
+        heard = ", ".join(map(str, hears[:20])) + (", …" if len(hears) > 20 else "") if hears else "no agent"
         parts.append(
             f'<g>{shape} fill="#fff" stroke="{colour}" stroke-width="1.5"/><title>{kind} {agent} hears {heard}</title>'
         )
-        if graph.agents <= _LABELLED:
+        if graph.agents <= LABELLED:
             size = radius if agent < 100 else 0.8 * radius
             parts.append(
                 f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="middle" dominant-baseline="central" '
@@ -92,7 +91,7 @@ def _links(
     thin = 0.4 if len(links) > 400 else 1.0
     drawn = [
         f'<path d="{"".join(paths)}" fill="none" stroke="{colour}" stroke-opacity=".8" '
-        f'stroke-width="{thin * (0.4 + 1.3 * width / _WEIGHTS):.2f}"/>'
+        f'stroke-width="{thin * line_width(width / _WEIGHTS):.2f}"/>'
         for width, paths in sorted(lines.items())
     ]
     return drawn + ([f'<path d="{"".join(heads)}" fill="{colour}"/>'] if heads else [])

@@ -19,21 +19,27 @@ from bokeh.resources import Resources
 from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
+from msg_analysis.common.number_words import p_text, z_text
 from msg_analysis.errors import InputError
 from msg_analysis.inference.observed.observation import bounded
+from msg_analysis.inference.realtime.laws import SUPPORT
 from msg_analysis.inference.verdict.comparison import Comparison
 from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.report.documents.comparison_words import (
+    QUANTILES,
+    REAL_TIME_LAWS,
+    TIMES,
+    agent_order,
+    furthest,
+    sentence,
+    timing_facts,
+    verdict_line,
+)
 from msg_analysis.report.documents.explanation import explain, graph_facts
+from msg_analysis.report.figures.palette import LINE_COLOURS
 from msg_analysis.report.html import error_plots, network_drawings, switching_plots
-from msg_analysis.report.terminal.result_text import LAWS, QUANTILES, SUPPORT, TIMES, timing_facts, verdict_line
-from msg_analysis.report.terminal.verdict_text import order_statements, sentence
+from msg_analysis.theory.prediction import LAW_NAMES
 
-_HEADLINES = {
-    "agrees": "The run agrees with the prediction.",
-    "disagrees": "The run disagrees with the prediction.",
-    "incomplete": "No verdict: the data are incomplete.",
-    "unpredicted": "No verdict: there is no prediction.",
-}
 _OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
 _SMALL_CHAIN = 8  # most graphs whose transitions are listed
 _FIRST_LINES = 5
@@ -74,7 +80,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": _number, "p": _p_value, "z": _distance}
+    environment.filters |= {"number": _number, "p": _p, "z": _z}
     names = [graph.name for graph in experiment.graph_list]
     models, sojourns = _models(document, comparison, trajectory)
     script, divs = components(models)
@@ -83,21 +89,24 @@ def render(
         document=document,
         restarts=restarts,
         strangers=strangers,
-        headline=verdict_line(_HEADLINES[document["verdict"]], document),
+        headline=verdict_line(document),
         timing_facts=timing_facts(timing) if timing else [],
         times=TIMES,
         quantiles=QUANTILES,
-        laws=LAWS,
+        laws=REAL_TIME_LAWS,
+        law_name=LAW_NAMES["emulated" if document["law"] == "synchronous" else document["law"]],
         support=SUPPORT,
         explanation=_explanation(document),
         blame=[sentence(cause["words"]) for cause in document["blame"]],
-        order=_order(document),
+        order=agent_order(document),
         experiment=experiment,
         versions=trajectory.record.versions,
         plots={name: Markup(div) for name, div in divs.items()},
         script=Markup(script),
         library=Markup(Resources(mode="inline", components=["bokeh"]).js_raw[0]),
-        first_agents=_furthest(document),
+        first_agents=_first_agents(document),
+        line_colours=LINE_COLOURS,
+        most_lines=error_plots.MOST_LINES,
         sojourns=sojourns[1],
         shown_sojourns=sojourns[0],
         at_once=switching_plots.FIRST_SOJOURNS,
@@ -106,7 +115,7 @@ def render(
         graph_facts=graph_facts(experiment),
         chain=network_drawings.chain_drawing(experiment),
         yaml=yaml.safe_dump(experiment.to_document(), sort_keys=False, allow_unicode=True, default_flow_style=None),
-        host=platform.node() or "a host without a name",
+        host=platform.node() or "unnamed host",
         tests=[test for test in document["tests"] if not test["name"].startswith(_NODE_TEST)],
         node_tests=_node_tests(document),
         nodes_open=experiment.agents <= _OPEN_TABLE,
@@ -142,7 +151,7 @@ def _models(
                 states, reference, experiment.step_length, document["node_errors"]
             )
     if ratios is not None and any(ratio is not None for ratio in ratios):
-        sizes = np.array([np.nan if ratio is None else ratio for ratio in ratios])
+        sizes = np.array(ratios, dtype=float)  # None: nan
         models["innovations"] = error_plots.innovation_sizes(sizes, document["innovations"]["samples"])
     if document["timing"]:
         models["lateness"] = error_plots.lateness(document["timing"])
@@ -150,11 +159,9 @@ def _models(
     return {name: model for name, model in models.items() if model is not None}, sojourns
 
 
-def _furthest(document: dict[str, Any]) -> list[int]:
+def _first_agents(document: dict[str, Any]) -> list[int]:
     """The agents (from 1, ascending) whose convergence is drawn at first: those with the largest abs(z)."""
-    distances = [abs(node["z"] or 0.0) for node in document["node_errors"]]
-    most = min(len(distances), _FIRST_LINES)
-    return sorted(sorted(range(1, len(distances) + 1), key=lambda agent: -distances[agent - 1])[:most])
+    return sorted(agent + 1 for agent in furthest([node["z"] for node in document["node_errors"]], _FIRST_LINES))
 
 
 def _explanation(document: dict[str, Any]) -> str:
@@ -168,31 +175,20 @@ def _explanation(document: dict[str, Any]) -> str:
         numbers = (
             f"The numbers below are those of the first {document['steps']} steps, up to the first gap."
             if document["system_error"]["measured"] is not None
-            else "Too little came before the first gap for any number."
+            else "The first gap is too early to compute errors."
         )
         return f"Missing: {' and '.join(filter(None, lost))}. {numbers}"
     if document["unpredicted"]:
-        rejected = [test["name"] for test in tests if test["rejected"]]
-        tested = " and ".join(test["name"] for test in tests) or "nothing"
-        outcome = f"{' and '.join(rejected)}: rejected." if rejected else f"Tested, and not rejected: {tested}."
+        results = [f"{test['name']}: {'rejected' if test['rejected'] else 'passed'}" for test in tests]
         cut = f" Errors are measured from step {document['transient']} on." if document["transient"] else ""
-        return f"Unpredicted: {document['unpredicted']}. {outcome}{cut}"
-    chance = f"a run that follows the predicted law would be called a disagreement with a chance of {level:.2g}"
+        return f"No prediction: {document['unpredicted']}. Tests: {', '.join(results) or 'none'}.{cut}"
+    chance = f"If the run follows the predicted law, the probability of a rejected test is at most {level:.2g}."
     rejected = [test for test in tests if test["rejected"]]
     if not rejected:
-        return f"None of {len(tests)} tests rejects the predicted law ({chance}, all tests together)."
-    named = ", ".join(f"{test['name']} (p {_p_value(test['p_adjusted'], '= ')})" for test in rejected[:6])
+        return f"All {len(tests)} tests passed. {chance}"
+    named = ", ".join(f"{test['name']} (p = {_p(test['p_adjusted'])})" for test in rejected[:6])
     more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
-    verb = "rejects" if len(rejected) == 1 else "reject"
-    return f"{len(rejected)} of {len(tests)} tests {verb} the predicted law: {named}{more}; {chance}."
-
-
-def _order(document: dict[str, Any]) -> list[str]:
-    """Which agents are more certain than which, in sentences."""
-    if document["order"] is None:
-        return []
-    names = [f"agent {i}" for i in range(1, len(document["node_errors"]) + 1)]
-    return order_statements(document["order"], names, "is more certain than")
+    return f"Rejected: {len(rejected)} of {len(tests)} tests: {named}{more}. {chance}"
 
 
 def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
@@ -205,20 +201,20 @@ def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _number(value: float | None, digits: int = 4) -> str:
-    if value is None:
-        return "–"
-    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
+    return "–" if value is None else _typeset(f"{value:#.{digits}g}".rstrip("."))
 
 
-def _distance(z: float | None) -> str:
-    """A distance in standard errors."""
-    return "–" if z is None else f"{z:+.2f}".replace("-", "−")
+def _z(z: float | None) -> str:
+    return _typeset(z_text(z))
 
 
-def _p_value(p: float | None, equals: str = "") -> str:
-    if p is None:
-        return "not tested"
-    return "< 0.0001" if p < 1e-4 else f"{equals}{p:.{4 if p < 0.01 else 3}f}"
+def _p(p: float | None) -> str:
+    return _typeset(p_text(p))
+
+
+def _typeset(number: str) -> str:
+    """With a dash where there is no number, and a minus sign."""
+    return "–" if number == "-" else number.replace("-", "−")
 
 
 def _matrix(rows: list[list[float]] | None) -> Any:

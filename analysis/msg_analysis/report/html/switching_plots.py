@@ -57,7 +57,7 @@ def active_graph(
         min_border_right=12,
     )
     bars = path.hbar("mode", left="left", right="right", height=0.72, color="colour", line_alpha=0, source=data)
-    rows = [("graph", "@name"), ("from", "@left{0.[00]} to @right{0.[00]}"), ("held for", "@held{0.[00]}")]
+    rows = [("graph", "@name"), ("from", "@left{0.[00]} to @right{0.[00]}"), ("duration", "@held{0.[00]}")]
     path.add_tools(HoverTool(renderers=[bars], tooltips=rows))
     _name_graphs(path, names)
     # As plain text: for mathematics, the page would load a library from the network.
@@ -73,7 +73,7 @@ def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> 
     shares = new_figure(
         _height(names),
         "save",
-        title="share of the time",
+        title="share of time",
         y_range=Range1d(len(names) - 0.4, -0.6),
         toolbar_location=None,
         x_axis_label="line: predicted",

@@ -8,10 +8,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.common.number_words import counted
+from msg_analysis.common.number_words import counted, number_text
 from msg_analysis.model.experiment.memory import amount
-from msg_analysis.report.terminal.result_text import add_protocol, gaps
-from msg_analysis.report.terminal.tables import fact_table, number_text
+from msg_analysis.report.documents.comparison_words import gaps
+from msg_analysis.report.terminal.experiment_text import add_protocol
+from msg_analysis.report.terminal.tables import fact_table
 
 _TOPICS = 12  # most topics listed; --json has all
 
@@ -49,7 +50,7 @@ def _add_run(facts: Table, document: dict[str, Any]) -> None:
     facts.add_row("states", f"{state}: {count['received']} of {count['expected']}, {count['missing']} missing")
     for line in gaps(count | {"refused": {}}):
         facts.add_row("", line)
-    facts.add_row("came twice, out of order", f"{count['duplicates']}, {count['out_of_order']}")
+    facts.add_row("duplicates, out of order", f"{count['duplicates']}, {count['out_of_order']}")
     facts.add_row("steps without a graph", str(count["missing_modes"]))
     for reason, number in count["refused"].items():
         facts.add_row("refused", Text(f"{number}: {reason}"))
@@ -76,12 +77,14 @@ def print_salvage(document: dict[str, Any], console: Console) -> None:
     """Print what was saved of a torn bag and what was dropped: a document of ``info.describe_salvage``."""
     facts = fact_table(console, document["bag"])
     facts.add_row("kept", counted(document["kept_messages"], "message"))
-    dropped = [f"{amount(document['dropped_bytes'])} behind the last whole record"] if document["dropped_bytes"] else []
+    dropped = (
+        [f"{amount(document['dropped_bytes'])} after the last complete record"] if document["dropped_bytes"] else []
+    )
     if document["damaged_chunks"]:
         known = f" with {counted(document['lost_messages'], 'message')}" if document["lost_messages"] else ""
         dropped.append(f"{counted(document['damaged_chunks'], 'damaged chunk')}{known}")
     if document["dropped_files"]:
-        dropped.append(f"{counted(document['dropped_files'], 'file')} of which nothing can be read")
+        dropped.append(counted(document["dropped_files"], "unreadable file"))
     facts.add_row("dropped", ", ".join(dropped) or "nothing")
     if document["torn"]:
         facts.add_row("torn", Text(document["torn"]))

@@ -8,12 +8,13 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from msg_analysis.common.number_words import half_width_text, measured_text, number_text, z_text
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.online.running_errors import LiveReport
 from msg_analysis.model.run.record import RunRecord
+from msg_analysis.report.documents.comparison_words import furthest
 
-MOST_ROWS = 20
-"""Most agents in the table; of more, those with the largest abs(z)."""
+MOST_ROWS = 20  # agents in the table: a screen; of more, those with the largest abs(z)
 
 
 def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
@@ -36,7 +37,7 @@ def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
 
 def live_line(report: LiveReport, record: RunRecord, rate: float) -> str:
     """Step, system error and missing steps in one line; ``rate`` in steps per second."""
-    parts = [f"step {max(report.newest, 0)} of {record.experiment.steps}", f"system error {_beside(report.system)}"]
+    parts = [f"step {max(report.newest, 0)} of {record.experiment.steps}", _system(report.system)]
     return ", ".join(parts + _account(report, rate))
 
 
@@ -48,17 +49,15 @@ def live_table(report: LiveReport, record: RunRecord, rate: float) -> Renderable
         title=f"{experiment.name}: step {max(report.newest, 0)} of {experiment.steps}, simulated time {time:g}",
         title_justify="left",
     )
-    for name in ("error", "measured", "predicted", "standard error", "z"):
+    for name in ("error", "measured", "± (95 %)", "predicted", "z"):
         table.add_column(name, justify="left" if name == "error" else "right")
     table.add_row("system", *_cells(report.system))
-    nodes = list(enumerate(report.nodes, start=1))
-    if len(nodes) > MOST_ROWS:
-        nodes = sorted(nodes, key=lambda node: -abs(node[1].z or 0.0))[:MOST_ROWS]
-    for number, node in nodes:
-        table.add_row(f"agent {number}", *_cells(node))
+    cut = len(report.nodes) > MOST_ROWS
+    for agent in furthest([node.z for node in report.nodes], MOST_ROWS) if cut else range(len(report.nodes)):
+        table.add_row(f"agent {agent + 1}", *_cells(report.nodes[agent]))
     lines = [Text(", ".join(_account(report, rate)))]
-    if len(nodes) < len(report.nodes):
-        lines.append(Text(f"the {len(nodes)} agents furthest off, of {len(report.nodes)}"))
+    if cut:
+        lines.append(Text(f"the {MOST_ROWS} agents with the largest |z|, of {len(report.nodes)}"))
     if report.note:
         lines.append(Text(report.note))
     return Group(table, *lines)
@@ -66,23 +65,23 @@ def live_table(report: LiveReport, record: RunRecord, rate: float) -> Renderable
 
 def _account(report: LiveReport, rate: float) -> list[str]:
     if not report.steps:
-        return ["nothing has come whole yet"]
+        return ["no complete step yet"]
     since = f" since step {report.first}" if report.first else ""
     parts = [f"{report.steps} steps{since}", f"{report.missing} missing", f"{rate:.0f} steps/s"]
     return parts + [f"{reason}: {count}" for reason, count in report.refused.items()]
 
 
-def _beside(estimate: Estimate) -> str:
-    measured, predicted, error, z = _cells(estimate)
-    text = measured
-    if estimate.standard_error is not None:
-        text += f" +- {error}"
-    if estimate.predicted is not None:
-        text += f", predicted {predicted}"
-    return text + (f", z = {z}" if estimate.z is not None else "")
+def _system(error: Estimate) -> str:
+    text = f"system error {measured_text(error.measured, error.interval)}"
+    if error.predicted is not None:
+        text += f", predicted {number_text(error.predicted)}"
+    return text + (f", z = {z_text(error.z)}" if error.z is not None else "")
 
 
-def _cells(estimate: Estimate) -> list[str]:
-    numbers = [estimate.measured, estimate.predicted, estimate.standard_error]
-    cells = ["-" if number is None else f"{number:.5g}" for number in numbers]
-    return [*cells, "-" if estimate.z is None else f"{estimate.z:+.1f}"]
+def _cells(error: Estimate) -> list[str]:
+    return [
+        number_text(error.measured),
+        half_width_text(error.interval),
+        number_text(error.predicted),
+        z_text(error.z),
+    ]

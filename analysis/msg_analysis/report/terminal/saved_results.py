@@ -16,11 +16,13 @@ from rich.console import Console
 from rich.text import Text
 from scipy import stats
 
-from msg_analysis.common.markdown import markdown_table, number_text
+from msg_analysis.common.markdown import markdown_table
+from msg_analysis.common.number_words import half_width_text, measured_text, number_text, p_text, z_text
 from msg_analysis.errors import InputError
+from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.errors.ranking import Ranking, rank_estimates
+from msg_analysis.report.documents.comparison_words import order_statements
 from msg_analysis.report.terminal.tables import number_table
-from msg_analysis.report.terminal.verdict_text import order_statements
 
 RESULT_FILE = "result.json"
 
@@ -58,7 +60,7 @@ def read_result(path: Path) -> Result:
     except ValueError as error:
         raise InputError(f"{file}: not JSON ({error}): {wanted}") from error
     if not isinstance(document, dict):
-        raise InputError(f"{file}: no JSON object: {wanted}")
+        raise InputError(f"{file}: not a JSON object: {wanted}")
     total = _part(document, "system_error", dict, file)
     interval = total.get("interval")
     if not isinstance(interval, list) or len(interval) != 2:
@@ -190,9 +192,8 @@ def to_markdown(rows: Sequence[Result]) -> str:
 def print_results(rows: Sequence[Result], level: float, console: Console) -> None:
     """Print the results as a table, and which system errors differ at ``level`` (all pairs together)."""
     heads, body = _shown(rows)
-    kept = [
-        place for place, head in enumerate(heads) if head not in ("experiment", "seed", "time", "least p")
-    ]  # 80 columns
+    wide = ("experiment", "seed", "time", "smallest p")  # too much for 80 columns
+    kept = [place for place, head in enumerate(heads) if head not in wide and {line[place] for line in body} != {"-"}]
     table = number_table(console, "Results", *(heads[place] for place in kept))
     for line in body:
         table.add_row(*(Text(line[place]) for place in kept))
@@ -201,11 +202,12 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
         if row.blame:
             console.print(Text(f"{row.file}: {row.blame}."))
     for one in merge_results(rows):
+        interval = Estimate(one.measured, standard_error=one.standard_error).interval
         console.print(
             Text(
                 f"{one.experiment}, {len(one.files)} results merged ({number_text(one.simulated_time)} units of time): "
-                f"{number_text(one.measured)} ± {number_text(one.standard_error)}, predicted "
-                f"{number_text(one.predicted)}, z {one.z:+.2f}, p {one.p:.3g}."
+                f"{measured_text(one.measured, interval)}, predicted {number_text(one.predicted)}, "
+                f"z = {z_text(one.z)}, p = {p_text(one.p)}."
             )
         )
     order = order_of_results(rows, level)
@@ -217,25 +219,12 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
 
 
 def _shown(rows: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
-    heads = [
-        "result",
-        "experiment",
-        "leaders",
-        "verdict",
-        "seed",
-        "time",
-        "system error",
-        "±",
-        "predicted",
-        "z",
-        "least p",
-    ]
+    heads = ["result", "experiment", "leaders", "verdict", "seed", "time"]
+    heads += ["system error", "± (95 %)", "predicted", "z", "smallest p"]
     body = []
     for row in rows:
         seed = f"{row.bags} runs" if row.bags > 1 else row.seeds or "-"
-        numbers = [row.simulated_time, row.measured, row.standard_error, row.predicted]
-        shown = [number_text(value) for value in numbers]
-        z = "-" if row.z is None else f"{row.z:+.2f}"
-        least = "-" if row.least_p is None else f"{row.least_p:.3g}"
-        body.append([row.file, row.experiment, row.leaders or "-", row.verdict, seed, *shown, z, least])
+        names = [row.file, row.experiment, row.leaders or "-", row.verdict, seed]
+        numbers = [number_text(row.simulated_time), number_text(row.measured), half_width_text((row.low, row.high))]
+        body.append([*names, *numbers, number_text(row.predicted), z_text(row.z), p_text(row.least_p)])
     return heads, body

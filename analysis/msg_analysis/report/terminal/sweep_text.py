@@ -8,7 +8,8 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.report.terminal.tables import ROWS, note_cut, number_table, number_text
+from msg_analysis.common.number_words import half_width_text, number_text, p_text
+from msg_analysis.report.terminal.tables import ROWS, first_rows, number_table
 from msg_analysis.sweep.conduct import Conducted, Judgement
 from msg_analysis.sweep.figure_series import Picture, value_text
 from msg_analysis.sweep.jobs.job import FAILED
@@ -39,27 +40,20 @@ def print_sweep(sweep: Sweep, document: dict[str, Any], picture: Picture, consol
     several = len(picture.series) > 1
     first = [picture.x] if several else []
     table = number_table(console, f"{sweep.name}: {picture.y}", "" if several else picture.x, *first, *heads)
-    shown = 0
-    for series in picture.series:
-        for place in series.places:
-            if shown < ROWS:
-                x = value_text(place.x)
-                cells = [Text(series.label), Text(x)] if several else [Text(x)]
-                numbers = [number_text(place.value)]
-                if picture.measured:
-                    half = None if place.high is None or place.low is None else (place.high - place.low) / 2
-                    numbers += ["-" if half is None else f"{half:.3g}", number_text(place.predicted)]
-                else:
-                    numbers += [number_text(place.reference)]
-                table.add_row(*cells, *numbers)
-            shown += 1
-    note_cut(table, shown, "places")
+    places = [(series.label, place) for series in picture.series for place in series.places]
+    for label, place in first_rows(table, places, "rows"):
+        numbers = [number_text(place.value)]
+        if picture.measured:
+            numbers += [half_width_text((place.low, place.high)), number_text(place.predicted)]
+        else:
+            numbers += [number_text(place.reference)]
+        table.add_row(*([Text(label)] if several else []), Text(value_text(place.x)), *numbers)
     console.print(table)
-    for row in [row for row in document["points"] if row["status"] == FAILED][:10]:
+    for row in [row for row in document["points"] if row["status"] == FAILED][:ROWS]:
         console.print(Text(f"point {row['point']}: no result: {row['reason']}"))
-    for row in [row for row in document["points"] if row.get("verdict") == "disagrees"][:10]:
+    for row in [row for row in document["points"] if row.get("verdict") == "disagrees"][:ROWS]:
         why = row.get("blame") or row.get("least")
-        console.print(Text(f"point {row['point']} disagrees with its prediction: p {row['p_holm']:.3g}: {why}"))
+        console.print(Text(f"point {row['point']} disagrees with its prediction (p = {p_text(row['p_holm'])}): {why}"))
     console.print(Text(_summary(document)))
 
 
@@ -68,12 +62,12 @@ def _summary(document: dict[str, Any]) -> str:
     what = {"predict": "predictions", "simulate": "runs simulated", "network": "networks run"}[document["kind"]]
     text = f"{count} {what}"
     if document["kept"]:
-        text += f", {document['kept']} of them before"
+        text += f", {document['kept']} of them from an earlier sweep"
     if document["failed"]:
         text += f"; {document['failed']} without a result"
     tested = [row["p_holm"] for row in document["points"] if row.get("p_holm") is not None]
     if tested:
         apart = sum(row.get("verdict") == "disagrees" for row in document["points"])
         text += f". {apart or 'None'} of {len(tested)} {'disagree' if apart > 1 else 'disagrees'} with its prediction"
-        text += f" (Holm over all of them, level {document['level']:g}; least p {min(tested):.3g})"
+        text += f" (Holm over all points, level {document['level']:g}; smallest p {min(tested):.3g})"
     return text + "."

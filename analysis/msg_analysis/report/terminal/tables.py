@@ -1,15 +1,18 @@
-"""What all terminal tables share: layout, and numbers as text."""
+"""Layout of terminal tables."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.common.markdown import number_text as number_text
+from msg_analysis.common.number_words import number_text
+
+Row = TypeVar("Row")
 
 ROWS = 30
 """Most rows of a table; --json has them all."""
@@ -34,20 +37,18 @@ def fact_table(console: Console, title: str) -> Table:
     return table
 
 
-def note_cut(table: Table, total: int, what: str) -> None:
-    """Caption a table, of the first ``ROWS`` of ``total`` rows, with how many rows (``what``) are left out."""
-    if total > ROWS:
-        table.caption = f"{total - ROWS} more {what}: use --json"
+def listed(values: Sequence[Any], longest: int = 12) -> str:
+    """The values, separated by commas; of more than ``longest``, how many are left out."""
+    more = f", and {len(values) - longest} more" if len(values) > longest else ""
+    return ", ".join(str(value) for value in values[:longest]) + more
 
 
-def z_text(value: float | None) -> str:
-    """A z with its sign; "-" for None."""
-    return "-" if value is None else f"{value:+.2f}"
-
-
-def p_text(value: float | None) -> str:
-    """Three significant digits; "-" for None."""
-    return "-" if value is None else f"{value:.3g}"
+def first_rows(table: Table, rows: Iterable[Row], what: str, where: str = "--json") -> list[Row]:
+    """The first ``ROWS`` rows for a table; a caption says how many (``what``) are left out, and where they are."""
+    shown = list(rows)
+    if len(shown) > ROWS:
+        table.caption = f"{len(shown) - ROWS} more {what}: use {where}"
+    return shown[:ROWS]
 
 
 def interval_text(interval: Sequence[float | None] | None) -> str:

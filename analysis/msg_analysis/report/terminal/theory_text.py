@@ -1,4 +1,4 @@
-"""Transients and facts as terminal tables. Every function takes the document that ``--json`` prints."""
+"""Predictions, sets of leaders, transients and facts as terminal tables, from the documents of ``--json``."""
 
 from __future__ import annotations
 
@@ -7,36 +7,87 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.report.terminal.tables import fact_table, number_table, number_text
+from msg_analysis.common.number_words import number_text
+from msg_analysis.report.terminal.tables import fact_table, first_rows, listed, number_table
+from msg_analysis.theory.prediction import LAW_NAMES
 
-_ROWS = 40
-_LAWS = {"continuous": "continuous time", "emulated": "steps of the run", "discrete": "discrete time"}
+_METHODS = {
+    "exhaustive": "exhaustive search",
+    "greedy": "greedy selection",
+    "swap": "greedy selection with exchanges",
+}
+
+
+def print_prediction(document: dict[str, Any], console: Console) -> None:
+    """Print the steady errors of every predicted law, and the share of time of every graph."""
+    laws = {
+        LAW_NAMES["sequential"] if document[key].get("law") == "sequential" else LAW_NAMES[key]: document[key]
+        for key in LAW_NAMES
+        if document.get(key) is not None
+    }
+    errors = number_table(console, "Mean-square error in the steady state", "", *laws)
+    errors.add_row("system", *(number_text(law["system_error"]) for law in laws.values()), end_section=True)
+    for agent in first_rows(errors, range(document["agents"]), "agents"):
+        errors.add_row(f"agent {agent + 1}", *(number_text(law["node_errors"][agent]) for law in laws.values()))
+    errors.add_section()
+    errors.add_row("certainty", *(number_text(law["system_certainty"]) for law in laws.values()))
+    console.print(errors)
+    modes = number_table(console, "Graphs", "graph", "share of time")
+    for name, share in zip(document["modes"], document["stationary"], strict=True):
+        modes.add_row(Text(name), number_text(share))
+    console.print(modes)
+    for key, title in LAW_NAMES.items():
+        if key in document and document[key] is None:
+            console.print(f"{title}: not finite, or not defined with this noise", style="dim")
+
+
+def print_leaders(document: dict[str, Any], console: Console) -> None:
+    """Print a document of ``Selection.to_json()``: the best sets of leaders, and how good the first is."""
+    gain = "held at the reference" if document["gain"] == "inf" else f"gain {document['gain']:g}"
+    law = LAW_NAMES[document["law"]]
+    what = "Single leaders" if document["count"] == 1 else f"Sets of {document['count']} leaders"
+    title = f"{what}, {gain}, {law}"
+    centrality = "joint centrality" if document["gain"] == "inf" else "certainty"
+    table = number_table(console, title, "agents", "system error", centrality)
+    for entry in first_rows(table, document["sets"], "sets"):
+        row = (listed(entry["agents"]), number_text(entry["system_error"]), number_text(entry["joint_centrality"]))
+        table.add_row(*row)
+    console.print(table)
+    facts = fact_table(console, f"Method: {_METHODS[document['method']]}")
+    facts.add_row("system errors computed", str(document["evaluations"]))
+    bound, gap = document["bound"]["system_error"], document["bound"]["gap"]
+    if gap is not None and gap < 1e-8:
+        facts.add_row("guarantee", "no better set exists")
+    elif bound is not None:
+        above = "" if gap is None else f": this one is at most {100 * gap:.3g} % above the best"
+        facts.add_row("guarantee", f"every set has at least {number_text(bound)}{above}")
+    else:
+        facts.add_row("guarantee", f"none: {document['note']}")
+    console.print(facts)
 
 
 def print_transient(document: dict[str, Any], console: Console) -> None:
     """Print the system error over time with the law of the graph; settling time and rates."""
     key = "system_second_moment" if document["unreduced"] else "system_error"
-    title = f"Transient from the start of the run, {_LAWS[document['law']]}"
+    title = f"Transient from the start of the run, {LAW_NAMES[document['law']]}"
     columns = [key.replace("_", " ")]
     few = len(document["modes"]) <= 6
     if few:
-        columns += [f"in {name}" for name in document["modes"]]
+        columns += [f"P({name})" for name in document["modes"]]
     table = number_table(console, title, "time", *columns)
     rows = list(zip(document["times"], document[key], document["graph_law"], strict=True))
-    for time, error, law in rows[:_ROWS]:
+    for time, error, law in first_rows(table, rows, "times", "--json or --csv"):
         table.add_row(number_text(time), number_text(error), *map(number_text, law if few else []))
-    if len(rows) > _ROWS:
-        table.caption = f"{len(rows) - _ROWS} more times: use --json or --csv"
     console.print(table)
     settling, rates = document["settling"], document["rates"]
     share = f"{100 * settling['fraction']:g} %"
-    facts = fact_table(console, "In the end")
+    facts = fact_table(console, "Steady state and rates")
     facts.add_row("system error in the steady state", number_text(document["steady_system_error"]))
-    facts.add_row(f"within {share} of it after, from this start", number_text(settling["from_start"]))
-    facts.add_row(f"within {share} of it after, from zero", number_text(settling["from_zero"]))
+    facts.add_row(f"settling time ({share}), from this start", number_text(settling["from_start"]))
+    facts.add_row(f"settling time ({share}), from zero", number_text(settling["from_zero"]))
     facts.add_row("decay rate of means", number_text(rates["mean"]))
     facts.add_row("decay rate of second moments", number_text(rates["second_moment"]))
-    facts.add_row("decay rate of the law of the graph", number_text(rates["graph"]))
+    facts.add_row("decay rate of graph probabilities", number_text(rates["graph"]))
     console.print(facts)
 
 
@@ -48,7 +99,7 @@ def print_facts(document: dict[str, Any], console: Console) -> None:
     if bounds["lower"] is None and bounds["upper"] is None:
         console.print(Text(f"No bounds of the system error: {bounds['note']}", style="dim"))
     else:
-        console.print(Text("Bounds of the system error, whatever the rates", style="bold"))
+        console.print(Text("Bounds of the system error for all switching rates", style="bold"))
         console.print(
             Text(f"  {number_text(bounds['lower'])} <= E <= {number_text(bounds['upper'])}   ({bounds['note']})")
         )
@@ -61,8 +112,8 @@ def print_facts(document: dict[str, Any], console: Console) -> None:
 
 def _print_lemmas(facts: list[dict[str, Any]], console: Console) -> None:
     table = number_table(console, "Eigenvalues of the paper's matrices", "matrix")
-    table.add_column("lemma, corrected", overflow="fold")
-    for heading in ("at it", "others", ""):
+    table.add_column("lemma (corrected)", overflow="fold")
+    for heading in ("count", "others", ""):
         table.add_column(heading, justify="right")
     for fact in facts:
         holds = Text("holds", style="green") if fact["holds"] else Text("does not hold", style="bold red")
@@ -79,13 +130,13 @@ def _print_graphs(document: dict[str, Any], console: Console) -> None:
     table.add_column("information centrality of agents 1, 2, ...", overflow="fold")
     for entry in shown:
         centrality = entry["information_centrality"]
-        values = ", ".join(map(number_text, centrality[:12])) + (", ..." if len(centrality) > 12 else "")
+        values = listed([number_text(value) for value in centrality])
         table.add_row(Text(entry["name"]), number_text(entry["kirchhoff_index"]), values)
     console.print(table)
 
 
 def _print_form(law: str, form: dict[str, Any], console: Console) -> None:
-    title = f"Two graphs in closed form, {_LAWS[law]}, beta = {number_text(form['rate'])}"
+    title = f"Two graphs in closed form, {LAW_NAMES[law]}, beta = {number_text(form['rate'])}"
     table = number_table(console, title, "", "static", "switching adds", "error", "fastest adds")
     keys = ("static", "switching", "error", "fast")
     table.add_row("system", *(number_text(form["system"][key]) for key in keys), end_section=True)
@@ -94,8 +145,6 @@ def _print_form(law: str, form: dict[str, Any], console: Console) -> None:
         [0.0 if abs(value) < 1e-14 * abs(row[0]) else value for value in row]
         for row in zip(*(form["nodes"][key] for key in keys), strict=True)
     ]
-    for agent, row in enumerate(rows[:_ROWS], start=1):
+    for agent, row in enumerate(first_rows(table, rows, "agents"), start=1):
         table.add_row(f"agent {agent}", *map(number_text, row))
-    if len(rows) > _ROWS:
-        table.caption = f"{len(rows) - _ROWS} more agents: use --json"
     console.print(table)

@@ -15,8 +15,6 @@ from typing import Any
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.job import DONE, FAILED, Job, NetworkStoppedError, Outcome
 
-_LAWS = ("continuous", "emulated", "discrete")
-
 
 def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
     """Do a job. An error becomes a failed outcome, so that the other points go on.
@@ -65,8 +63,10 @@ def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
 
 def of_prediction(document: Mapping[str, Any]) -> dict[str, Any]:
     """What is kept of a prediction, as ``predict --json`` prints it: the errors under every law, without matrices."""
+    from msg_analysis.theory.prediction import LAW_NAMES
+
     keys = ("system_error", "system_certainty", "node_errors")
-    laws = {law: document[law] for law in (*_LAWS, "static") if document.get(law)}
+    laws = {law: document[law] for law in LAW_NAMES if document.get(law)}
     kept: dict[str, Any] = {law: {key: found[key] for key in keys} for law, found in laws.items()}
     return {"agents": document["agents"], "stationary": document["stationary"], **kept}
 

@@ -1,9 +1,9 @@
 "use strict";
 // Choosing agents: by numbers in the field, or in the figure; the table and the lines follow.
 (() => {
-  const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8a7d00"];
+  const COLOURS = JSON.parse(document.body.dataset.colours);
   const DASHES = ["solid", "dashed", "dotted", "dotdash"];
-  const MOST = 8, MOST_BANDS = 3;
+  const MOST = Number(document.body.dataset.most), MOST_BANDS = 3;
   const field = document.getElementById("agents");
   const said = document.getElementById("chosen");
   const rows = [...document.querySelectorAll("#node-table tbody tr")];

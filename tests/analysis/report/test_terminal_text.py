@@ -9,8 +9,9 @@ import pytest
 from rich.console import Console
 
 from msg_analysis.model.experiment.experiment import Experiment
-from msg_analysis.report.documents.info import algebraic_connectivity, describe_experiment
-from msg_analysis.report.terminal import bag_text, result_text
+from msg_analysis.report.documents.info import describe_experiment
+from msg_analysis.report.terminal import bag_text, comparison_text, experiment_text, theory_text
+from msg_analysis.theory.graph_indices import algebraic_connectivity
 
 
 def shown(function: Any, document: dict[str, Any], width: int = 120) -> str:
@@ -48,34 +49,52 @@ def comparison(verdict: str, agents: int, measured: float | None) -> dict[str, A
 
 
 def test_comparison() -> None:
-    output = shown(result_text.print_comparison, comparison("disagrees", 3, 2.0))
+    output = shown(comparison_text.print_comparison, comparison("disagrees", 3, 2.0))
     assert output.startswith("The run disagrees with the prediction.")
-    assert "11 of 12 states in 3 steps (0.75 units of time): 1 missing, 2 twice, 3 out of order" in output
+    assert "11 of 12 states in 3 steps (0.75 units of time): 1 missing, 2 duplicates, 3 out of order" in output
     assert output.count("1.5 .. 2.5") == 4
     assert "+3.14" in output
     assert "agent 3" in output
     lines = [line for line in output.splitlines() if "0.0001" in line]
     assert "rejected" in lines[0]
     assert "covariance [m > 20]" in output
-    assert "not done" in output
+    assert "not tested" in output
 
 
 def test_strangers() -> None:
     entry = {"node": "agent_1", "topic": "[red]graph", "reason": "other run", "count": 1234}
-    output = shown(result_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": [entry]})
+    output = shown(comparison_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": [entry]})
     (line,) = (line for line in output.splitlines() if "1234" in line)
     assert line.split() == ["agent_1", "[red]graph", "other", "run", "1234"]
-    assert "refused" not in shown(result_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": []})
+    assert "refused" not in shown(comparison_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": []})
+
+
+def test_blame_and_bags() -> None:
+    bag = {
+        "bag": "torn[1]",
+        "seed": 7,
+        "simulated_time": 5.0,
+        "system_error": {"measured": None, "z": None},
+        "missing": 3,
+        "complete": False,
+        "verdict": "incomplete",
+    }
+    document = comparison("disagrees", 2, 2.0)
+    document |= {"blame": [{"words": "all gains [x] are 2"}], "bags": [bag, bag | {"bag": "whole", "complete": True}]}
+    output = shown(comparison_text.print_comparison, document)
+    assert output.startswith("The runs disagree with the prediction.")
+    assert "All gains [x] are 2." in output
+    assert "Incomplete: torn[1]. Leave them out for a verdict on the others." in output
 
 
 def test_comparison_without_numbers() -> None:
-    output = shown(result_text.print_comparison, comparison("incomplete", 2, None))
+    output = shown(comparison_text.print_comparison, comparison("incomplete", 2, None))
     assert output.startswith("No verdict: the data are incomplete.")
     assert "nan" not in output.lower()
 
 
 def test_many_agents_are_cut_and_it_says_so() -> None:
-    output = shown(result_text.print_comparison, comparison("agrees", 100, 2.0))
+    output = shown(comparison_text.print_comparison, comparison("agrees", 100, 2.0))
     assert "agent 30" in output
     assert "agent 31" not in output
     assert "70 more agents: use --json" in output
@@ -96,7 +115,7 @@ def test_prediction() -> None:
         "emulated": law,
         "static": None,
     }
-    output = shown(result_text.print_prediction, document)
+    output = shown(theory_text.print_prediction, document)
     assert "[red]" in output
     for part in (
         "continuous time",
@@ -104,7 +123,7 @@ def test_prediction() -> None:
         "3.5",
         "0.285714",
         "0.25",
-        "graphs held for ever: not",
+        "graphs held fixed: not",
     ):
         assert part in output
 
@@ -136,7 +155,7 @@ def test_experiment_explained() -> None:
     shares = [1, 0.25, 0.125]  # detailed balance: share times rate is equal both ways
     assert [graph["stationary"] for graph in document["graphs"]] == pytest.approx([s / sum(shares) for s in shares])
     assert document["memory"]["states"] == 1001 * 4 * 2 * 8
-    output = shown(result_text.print_experiment, document)
+    output = shown(experiment_text.print_experiment, document)
     for part in (
         "tracking of 4 agents in continuous time",
         "gain inf",
@@ -150,7 +169,7 @@ def test_experiment_explained() -> None:
 def test_experiment_that_cannot_be_run_yet() -> None:
     document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"delay": 1}}))
     assert document["predicted_system_error"] > 0
-    assert "noise.delay: 1: not available in runs yet" in shown(result_text.print_experiment, document)
+    assert "noise.delay: 1: not available in runs yet" in shown(experiment_text.print_experiment, document)
 
 
 def test_noise_by_graph_and_delay_explained() -> None:
@@ -159,7 +178,7 @@ def test_noise_by_graph_and_delay_explained() -> None:
     document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"process": gains, "delay": 2}}))
     assert document["stability_limit"] is None
     assert document["predicted_system_error"] > 0
-    output = " ".join(shown(result_text.print_experiment, document).split())
+    output = " ".join(shown(experiment_text.print_experiment, document).split())
     assert "line: 1.0; ring: [0.5, 1.0, 1.0, 2.0]; arcs: matrix 4 x 4" in output
     assert "delay 2" in output
 
@@ -215,7 +234,11 @@ def test_bag() -> None:
     output = " ".join(shown(bag_text.print_bag, document).split())
     for part in (
         *("[bold]bag", "d3ba43f6", "incomplete: 3 of 4, 1 missing", "5: other run", "1.23 MB", "2.0"),
-        *("process 4711", "steps 1 to 1; numbers need one from step 0", "/[red]11, 11 messages, pkg/msg/Kind"),
+        *(
+            "process 4711",
+            "steps 1 to 1; errors are computed only from step 0 on",
+            "/[red]11, 11 messages, pkg/msg/Kind",
+        ),
         *("and 2 more with 25 messages", "8 messages, lz4, torn: cut off", "2 damaged chunks, 77 messages"),
     ):
         assert part in output
@@ -244,12 +267,12 @@ def test_real_time() -> None:
     }
     laws = {"pattern": law | {"supported": True}, "sequential": law, "continuous": law | {"supported": False}}
     document = comparison("agrees", 3, 2.0) | {"timing": timing, "laws": laws | {"why": "the reasons"}}
-    output = shown(result_text.print_comparison, document)
+    output = shown(comparison_text.print_comparison, document)
     assert output.startswith("The run agrees with the prediction; 7.3 % of the deadlines were missed.")
-    for part in ("late by [ms]", "73 of 1000 (7.3 %)", "300 of 400 (75 %)", "1 of 1000 (less than 0.01 %)"):
+    for part in ("lateness [ms]", "73 of 1000 (7.3 %)", "300 of 400 (75 %)", "1 of 1000 (less than 0.01 %)"):
         assert part in output
-    assert "neighbours not heard of yet" in output
+    assert "neighbours before their first message" in output
     assert output.count("supported") == 2
     assert "not decided" in output
     assert "the reasons" in output
-    assert "Timing" not in shown(result_text.print_comparison, comparison("agrees", 3, 2.0))
+    assert "Timing" not in shown(comparison_text.print_comparison, comparison("agrees", 3, 2.0))

@@ -1,0 +1,115 @@
+"""What a comparison says in words: verdict, completeness, timing and order, for the terminal and the HTML report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from msg_analysis.common.number_words import number_text, percent
+from msg_analysis.theory.prediction import LAW_NAMES
+
+VERDICTS = {
+    "agrees": "The run agrees with the prediction.",
+    "disagrees": "The run disagrees with the prediction.",
+    "incomplete": "No verdict: the data are incomplete.",
+    "unpredicted": "No verdict: there is no prediction. No test is rejected.",
+}
+TIMES = {
+    "lateness_ms": "lateness [ms]",
+    "jitter_ms": "error of the period [ms]",
+    "staleness_ms": "age of values used [ms]",
+    "staleness_steps": "age of values used [steps]",
+}
+QUANTILES = {"p50": "median", "p95": "95 %", "p99": "99 %", "max": "largest"}
+REAL_TIME_LAWS = {key: LAW_NAMES[key] for key in ("pattern", "sequential", "continuous")}
+
+
+def verdict_line(document: dict[str, Any]) -> str:
+    """The verdict on one run or several; in real time with missed deadlines, which are not a disagreement."""
+    verdict = VERDICTS[document["verdict"]]
+    if document.get("bags"):
+        verdict = verdict.replace("The run agrees", "The runs agree").replace("The run disagrees", "The runs disagree")
+    deadlines = (document.get("timing") or {}).get("deadlines")
+    if not deadlines or not deadlines["missed"]:
+        return verdict
+    return f"{verdict.removesuffix('.')}; {percent(deadlines['share'])} of the deadlines were missed."
+
+
+def gaps(count: dict[str, Any]) -> list[str]:
+    """Where the gaps of a log are, and what was refused, of ``completeness`` of a comparison; empty for a whole log."""
+    lines = []
+    if count["missing"]:
+        first, last = count.get("stretch") or (None, None)
+        if first is None:
+            lines.append("No step has the states of all agents.")
+        elif first == 0:
+            lines.append(f"All steps up to step {last} are complete.")
+        else:
+            lines.append(
+                f"The longest part without gaps is steps {first} to {last}; errors are computed only from step 0 on."
+            )
+    if count.get("refused"):
+        reasons = ", ".join(f"{number} x {reason}" for reason, number in count["refused"].items())
+        lines.append(f"Refused: {reasons}")
+    return lines
+
+
+def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:
+    """Counts of a run in real time, ``timing`` of a comparison: what was counted, and the numbers."""
+    deadlines, uses, graphs = timing["deadlines"], timing["ideal_uses"], timing["outdated_graph"]
+    facts = [
+        ("period", f"{number_text(timing['period_ms'])} ms"),
+        ("deadlines missed", f"{deadlines['missed']} of {deadlines['steps']} ({percent(deadlines['share'])})"),
+        ("values used as with ideal timers", f"{uses['ideal']} of {uses['uses']} ({percent(uses['share'])})"),
+        ("steps with an outdated graph", f"{graphs['steps']} of {deadlines['steps']} ({percent(graphs['share'])})"),
+    ]
+    if timing["never_heard"]:
+        facts.append(("uses of neighbours before their first message", str(timing["never_heard"])))
+    return facts
+
+
+def sentence(words: str) -> str:
+    """The words with a capital letter and a full stop."""
+    return f"{words[:1].upper()}{words[1:]}."
+
+
+def agent_order(document: dict[str, Any]) -> list[str]:
+    """Which agents are more certain than which, in sentences; empty where that is not known."""
+    if not document.get("order"):
+        return []
+    names = [f"agent {i}" for i in range(1, len(document["node_errors"]) + 1)]
+    return order_statements(document["order"], names, "is more certain than")
+
+
+def order_statements(order: dict[str, Any], names: Sequence[str], relation: str, most: int = 12) -> list[str]:
+    """Which of ``names`` differ, in sentences with the ``relation`` of the better one; ``most`` pairs one by one."""
+
+    def named(pair: dict[str, Any]) -> str:
+        sure = pair["confidence"]
+        confidence = "> 99.99 %" if sure > 0.9999 else f"{100 * sure:.2f} %"
+        return f"{names[pair['better'] - 1]} {relation} {names[pair['worse'] - 1]} (confidence {confidence})"
+
+    lines = [
+        f"Order, smallest measured error first: {', '.join(names[i - 1] for i in order['ranking'])}. "
+        f"{order['distinguished']} of {order['pairs']} pairs differ significantly (level {order['level']:g} for all "
+        "pairs together)."
+    ]
+    # Of each, only the nearest one below it that differs significantly: those further down add little.
+    places = {number: place for place, number in enumerate(order["ranking"])}
+    nearest: dict[int, dict[str, Any]] = {}
+    for pair in sorted(order["distinctions"], key=lambda pair: places[pair["worse"]]):
+        nearest.setdefault(places[pair["better"]], pair)
+    for _, pair in sorted(nearest.items())[:most]:  # the name of a file keeps its first letter
+        lines.append(sentence(named(pair)) if named(pair).startswith("agent ") else f"{named(pair)}.")
+    if order["ties"] and order["distinguished"]:
+        ties = [f"{names[a - 1]} and {names[b - 1]}" for a, b in order["ties"][:most]]
+        lines.append(f"Not significantly different: {'; '.join(ties)}.")
+    for pair in order["contradictions"][:most]:
+        expected = "in the opposite order" if pair["predicted"] is False else "equal"
+        lines.append(f"Measured, but predicted {expected}: {named(pair)}.")
+    return lines
+
+
+def furthest(z: Sequence[float | None], most: int) -> list[int]:
+    """Places, from 0, of the ``most`` estimates with the largest abs(z), largest first."""
+    return sorted(range(len(z)), key=lambda place: -abs(z[place] or 0.0))[:most]

@@ -1,0 +1,89 @@
+"""Experiments as terminal tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from msg_analysis.common.number_words import number_text
+from msg_analysis.model.experiment.memory import amount
+from msg_analysis.report.terminal.tables import ROWS, fact_table, listed, number_table
+
+
+def print_experiment(document: dict[str, Any], console: Console) -> None:
+    """Print an experiment: a document of ``info.describe_experiment``."""
+    run = document["run"]
+    facts = fact_table(console, document["name"])
+    facts.add_row("problem", f"{document['problem']} of {document['agents']} agents in {document['time']} time")
+    if document["leaders"]:
+        leaders = document["leaders"]
+        text = f"{listed(leaders['agents'])}, gain {leaders['gain']}, reference {leaders['reference']}"
+        facts.add_row("leaders", text)
+    add_protocol(facts, document.get("protocol"))
+    facts.add_row("noise", ", ".join(f"{key} {_short(value)}" for key, value in document["noise"].items()))
+    facts.add_row("steps", f"{run['steps']} of {number_text(run['dt'])}, {number_text(run['duration'])} units of time")
+    facts.add_row("stability limit of dt", number_text(document["stability_limit"]))
+    facts.add_row("replicas", str(run["replicas"]))
+    facts.add_row("seed", str(run["seed"]))
+    facts.add_row("start", f"{_short(run['start'])}, first graph {document['switching']['initial']}")
+    facts.add_row("pace", f"{run['pace']}, processes {run['processes']}")
+    facts.add_row("predicted system error", number_text(document["predicted_system_error"]))
+    memory = document["memory"]
+    facts.add_row("memory", f"states {amount(memory['states'])}, graphs {amount(memory['matrices'])}")
+    facts.add_row("can be run", "yes" if not document["unavailable"] else "no")
+    console.print(facts)
+    columns = ("connectivity", "share", "held for", "dt limit")
+    graphs = number_table(console, "Graphs", "graph", *columns)
+    graphs.add_column("links", overflow="fold")
+    for graph in document["graphs"]:
+        graphs.add_row(
+            Text(graph["name"]),
+            number_text(graph["algebraic_connectivity"]),
+            number_text(graph["stationary"]),
+            number_text(graph["mean_holding_time"]),
+            number_text(graph["stability_limit"]),
+            _links(graph),
+        )
+    console.print(graphs)
+    switching = document["switching"]
+    title = "Switching rates" if document["time"] == "continuous" else "Switching probabilities"
+    names = [graph["name"] for graph in document["graphs"]]
+    if 1 < len(names) <= ROWS:
+        chain = number_table(console, title, "from / to", *names)
+        for name, row in zip(names, switching["matrix"], strict=True):
+            chain.add_row(Text(name), *map(number_text, row))
+        console.print(chain)
+    for line in document["unavailable"]:
+        console.print(Text(line, style="yellow"))
+
+
+def add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
+    """Add rows for the protocol of a document of ``info``; none for the built-in law (None)."""
+    if protocol is None:
+        return
+    kind = "linear" if protocol["linear"] else "not linear, no prediction"
+    facts.add_row("protocol", Text(f"{protocol['name']} of {protocol['package']} {protocol['version']}, {kind}"))
+    for name, value in protocol["parameters"].items():
+        facts.add_row("", Text(f"{name}: {_short(value)}"))
+    if protocol["absent"]:
+        facts.add_row("", Text(protocol["absent"], style="yellow"))
+
+
+def _short(value: Any) -> str:
+    """A number or word as it is, a list by its entries, a matrix by its size, a mapping entry by entry."""
+    if isinstance(value, dict):
+        return "; ".join(f"{key}: {_short(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        if value and isinstance(value[0], list):
+            return f"matrix {len(value)} x {len(value[0])}"
+        return f"[{listed(value)}]"
+    return str(value)
+
+
+def _links(graph: dict[str, Any]) -> str:
+    """``1-2, 2-3 (0.5)`` for edges, ``1>2`` for arcs (2 hears 1)."""
+    sign, links = ("-", graph["edges"]) if graph["edges"] is not None else (">", graph["arcs"])
+    return listed([f"{i}{sign}{j}" + (f" ({weight:g})" if weight != 1 else "") for i, j, weight in links]) or "none"
