@@ -6,7 +6,6 @@ input, 3 data incomplete. Slow imports are made inside the commands that need th
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,7 @@ from msg_analysis.cli.console import CommandGroup, examples, print_json, result_
 from msg_analysis.cli.options import (
     BAG,
     PATH,
-    InputPath,
+    SOURCE,
     duration_option,
     experiment_argument,
     json_option,
@@ -30,9 +29,6 @@ from msg_analysis.errors import InputError
 if TYPE_CHECKING:
     from msg_analysis.bags.format.storage_options import Compression
     from msg_analysis.sweep.conduct import OtherSoftware
-
-
-_SOURCE = InputPath(".yaml", ".yml", ".json", ".mcap", ".mcap.zstd", holds=("metadata.yaml", "*.mcap"))
 
 
 @click.group(cls=CommandGroup)
@@ -211,7 +207,7 @@ def figures(
 
 
 @main.command(epilog=examples("msg-analysis info line_ring.yaml", "msg-analysis info line_ring_twin --json"))
-@click.argument("source", metavar="EXPERIMENT|BAG", type=_SOURCE)
+@click.argument("source", metavar="EXPERIMENT|BAG", type=SOURCE)
 @json_option
 def info(source: Path, as_json: bool) -> None:
     """Explain an experiment file, or say what a bag holds."""
@@ -268,7 +264,7 @@ def schema(what: str) -> None:
     else:
         from msg_analysis.model.experiment.experiment import json_schema
 
-    click.echo(json.dumps(json_schema(), indent=2))
+    print_json(json_schema(), indent=2)
 
 
 if __name__ == "__main__":

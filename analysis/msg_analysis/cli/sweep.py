@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from msg_analysis.cli.console import complain, examples, print_json, result_console
-from msg_analysis.cli.options import PATH, InputPath, json_option
+from msg_analysis.cli.options import PATH, YAML, json_option
+from msg_analysis.common.exit_codes import ExitCode, killed_by
 from msg_analysis.common.json_numbers import finite
+from msg_analysis.common.notes import print_note
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.software import require_libraries
 
@@ -20,8 +22,6 @@ if TYPE_CHECKING:
     from msg_analysis.sweep.conduct import Conducted, OtherSoftware
     from msg_analysis.sweep.jobs.job import Job
     from msg_analysis.sweep.outcome_store import Store
-
-DISAGREES, INCOMPLETE = 1, 3
 
 other_software = click.option(
     "--other-software",
@@ -39,7 +39,7 @@ other_software = click.option(
         "msg-analysis sweep rates.yaml --scheduler tcp://10.0.0.1:8786",
     )
 )
-@click.argument("sweep_file", metavar="SWEEP", type=InputPath(".yaml", ".yml", ".json"))
+@click.argument("sweep_file", metavar="SWEEP", type=YAML)
 @click.option("--out", type=PATH, metavar="DIR", show_default="sweeps/<name>", help="Directory of the results.")
 @click.option(
     "--workers",
@@ -150,7 +150,7 @@ def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Sto
     from msg_analysis.sweep.jobs.workers import ENDING, WorkersLostError
 
     if store.damaged:
-        click.echo(f"note: {store.directory}: {store.damaged} lines cannot be read: done again", err=True)
+        print_note(f"{store.directory}: {store.damaged} lines cannot be read: their points are computed again")
     for number in ENDING:
         if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
             signal.signal(number, _end)
@@ -164,10 +164,10 @@ def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Sto
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the exit
             click.echo(f"\ninterrupted: {kept}", err=True)
             if isinstance(error, _EndedBySignal):
-                context.exit(128 + error.number)
+                context.exit(killed_by(error.number))
             raise
         complain(f"{error}: {kept}")
-        context.exit(INCOMPLETE)
+        context.exit(ExitCode.INCOMPLETE)
 
 
 def emulate(
@@ -198,7 +198,7 @@ def emulate(
     for outcome in failed:
         complain(f"no result: {outcome.reason}")
     if not points:
-        return INCOMPLETE
+        return ExitCode.INCOMPLETE
     files = write_figures(numbers, out, formats, points)
     if as_json:
         rows = [asdict(point) | {"agent": _number(point.agent)} for point in points]
@@ -209,7 +209,7 @@ def emulate(
         for path in files:
             click.echo(path)
         click.echo(summary(points, len(runs) - len(failed)))
-    return DISAGREES if disagreeing(points) else INCOMPLETE if failed else 0
+    return ExitCode.DISAGREES if disagreeing(points) else ExitCode.INCOMPLETE if failed else ExitCode.FINE
 
 
 def _number(agent: int | None) -> int | None:

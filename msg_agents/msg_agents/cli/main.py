@@ -6,7 +6,6 @@ input, 3 incomplete data. Modules that take long to import are imported by the c
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +22,7 @@ from msg_analysis.cli.options import (
     BAG,
     PATH,
     RUN_RECORD,
-    InputPath,
+    YAML,
     PositiveFloat,
     duration_option,
     experiment_argument,
@@ -32,13 +31,14 @@ from msg_analysis.cli.options import (
     suggest,
 )
 from msg_analysis.cli.storage_options import storage, storage_options
+from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.common.files import RESULT_FILE, write_whole
+from msg_analysis.common.json_numbers import json_text
 
 if TYPE_CHECKING:
     from msg_agents.running.runner import RunResult
     from msg_analysis.bags.format.storage_options import Compression
     from msg_analysis.model.experiment.experiment import Experiment
-
-DISAGREES, INCOMPLETE = 1, 3
 
 
 @click.group(cls=CommandGroup)
@@ -169,7 +169,7 @@ def _end(result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None]
     say(_ending(result))
     _show(result, as_json)
     if result.failures or (result.bag is not None and result.comparison is None):
-        sys.exit(INCOMPLETE)
+        sys.exit(ExitCode.INCOMPLETE)
     if result.comparison is not None:
         sys.exit(result.comparison.exit_code)
 
@@ -192,7 +192,7 @@ def _ending(result: RunResult) -> dict[str, Any]:
 
 def _show(result: RunResult, as_json: bool) -> None:
     """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
-    from msg_agents.running.runner import REPORT_FILE, RESULT_FILE
+    from msg_agents.running.runner import REPORT_FILE
 
     document: dict[str, Any] = {"verdict": "incomplete" if result.failures else None}  # None: nothing to judge
     if result.comparison is not None:
@@ -207,7 +207,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         "failures": result.failures,
     }
     if result.bag is not None and result.comparison is not None:
-        (result.bag / RESULT_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        write_whole(result.bag / RESULT_FILE, json_text(document, 1).encode() + b"\n")
     if as_json:
         print_json(document)
         return
@@ -241,7 +241,7 @@ def check(bag: Path | None, *, as_json: bool) -> None:
     else:
         missing = f", {outcome.missing} missing" if outcome.missing else ""
         click.echo(f"{path}: equal to the twin to the last bit: {outcome.compared} states{missing}")
-    sys.exit(DISAGREES if outcome.difference else INCOMPLETE if outcome.missing else 0)
+    sys.exit(ExitCode.DISAGREES if outcome.difference else ExitCode.INCOMPLETE if outcome.missing else ExitCode.FINE)
 
 
 def _newest_bag(directory: Path) -> Path:
@@ -269,7 +269,7 @@ def prepare(experiment: Path) -> None:
     )
 )
 @click.argument("run_record", type=RUN_RECORD)
-@click.argument("hosts", type=InputPath(".yaml", ".yml", ".json"))
+@click.argument("hosts", type=YAML)
 @click.option("--name", metavar="NAME", show_default="the name of this machine", help="Which of the hosts this is.")
 @click.option(
     "--out",

@@ -17,13 +17,12 @@ from msg_agents.processes.environment import DISCOVERY_TIMEOUT
 from msg_analysis.cli.console import examples
 from msg_analysis.cli.options import PATH, RUN_RECORD, PositiveFloat, suggest
 from msg_analysis.cli.storage_options import storage, storage_options
+from msg_analysis.common.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from msg_agents.nodes.network_node import NetworkNode
     from msg_analysis.bags.format.storage_options import Compression
     from msg_analysis.model.run.record import RunRecord
-
-INCOMPLETE = 3
 
 use_sim_time = click.option(
     "--use-sim-time",
@@ -232,7 +231,7 @@ def _run_nodes(
         account=account,
         patience=patience,
     ):
-        sys.exit(INCOMPLETE)
+        sys.exit(ExitCode.INCOMPLETE)
 
 
 def _make(directory: Path | None) -> Path | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,15 +15,17 @@ from click.shell_completion import CompletionItem
 from msg_agents.cli.ros_command import RosCommand
 from msg_agents.cli.web_options import WebRosCommand, announce, page, web_options
 from msg_agents.processes.environment import LAST_DOMAIN
+from msg_agents.terminal.interruption import exit_on_signals
 from msg_analysis.cli.console import examples, print_json, result_console
 from msg_analysis.cli.options import BAG, PositiveFloat, json_option
+from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.common.notes import print_note
 
 if TYPE_CHECKING:
     from msg_agents.nodes.replay.player import Played
     from msg_agents.nodes.watching.live import Watched
     from msg_agents.watching.web_server import Web
 
-INCOMPLETE = 3
 _domain = click.option(
     "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Instead of the environment's ROS_DOMAIN_ID."
 )
@@ -239,31 +240,15 @@ class _play_bar:  # noqa: N801  used like a function
         self._progress.update(self._task, completed=played.now, total=played.length, state=state, refresh=True)
 
     def note(self, line: str) -> None:
-        from rich.text import Text
-
-        self._console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
-
-
-def _notes() -> Callable[[str], None]:
-    """A function that prints a note on stderr."""
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console(stderr=True)
-    return lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
+        """Print a note, above the bar."""
+        print_note(line, self._console)
 
 
 def _enter(domain: int | None) -> None:
     """Set the ROS domain, and let SIGTERM and SIGHUP end the process in order."""
     if domain is not None:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-
-    def end(number: int, _: object) -> None:
-        sys.exit(128 + number)
-
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # ignored under nohup
-            signal.signal(number, end)
+    exit_on_signals()
 
 
 @click.command(
@@ -300,15 +285,16 @@ def live(
             words = "The run has ended." if found.finished else "Nobody watches any more."
             served.end({"text": words, "verdict": None if found.finished else "incomplete"})
     if found is None:
-        _notes()("no network was seen")
-        sys.exit(INCOMPLETE)
+        print_note("no network was seen")
+        sys.exit(ExitCode.INCOMPLETE)
     if as_json:
         print_json(live_document(found.report, found.record))
     elif found.report.note and not result_console().is_terminal:
-        _notes()(found.report.note)
+        print_note(found.report.note)
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0 if found.finished else INCOMPLETE)  # all is done, and leaving the middleware may hang
+    # All is done, and leaving the middleware may hang.
+    os._exit(ExitCode.FINE if found.finished else ExitCode.INCOMPLETE)
 
 
 def _watch(
@@ -319,9 +305,8 @@ def _watch(
     from msg_analysis.report.terminal.live_text import live_line, live_table
 
     _enter(domain)
-    note = _notes()
     if served is not None:
-        announce(served, host, note)
+        announce(served, host, print_note)
     publish = _publisher(served)
     console = result_console()
     if as_json or not console.is_terminal:
@@ -331,7 +316,7 @@ def _watch(
             if not as_json:
                 click.echo(live_line(watched.report, watched.record, rate))
 
-        found = watch(reliable=reliable, timeout=timeout, on_report=show, on_note=note)
+        found = watch(reliable=reliable, timeout=timeout, on_report=show, on_note=print_note)
     else:
         from rich.live import Live
 
@@ -344,7 +329,7 @@ def _watch(
                 publish(watched, rate)
                 screen.update(live_table(watched.report, watched.record, rate), refresh=True)
 
-            found = watch(reliable=reliable, timeout=timeout, on_report=draw, on_note=note, on_look=jobs.check)
+            found = watch(reliable=reliable, timeout=timeout, on_report=draw, on_note=print_note, on_look=jobs.check)
     return found
 
 
@@ -391,6 +376,7 @@ def markers(*, rate: float, replica: int, frame: str, timeout: float | None, dom
     from msg_agents.nodes.watching.markers import show_markers
 
     _enter(domain)
-    over = show_markers(rate=rate, replica=replica - 1, frame=frame, timeout=timeout, on_note=_notes())
+    over = show_markers(rate=rate, replica=replica - 1, frame=frame, timeout=timeout, on_note=print_note)
     sys.stderr.flush()
-    os._exit(0 if over else INCOMPLETE)  # all is done, and leaving the middleware may hang
+    # All is done, and leaving the middleware may hang.
+    os._exit(ExitCode.FINE if over else ExitCode.INCOMPLETE)

@@ -53,12 +53,8 @@ class WebCommand(click.Command):
         return super().parse_args(ctx, with_port(args))
 
 
-class WebRosCommand(RosCommand):
+class WebRosCommand(WebCommand, RosCommand):
     """A command of a ROS 2 node that takes ``--web`` with or without a port."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """See click.Command."""
-        return super().parse_args(ctx, with_port(args))
 
 
 @contextmanager

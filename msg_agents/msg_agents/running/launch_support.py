@@ -7,15 +7,17 @@ and output. Killed processes are not started again here.
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from msg_agents.processes.environment import SINGLE_THREAD
 from msg_agents.processes.process_plan import ProcessPlan, plan_network
 from msg_agents.running.run_folder import workshop
 from msg_agents.running.runner import REPORT_FILE, make_bag_directory
+from msg_agents.running.supervisor import failure_of
+from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record
@@ -137,11 +139,10 @@ class LaunchedNetwork:
         ones do not, since they follow from it.
         """
         self._running.discard(name)
-        # A process that is done but hangs while it leaves the middleware ends itself by an alarm (``process.leave``).
-        if code not in (0, -signal.SIGALRM) and not self._over:
+        failure = failure_of(code)
+        if failure and not self._over:
             self._over = True
-            how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-            raise LaunchFailedError(f"{name}: {how}: the run is not complete" + self._what_is_left())
+            raise LaunchFailedError(f"{name}: {failure}: the run is not complete" + self._what_is_left())
         return not self._running and not self._over
 
     def _what_is_left(self) -> str:
@@ -157,7 +158,10 @@ class LaunchedNetwork:
     def analysed(self, code: int) -> None:
         """Take note of the exit code of ``msg-analysis compare``; LaunchFailedError unless the run agrees."""
         if code:
-            verdict = {1: "the run disagrees with the prediction", 3: "data are incomplete: no verdict"}
+            verdict: dict[int, str] = {
+                ExitCode.DISAGREES: "the run disagrees with the prediction",
+                ExitCode.INCOMPLETE: "data are incomplete: no verdict",
+            }
             raise LaunchFailedError(f"msg-analysis: {verdict.get(code, f'exit code {code}')}")
 
     def close(self) -> None:
@@ -173,8 +177,8 @@ class LaunchedNetwork:
 
 
 def environment() -> dict[str, str]:
-    """Additions to the launch's environment: the nodes' arithmetic is too small for threads."""
-    return {name: os.environ.get(name, "1") for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")}
+    """Additions to the launch's environment."""
+    return {name: os.environ.get(name, number) for name, number in SINGLE_THREAD.items()}
 
 
 def replay_commands(arguments: Mapping[str, str]) -> list[tuple[str, list[str]]]:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from msg_analysis.inference.verdict.comparison import Comparison
 
 POLL = 0.05  # s
-REPORT_FILE, RESULT_FILE = "report.html", "result.json"
+REPORT_FILE = "report.html"
 
 
 @dataclass(slots=True)

@@ -12,6 +12,7 @@ from msg_agents.terminal.job_control import JobControl
 from msg_agents.watching.run_observer import Observer
 from msg_agents.watching.snapshot import Clockwork, moment_document, setting
 from msg_agents.watching.terminal_panel import plain_line, show
+from msg_analysis.common.notes import print_note
 
 if TYPE_CHECKING:
     from msg_agents.watching.web_server import Web
@@ -58,9 +59,7 @@ class RunView:
 
     def note(self, line: str) -> None:
         """Print a note, above the panel."""
-        from rich.text import Text
-
-        self._console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
+        print_note(line, self._console)
 
     def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
         """Follow the run: its processes have been started. Without ``checkpoints`` its errors are not followed."""

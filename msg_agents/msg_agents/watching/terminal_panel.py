@@ -11,12 +11,13 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from msg_analysis.common.intervals import HALF_WIDTH_95
+
 if TYPE_CHECKING:
     from msg_agents.watching.snapshot import Moment
     from msg_analysis.inference.errors.estimates import Estimate
     from msg_analysis.model.experiment.experiment import Experiment
 
-HALF = 1.959963984540054  # standard errors from the middle to the end of a 95 % interval
 COLOURS = (
     "blue",
     "yellow",
@@ -94,7 +95,7 @@ def _system(moment: Moment, width: int) -> list[RenderableType]:
     text = Text("system error ", no_wrap=True, overflow="ellipsis")
     text.append(f"{system.measured:.4g}", style="bold")
     if system.standard_error is not None:
-        text.append(f" ± {HALF * system.standard_error:.2g} (95 %)")
+        text.append(f" ± {HALF_WIDTH_95 * system.standard_error:.2g} (95 %)")
     if system.predicted is not None:
         text.append(f", predicted {system.predicted:.4g}")
     if system.z is not None:
@@ -109,7 +110,7 @@ def gauge(estimate: Estimate, width: int) -> Text:
     measured, predicted, error = estimate.measured, estimate.predicted, estimate.standard_error
     if measured is None or predicted is None or not error or not math.isfinite(error) or width < 10:
         return Text()
-    low, high = measured - HALF * error, measured + HALF * error
+    low, high = measured - HALF_WIDTH_95 * error, measured + HALF_WIDTH_95 * error
     left, right = min(low, predicted) - error, max(high, predicted) + error
     cells = [" "] * width
 

@@ -16,13 +16,12 @@ from rich.console import Console
 from rich.text import Text
 from scipy import stats
 
+from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.common.markdown import markdown_table, number_text
 from msg_analysis.errors import InputError
 from msg_analysis.inference.errors.ranking import Order, order_of
 from msg_analysis.report.terminal.tables import number_table
 from msg_analysis.report.terminal.verdict_text import order_statements
-
-RESULT_FILE = "result.json"
 
 
 @dataclass(frozen=True, slots=True)
