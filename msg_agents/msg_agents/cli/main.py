@@ -38,7 +38,6 @@ from msg_analysis.common.json_numbers import json_text
 if TYPE_CHECKING:
     from msg_agents.running.runner import RunResult
     from msg_analysis.bags.format.storage_options import Compression
-    from msg_analysis.model.experiment.experiment import Experiment
 
 
 @click.group(cls=CommandGroup)
@@ -133,13 +132,12 @@ def run(
 
     On a terminal, a panel shows how the run stands; with --web, a page for browsers does, too.
     """
+    from msg_agents.running.experiment_overrides import load_with_overrides
     from msg_agents.running.runner import run_network
     from msg_agents.watching.run_view import RunView
 
-    changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
-    if processes is not None:
-        changes["processes"] = int(processes) if processes.isdigit() else processes
-    what = _load(experiment).with_run(**{key: value for key, value in changes.items() if value is not None})
+    changes = {"seed": seed, "duration": duration, "pace": pace, "speed": speed, "processes": processes}
+    what = load_with_overrides(experiment, changes)
     with page(web, web_host) as served:
         with RunView(what, served) as view:
             if served is not None:
@@ -152,7 +150,6 @@ def run(
                 use_sim_time=use_sim_time,
                 storage=storage(compression, split_size),
                 pin=pin,
-                on_note=view.note,
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
             )
@@ -255,9 +252,10 @@ def _newest_bag(directory: Path) -> Path:
 @experiment_argument
 def prepare(experiment: Path) -> None:
     """Print the run record of a new run of EXPERIMENT: the file that the single nodes are started with."""
+    from msg_analysis.model.experiment.experiment import Experiment
     from msg_analysis.twin.simulate import new_record
 
-    what = _load(experiment)
+    what = Experiment.load(experiment)
     what.require_available()
     click.echo(new_record(what).to_json())
 
@@ -346,7 +344,6 @@ def host(
             domain=places.domain,
             restarts=restarts,
             storage=storage(compression, split_size),
-            on_note=view.note,
             view=view,
             environment=places.environment(what, folder),
             record=record,
@@ -355,12 +352,6 @@ def host(
     _end(result, as_json)
     if not share.home and not as_json:
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
-
-
-def _load(path: Path) -> Experiment:
-    from msg_analysis.model.experiment.experiment import Experiment
-
-    return Experiment.load(path)
 
 
 for _command in (

@@ -14,6 +14,7 @@ from typing import Any
 
 from msg_agents.processes.environment import SINGLE_THREAD
 from msg_agents.processes.process_plan import ProcessPlan, plan_network
+from msg_agents.running.experiment_overrides import load_with_overrides
 from msg_agents.running.run_folder import workshop
 from msg_agents.running.runner import REPORT_FILE, make_bag_directory
 from msg_agents.running.supervisor import failure_of
@@ -89,11 +90,8 @@ def load_experiment(arguments: Mapping[str, str], share: Path) -> Experiment:
             except ValueError as error:
                 what = "a whole number" if kind is int else "a number"
                 raise InputError(f"{name}: {text}: expected {what}") from error
-    if pace := arguments["pace"].strip():
-        changes["pace"] = pace
-    if processes := arguments["processes"].strip():
-        changes["processes"] = int(processes) if processes.isdigit() else processes
-    experiment = Experiment.load(find_experiment(arguments["experiment"], share)).with_run(**changes)
+    changes |= {name: arguments[name].strip() or None for name in ("pace", "processes")}
+    experiment = load_with_overrides(find_experiment(arguments["experiment"], share), changes)
     experiment.require_available()
     return experiment
 

@@ -95,9 +95,7 @@ class Child:
 class Supervisor:
     """The processes of one run; at the end of the context they are ended.
 
-    Children run in sessions of their own, so that Ctrl-C in the terminal reaches the parent only, which then ends them
-    in order. Each holds the reading end of a pipe whose writing end only the parent has: when the parent ends, for
-    whatever reason, the pipe closes and the child leaves.
+    They have sessions of their own, so that Ctrl-C reaches only the parent; they end when its pipe to them closes.
     """
 
     logs: Path  # directory for what the children print

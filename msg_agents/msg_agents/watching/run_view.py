@@ -12,6 +12,7 @@ from msg_agents.terminal.job_control import JobControl
 from msg_agents.watching.run_observer import Observer
 from msg_agents.watching.snapshot import Clockwork, moment_document, setting
 from msg_agents.watching.terminal_panel import plain_line, show
+from msg_agents.watching.view import View
 from msg_analysis.common.notes import print_note
 
 if TYPE_CHECKING:
@@ -23,8 +24,8 @@ REFRESH = 0.25  # s between two updates
 LINES = 10.0  # s between two lines where there is no terminal
 
 
-class RunView:
-    """Shows a run; a context. All methods are called from the thread that runs the network."""
+class RunView(View):
+    """Shows a run in all these ways; a context."""
 
     def __init__(self, experiment: Experiment, web: Web | None = None) -> None:
         from rich.console import Console
