@@ -94,7 +94,7 @@ def test_a_run_of_which_no_state_comes_is_over(network: Any, domain: int) -> Non
     play = network.start("play", bag, "--topics", "/experiment", "--await", "live")
     ended(play)
     stdout, _ = ended(live, code=3)
-    assert "nothing has come whole yet" in stdout
+    assert "no complete step yet" in stdout
 
 
 def test_a_watcher_that_is_stopped_holds_nobody_up(network: Any, domain: int) -> None:
@@ -110,7 +110,7 @@ def test_a_watcher_that_is_stopped_holds_nobody_up(network: Any, domain: int) ->
     live.send_signal(signal.SIGCONT)
     stdout, stderr = live.communicate(timeout=60)
     assert live.returncode in (0, 3), stderr  # it may have missed the last step
-    assert re.search(r"system error [\d.]+ \+- [\d.]+, predicted [\d.]+, z = [+-][\d.]+, \d+ steps", stdout)
+    assert re.search(r"system error [\d.]+ ± [\d.]+ \(95 %\), predicted [\d.]+, z [+-][\d.]+, \d+ steps", stdout)
 
 
 def wait_for_steps(live: subprocess.Popen[str]) -> None:

@@ -153,7 +153,7 @@ def run(
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
             )
-        _end(result, as_json, view.say)
+        _end(result, as_json, view.display.end)
 
 
 def _end(result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None] = lambda _: None) -> None:

@@ -24,7 +24,8 @@ from msg_analysis.common.notes import print_note
 if TYPE_CHECKING:
     from msg_agents.nodes.replay.player import Played
     from msg_agents.nodes.watching.live import Watched
-    from msg_agents.watching.web_server import Web
+    from msg_agents.watching.display import Display
+    from msg_agents.watching.snapshot import SnapshotSource
 
 _domain = click.option(
     "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Instead of the environment's ROS_DOMAIN_ID."
@@ -177,7 +178,7 @@ def play(
         readers=readers,
         wait_timeout=wait_timeout,
     )
-    with _play_bar(bag.name) as bar:
+    with PlayBar(bag.name) as bar:
         try:
             played = play_bag(
                 bag, options, on_progress=bar.update, on_note=bar.note, on_stop=bar.hide, on_continue=bar.show
@@ -194,7 +195,7 @@ def play(
         print_json({"messages": played.messages, "seconds": played.seconds, "held_back": played.held_back})
 
 
-class _play_bar:  # noqa: N801  used like a function
+class PlayBar:
     """Prints notes on stderr and, on a terminal, a bar with the time in the bag and the rate."""
 
     def __init__(self, name: str) -> None:
@@ -216,7 +217,7 @@ class _play_bar:  # noqa: N801  used like a function
         )
         self._task = self._progress.add_task(name, total=None, state="looking for readers")
 
-    def __enter__(self) -> _play_bar:
+    def __enter__(self) -> PlayBar:
         self.show()
         return self
 
@@ -232,6 +233,7 @@ class _play_bar:  # noqa: N801  used like a function
         self._progress.stop()
 
     def update(self, played: Played) -> None:
+        """Show how far it came."""
         self.played = played
         pace = "as fast as it goes" if math.isinf(played.rate) else f"x {played.rate:.3g}"
         state = f"{played.now:.1f}/{played.length:.1f} s  {'paused' if played.paused else pace}"
@@ -277,13 +279,24 @@ def live(
     It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). The numbers are those of `msg-analysis
     compare`, on the topic `estimate` too, but they are no verdict.
     """
+    from msg_agents.nodes.watching.live import watch
+    from msg_agents.watching.display import Display
     from msg_analysis.report.terminal.live_text import live_document
 
+    _enter(domain)
+    console = result_console()
+    panel = console.is_terminal and not as_json
     with page(web, web_host) as served:
-        found = _watch(reliable=reliable, timeout=timeout, as_json=as_json, domain=domain, served=served, host=web_host)
-        if served is not None and found is not None:
-            words = "The run has ended." if found.finished else "Nobody watches any more."
-            served.end({"text": words, "verdict": None if found.finished else "incomplete"})
+        if served is not None:
+            announce(served, web_host, print_note)
+        with Display(console, served, panel=panel, transient=False) as display:
+            view = LiveView(display, None if as_json or panel else click.echo)
+            found = watch(
+                reliable=reliable, timeout=timeout, on_report=view.show, on_note=print_note, on_look=display.check
+            )
+        if found is not None:
+            words = "The run has ended." if found.finished else "This page is no longer updated."
+            display.end({"text": words, "verdict": None if found.finished else "incomplete"})
     if found is None:
         print_note("no network was seen")
         sys.exit(ExitCode.INCOMPLETE)
@@ -297,59 +310,26 @@ def live(
     os._exit(ExitCode.FINE if found.finished else ExitCode.INCOMPLETE)
 
 
-def _watch(
-    *, reliable: bool, timeout: float | None, as_json: bool, domain: int | None, served: Web | None, host: str
-) -> Watched | None:
-    """Watch a network and show it meanwhile; what was seen, or None without a network."""
-    from msg_agents.nodes.watching.live import watch
-    from msg_analysis.report.terminal.live_text import live_line, live_table
+class LiveView:
+    """Shows what has been seen of a network: drawn by ``display``, and as lines where these are wanted."""
 
-    _enter(domain)
-    if served is not None:
-        announce(served, host, print_note)
-    publish = _publisher(served)
-    console = result_console()
-    if as_json or not console.is_terminal:
+    def __init__(self, display: Display, print_line: Callable[[str], None] | None) -> None:
+        self._display, self._print_line = display, print_line
+        self._source: SnapshotSource | None = None
 
-        def show(watched: Watched, rate: float) -> None:
-            publish(watched, rate)
-            if not as_json:
-                click.echo(live_line(watched.report, watched.record, rate))
+    def show(self, watched: Watched, rate: float) -> None:
+        """Show the newest report; ``rate`` in steps per second."""
+        from msg_agents.watching.snapshot import SnapshotSource
+        from msg_analysis.report.terminal.live_text import live_line
 
-        found = watch(reliable=reliable, timeout=timeout, on_report=show, on_note=print_note)
-    else:
-        from rich.live import Live
-
-        from msg_agents.terminal.job_control import JobControl
-
-        screen = Live(console=console, auto_refresh=False)
-        with screen, JobControl(before=screen.stop, after=lambda: screen.start(refresh=True)) as jobs:
-
-            def draw(watched: Watched, rate: float) -> None:
-                publish(watched, rate)
-                screen.update(live_table(watched.report, watched.record, rate), refresh=True)
-
-            found = watch(reliable=reliable, timeout=timeout, on_report=draw, on_note=print_note, on_look=jobs.check)
-    return found
-
-
-def _publisher(served: Web | None) -> Callable[[Watched, float], None]:
-    """A function that sends reports to the page; without a page it does nothing."""
-    if served is None:
-        return lambda *_: None
-    from msg_agents.watching.snapshot import Clockwork, moment_document, setting
-
-    clockworks: list[Clockwork] = []
-
-    def publish(watched: Watched, _: float) -> None:
-        if not clockworks:
-            clockworks.append(Clockwork(watched.record.experiment))
-            served.begin(setting(watched.record.experiment))
+        experiment, report = watched.record.experiment, watched.report
+        if self._source is None:
+            self._source = SnapshotSource(experiment)
+            self._display.begin(experiment)
         # The steps of single agents are not counted here: the newest step of any agent stands for all.
-        moment = clockworks[0].moment([watched.report.newest], watched.report)
-        served.show(moment_document(moment) | {"steps": []})
-
-    return publish
+        self._display.draw(self._source.snapshot([report.newest], report), experiment)
+        if self._print_line is not None:
+            self._print_line(live_line(report, watched.record, rate))
 
 
 @click.command(

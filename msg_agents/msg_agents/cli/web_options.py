@@ -11,7 +11,7 @@ import click
 from msg_agents.cli.ros_command import RosCommand
 
 if TYPE_CHECKING:
-    from msg_agents.watching.web_server import Web
+    from msg_agents.watching.web_server import WebServer
 
 PORT, HOST = 8421, "127.0.0.1"
 LOOPBACK = {"127.0.0.1", "localhost", "::1"}
@@ -58,18 +58,18 @@ class WebRosCommand(WebCommand, RosCommand):
 
 
 @contextmanager
-def page(port: int | None, host: str) -> Iterator[Web | None]:
+def page(port: int | None, host: str) -> Iterator[WebServer | None]:
     """Serve the live page inside the context (port 0: any free port); None without a port."""
     if port is None:
         yield None
         return
-    from msg_agents.watching.web_server import Web
+    from msg_agents.watching.web_server import WebServer
 
-    with Web(host, port) as web:
+    with WebServer(host, port) as web:
         yield web
 
 
-def announce(web: Web, host: str, note: Callable[[str], None]) -> None:
+def announce(web: WebServer, host: str, note: Callable[[str], None]) -> None:
     """Note the address of the page, and that other machines can see it where that is so."""
     note(f"live page at {web.address}")
     if host not in LOOPBACK:

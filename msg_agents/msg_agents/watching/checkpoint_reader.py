@@ -20,7 +20,7 @@ BLOCK = 2000
 """Steps that are taken at once: limits the memory that a large network needs."""
 
 
-class Tap:
+class CheckpointReader:
     """Reads whole steps from the checkpoints of the agents, each at most once, in order."""
 
     def __init__(self, record: RunRecord, directory: Path) -> None:

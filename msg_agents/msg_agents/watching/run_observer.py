@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from msg_agents.watching.checkpoint_reader import Tap
+from msg_agents.watching.checkpoint_reader import CheckpointReader
 from msg_analysis.errors import InputError
 from msg_analysis.model.run.record import RunRecord
 
@@ -24,7 +24,7 @@ MOST_NODES = 20
 """Up to this many agents, each gets a standard error; for more it would cost the network too much CPU time."""
 
 
-class Observer:
+class RunObserver:
     """Estimates the errors of a run; ``checkpoints``: directory in which its agents keep their states.
 
     Its thread sets ``report`` (the newest numbers; None before the first) and ``note`` (why there are none).
@@ -33,7 +33,7 @@ class Observer:
     def __init__(self, record: RunRecord, checkpoints: Path) -> None:
         self.report: LiveReport | None = None
         self.note: str | None = None
-        self._record, self._tap = record, Tap(record, checkpoints)
+        self._record, self._reader = record, CheckpointReader(record, checkpoints)
         self._reached = -1
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="observer", daemon=True)
@@ -67,10 +67,10 @@ class Observer:
             self.note = str(error)
 
     def _follow(self, estimate: LiveEstimate, deadline: float) -> None:
-        if not self._tap.ready():
+        if not self._reader.ready():
             return
         while time.monotonic() < deadline and not (deadline == math.inf and self._over.is_set()):
-            found = self._tap.take(self._reached)
+            found = self._reader.take(self._reached)
             if not len(found[0]):
                 break
             estimate.add_whole(*found)

@@ -36,7 +36,7 @@ HEADERS = {
 }
 
 
-class Web:
+class WebServer:
     """Serves the page at ``address`` from when it is made until ``close``; port 0: any free one.
 
     Its methods may be called from any thread. InputError: the port is taken, or the address is not one of this machine.
@@ -73,13 +73,13 @@ class Web:
         self.close()
 
     def begin(self, setting: dict[str, Any]) -> None:
-        """Show a run, given by ``moment.setting``."""
+        """Show a run, given by ``snapshot.run_description``."""
         with self._changed:
             self._setting = finite(setting)
             self._tell()
 
     def show(self, moment: dict[str, Any]) -> None:
-        """Show the current state of the run, given by ``moment.moment_document``."""
+        """Show the current state of the run, given by ``snapshot.snapshot_document``."""
         system = moment["system"] or {}
         with self._changed:
             self._moment = finite(moment)
@@ -152,7 +152,7 @@ class _Server(ThreadingHTTPServer):
     allow_reuse_address = True
     request_queue_size = 64
 
-    def __init__(self, web: Web, host: str, port: int, family: socket.AddressFamily) -> None:
+    def __init__(self, web: WebServer, host: str, port: int, family: socket.AddressFamily) -> None:
         self.address_family = family
         self.web = web
         page = resources.files("msg_agents.watching") / "pages" / "live.html"

@@ -10,8 +10,8 @@ import pytest
 
 from msg_agents.processes.process_plan import agent_name
 from msg_agents.recovery.checkpoint import Checkpoint, longest_heard
-from msg_agents.watching.checkpoint_reader import BLOCK, Tap
-from msg_agents.watching.run_observer import Observer
+from msg_agents.watching.checkpoint_reader import BLOCK, CheckpointReader
+from msg_agents.watching.run_observer import RunObserver
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.arithmetic.payload import to_payload
 from msg_analysis.model.experiment.experiment import Experiment
@@ -58,38 +58,38 @@ class Writers:
 @pytest.mark.parametrize("noise", [{}, {"loss": 0.1}])
 def test_gives_what_was_written(tmp_path: Path, noise: dict[str, float]) -> None:
     trajectory = simulate(_experiment(noise={"process": 1.0, **noise}))
-    tap = Tap(trajectory.record, tmp_path)
-    assert not tap.ready()
+    reader = CheckpointReader(trajectory.record, tmp_path)
+    assert not reader.ready()
     writers = Writers(trajectory, tmp_path)
-    assert tap.ready()
-    assert not len(tap.take(-1)[0])
+    assert reader.ready()
+    assert not len(reader.take(-1)[0])
     seen = []
     for last in (0, 1, 2, 150, 150, 400):
         writers.write(last)
-        steps, modes, states, after = tap.take(last)
+        steps, modes, states, after = reader.take(last)
         seen += steps.tolist()
         assert np.array_equal(modes, trajectory.modes[steps])
         assert np.array_equal(states, trajectory.states[steps])
         assert np.array_equal(after, trajectory.states[steps + 1])
     assert seen == list(range(400))
-    assert tap.missed == 0
+    assert reader.missed == 0
 
 
 def test_what_was_written_over_is_missed(tmp_path: Path) -> None:
     """The ring has room for 6000 steps; half of that is read, so that nothing is read while it is written over."""
     trajectory = simulate(_experiment(duration=500))
     writers = Writers(trajectory, tmp_path)
-    tap = Tap(trajectory.record, tmp_path)
+    reader = CheckpointReader(trajectory.record, tmp_path)
     writers.write(100)
-    assert tap.ready()
-    assert tap.take(100)[0].tolist() == list(range(100))
+    assert reader.ready()
+    assert reader.take(100)[0].tolist() == list(range(100))
     writers.write(9000)
     seen = []
-    while len(found := tap.take(9000)[0]):
+    while len(found := reader.take(9000)[0]):
         assert len(found) <= BLOCK
         seen += found.tolist()
     assert seen == list(range(6000, 9000))
-    assert tap.missed == 5900
+    assert reader.missed == 5900
 
 
 def test_half_written_states_do_not_count(tmp_path: Path) -> None:
@@ -101,17 +101,17 @@ def test_half_written_states_do_not_count(tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[20 * (size + 16) + size + 8 : 20 * (size + 16) + size + 16] = bytes(8)  # the mark of step 20
     path.write_bytes(data)
-    tap = Tap(trajectory.record, tmp_path)
-    assert tap.ready()
-    steps = tap.take(50)[0].tolist()
+    reader = CheckpointReader(trajectory.record, tmp_path)
+    assert reader.ready()
+    steps = reader.take(50)[0].tolist()
     assert steps == [k for k in range(50) if k not in (19, 20)]  # a step needs the state after it, too
-    assert tap.missed == 2
+    assert reader.missed == 2
 
 
 def test_the_observer_has_the_numbers_of_the_comparison(tmp_path: Path) -> None:
     trajectory = simulate(_experiment())
     writers = Writers(trajectory, tmp_path)
-    observer = Observer(trajectory.record, tmp_path)
+    observer = RunObserver(trajectory.record, tmp_path)
     writers.write(400)
     observer.look(400)
     observer.end()
