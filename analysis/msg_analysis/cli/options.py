@@ -69,9 +69,9 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 experiment_argument = click.argument("experiment", type=YAML)
-seed_option = click.option("--seed", type=int, metavar="N", help="Instead of run.seed.")
+seed_option = click.option("--seed", type=int, metavar="N", help="Overrides run.seed.")
 duration_option = click.option(
-    "--duration", type=float, metavar="T", help="Instead of run.duration, in units of simulated time."
+    "--duration", type=float, metavar="T", help="Overrides run.duration, in units of simulated time."
 )
 
 

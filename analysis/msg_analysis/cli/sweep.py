@@ -28,7 +28,7 @@ other_software = click.option(
     type=click.Choice(["refuse", "redo", "keep"]),
     default="refuse",
     show_default=True,
-    help="What to do with results in the directory that other versions made.",
+    help="What to do with results that other versions made.",
 )
 
 
@@ -46,15 +46,13 @@ other_software = click.option(
     type=click.IntRange(1),
     metavar="N",
     show_default="one for each CPU; one where networks run",
-    help="Processes. A network needs a machine.",
+    help="Worker processes; each network needs a machine of its own.",
 )
 @click.option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of this Dask scheduler instead.")
-@click.option(
-    "--column", metavar="NAME", show_default="system_error", help="Column of the tables that is drawn and listed."
-)
-@click.option("--retry", is_flag=True, help="Try again what has failed.")
+@click.option("--column", metavar="NAME", show_default="system_error", help="Column of the tables to draw and list.")
+@click.option("--retry", is_flag=True, help="Repeat failed points.")
 @other_software
-@click.option("--keep-bags", is_flag=True, help="Keep the bags of networks that agree with the prediction, too.")
+@click.option("--keep-bags", is_flag=True, help="Also keep the bags of networks that agree with the prediction.")
 @json_option
 @click.pass_context
 def sweep(
@@ -70,15 +68,16 @@ def sweep(
     keep_bags: bool,
     as_json: bool,
 ) -> None:
-    """Predict, simulate or run an experiment at many values of its keys, as the file SWEEP says.
+    """Predict, simulate or run an experiment at many values of its keys, as described in the file SWEEP.
 
-    What has been done is kept: after an interruption, the same command goes on. Tables (Parquet, CSV, JSON) and a
-    figure are written beside it.
+    Results are kept: after an interruption, the same command continues. Tables (Parquet, CSV, JSON) and a figure are
+    written next to them.
 
-    Exit code 0: fine, 1: some run disagrees with its prediction, all runs judged together, 3: some point has no result.
+    Exit code 0: success, 1: some run disagrees with its prediction, all runs judged together, 3: some point has no
+    result.
     """
     if workers and scheduler:
-        raise InputError("--workers: given with --scheduler, whose workers are used: give one of them")
+        raise InputError("--workers: not together with --scheduler, which has workers of its own: give one of them")
     require_libraries()
     if not scheduler:
         from msg_analysis.sweep.jobs.workers import warm_up
@@ -159,7 +158,7 @@ def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Sto
             return conduct(jobs, store, watch=progress.done, **how)
     except (KeyboardInterrupt, WorkersLostError) as error:
         there = sum(job.id in store.outcomes for job in jobs)
-        kept = f"{there} of {len(jobs)} points are kept in {store.directory}: the same command goes on"
+        kept = f"{there} of {len(jobs)} points are kept in {store.directory}: the same command continues"
         if isinstance(error, KeyboardInterrupt):
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the exit
             click.echo(f"\ninterrupted: {kept}", err=True)

@@ -21,7 +21,7 @@ def require_place(file: Path | None) -> None:
     if not file.parent.is_dir():
         raise InputError(f"{file}: no such directory {file.parent}: create it")
     if file.exists() and not file.is_file():
-        raise InputError(f"{file}: not a regular file: name another")
+        raise InputError(f"{file}: not a regular file: choose another")
 
 
 def write_whole(path: Path, content: bytes) -> Path:

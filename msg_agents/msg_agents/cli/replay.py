@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from msg_agents.watching.snapshot import SnapshotSource
 
 _domain = click.option(
-    "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Instead of the environment's ROS_DOMAIN_ID."
+    "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Overrides ROS_DOMAIN_ID of the environment."
 )
 _timeout = click.option(
     "--timeout",
     type=PositiveFloat(),
     metavar="SECONDS",
-    show_default="for ever",
+    show_default="no limit",
     help="How long to wait for a network [s].",
 )
 
@@ -83,7 +83,7 @@ class _Rate(click.types.FloatParamType):
     type=_Rate(),
     metavar="RATE",
     default="1",
-    help="Seconds of the bag per second; of a network's bag, units of simulated time. max: as fast as readers take it.",
+    help="Seconds of the bag per second; of a network's bag, units of simulated time. max: as fast as readers allow.",
 )
 @click.option(
     "--start-offset",
@@ -92,21 +92,21 @@ class _Rate(click.types.FloatParamType):
     metavar="SECONDS",
     help="Seconds of the bag to leave out at the start.",
 )
-@click.option("--duration", type=PositiveFloat(), metavar="SECONDS", help="Seconds of the bag to play; otherwise all.")
-@click.option("-l", "--loop", is_flag=True, help="Begin again at the end.")
-@click.option("--paused", is_flag=True, help="Stand at first; the space bar starts it.")
+@click.option("--duration", type=PositiveFloat(), metavar="SECONDS", help="Seconds of the bag to play.")
+@click.option("-l", "--loop", is_flag=True, help="Start again at the end.")
+@click.option("--paused", is_flag=True, help="Start paused; the space bar continues.")
 @click.option(
     "--clock",
     type=PositiveFloat(),
     metavar="HZ",
-    help="Publish the time of the bag on /clock so often a second.",
+    help="Publish the time of the bag on /clock at this rate.",
 )
 @click.option(
     "--topics",
     multiple=True,
     metavar="TOPIC",
     shell_complete=_topics_of_bag,
-    help="Only this topic; or a pattern such as '/agent_*/state'. Repeatable.",
+    help="Play only this topic, or pattern such as '/agent_*/state'. Repeatable.",
 )
 @click.option(
     "-x",
@@ -114,19 +114,17 @@ class _Rate(click.types.FloatParamType):
     multiple=True,
     metavar="TOPIC",
     shell_complete=_topics_of_bag,
-    help="Not this topic, or pattern. Repeatable.",
+    help="Do not play this topic, or pattern. Repeatable.",
 )
-@click.option(
-    "-m", "--remap", "remaps", multiple=True, metavar="OLD:=NEW", help="Another name for a topic. Repeatable."
-)
+@click.option("-m", "--remap", "remaps", multiple=True, metavar="OLD:=NEW", help="Rename a topic. Repeatable.")
 @click.option(
     "--wait-for-subscribers",
     "subscribers",
     type=click.IntRange(1),
     metavar="N",
-    help="Begin when every topic has N readers (latched topics, whose readers miss nothing, are not waited for).",
+    help="Start when every topic has N readers (except latched topics, whose readers miss nothing).",
 )
-@click.option("--await", "readers", multiple=True, metavar="NODE", help="Begin when NODE reads them. Repeatable.")
+@click.option("--await", "readers", multiple=True, metavar="NODE", help="Start when NODE reads the topics. Repeatable.")
 @click.option(
     "--wait-timeout",
     type=PositiveFloat(),
@@ -154,11 +152,11 @@ def play(
     domain: int | None,
     as_json: bool,
 ) -> None:
-    """Publish the messages of BAG again, a bag of ROS 2 with MCAP storage, in the order in which they were recorded.
+    """Play BAG, a bag of ROS 2 with MCAP storage: publish its messages in the recorded order.
 
-    No message is lost: readers that do not keep up hold the player back.
+    No message is lost: the player waits for slow readers.
 
-    On a terminal, space pauses and goes on, s or the right arrow plays one message, up and down change the rate.
+    On a terminal, space pauses and continues, s or the right arrow plays one message, up and down change the rate.
     """
     from msg_agents.nodes.replay.player import PlayOptions
     from msg_agents.nodes.replay.player import play as play_bag
@@ -187,9 +185,9 @@ def play(
             if bar.played.begun:
                 bar.note(f"stopped at {bar.played.now:g} s of the bag after {bar.played.messages} messages")
             else:
-                bar.note("stopped before it began: nothing but latched messages has been played")
+                bar.note("stopped before the start: only latched messages were played")
             raise
-    held = f"; held back by readers for {played.held_back:.1f} s" if played.held_back >= 0.1 else ""
+    held = f"; waited {played.held_back:.1f} s for readers" if played.held_back >= 0.1 else ""
     click.echo(f"{played.messages} messages played in {played.seconds:.1f} s{held}", err=True)
     if as_json:
         print_json({"messages": played.messages, "seconds": played.seconds, "held_back": played.held_back})
@@ -215,7 +213,7 @@ class PlayBar:
             transient=True,
             auto_refresh=False,  # no thread: it might hold a lock that a signal handler needs
         )
-        self._task = self._progress.add_task(name, total=None, state="looking for readers")
+        self._task = self._progress.add_task(name, total=None, state="waiting for readers")
 
     def __enter__(self) -> PlayBar:
         self.show()
@@ -238,7 +236,7 @@ class PlayBar:
         pace = "as fast as it goes" if math.isinf(played.rate) else f"x {played.rate:.3g}"
         state = f"{played.now:.1f}/{played.length:.1f} s  {'paused' if played.paused else pace}"
         if not played.begun:
-            state = "looking for readers"
+            state = "waiting for readers"
         self._progress.update(self._task, completed=played.now, total=played.length, state=state, refresh=True)
 
     def note(self, line: str) -> None:
@@ -265,7 +263,7 @@ def _enter(domain: int | None) -> None:
 @click.option(
     "--reliable",
     is_flag=True,
-    help="Miss no state, and hold the network back where that takes too long. By default it never waits.",
+    help="Receive every state: the network waits for this node if it is too slow. By default it never waits.",
 )
 @_timeout
 @json_option
@@ -274,10 +272,10 @@ def _enter(domain: int | None) -> None:
 def live(
     *, reliable: bool, timeout: float | None, as_json: bool, web: int | None, web_host: str, domain: int | None
 ) -> None:
-    """Watch a network, running or played: its errors up to now beside their prediction.
+    """Watch a network, running or played: its errors so far next to their prediction.
 
-    It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). The numbers are those of `msg-analysis
-    compare`, on the topic `estimate` too, but they are no verdict.
+    It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The numbers are those of `msg-analysis
+    compare`, also published on the topic `estimate`; they are not a verdict.
     """
     from msg_agents.nodes.watching.live import watch
     from msg_agents.watching.display import Display
@@ -341,9 +339,9 @@ class LiveView:
     type=click.FloatRange(0, 1000, min_open=True),
     metavar="HZ",
     default=10.0,
-    help="Pictures a second.",
+    help="Updates per second.",
 )
-@click.option("--replica", type=click.IntRange(1), metavar="R", default=1, help="Which of the copies is drawn.")
+@click.option("--replica", type=click.IntRange(1), metavar="R", default=1, help="Replica to draw.")
 @click.option("--frame", metavar="FRAME", default="network", help="Frame of reference: the fixed frame of RViz.")
 @_timeout
 @_domain
@@ -351,7 +349,8 @@ def markers(*, rate: float, replica: int, frame: str, timeout: float | None, dom
     """Draw a network, running or played, for RViz and Foxglove: markers on the topic `markers`.
 
     Agents on a circle, coloured by how far their states are from the mean (or the reference), and the links of the
-    active graph. It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). Nobody waits for it.
+    active graph. It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The network never waits
+    for it.
     """
     from msg_agents.nodes.watching.markers import show_markers
 

@@ -25,7 +25,7 @@ def web_options(function: Function) -> Function:
         default=HOST,
         show_default=True,
         metavar="ADDRESS",
-        help="Where the page of --web is served; 0.0.0.0: to everybody who can reach this machine.",
+        help="Address of the page of --web; 0.0.0.0: for all machines that can reach this one.",
     )
     web = click.option(
         "--web",
@@ -34,7 +34,7 @@ def web_options(function: Function) -> Function:
         is_flag=False,
         flag_value=PORT,
         default=None,
-        help=f"Serve a live page for browsers on this port; {PORT} if none is named, 0: any that is free.",
+        help=f"Serve a live page for browsers on this port; {PORT} if none is given, 0: any free port.",
     )
     return web(host(function))
 
@@ -73,4 +73,4 @@ def announce(web: WebServer, host: str, note: Callable[[str], None]) -> None:
     """Note the address of the page, and that other machines can see it where that is so."""
     note(f"live page at {web.address}")
     if host not in LOOPBACK:
-        note("whoever can reach this machine can see the page; it is not encrypted and asks for no password")
+        note("all machines that can reach this one can see the page; it is not encrypted and has no password")

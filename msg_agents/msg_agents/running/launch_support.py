@@ -26,28 +26,28 @@ from msg_analysis.twin.simulate import new_record
 TRUE, FALSE = {"true", "1", "yes", "on"}, {"false", "0", "no", "off"}
 NETWORK_ARGUMENTS = {
     "experiment": ("line_ring", "Experiment file, or the name of one of msg_agents_bringup."),
-    "out": ("runs", "Where the bag's directory <name>_<time> is made."),
+    "out": ("runs", "Directory in which the bag's directory <name>_<time> is created."),
     "record": ("true", "Whether to record; otherwise there is no bag and no verdict."),
     "analyse": (
         "true",
         "Whether to compare the bag with the prediction afterwards: the launch fails if they disagree.",
     ),
-    "seed": ("", "Instead of run.seed."),
-    "duration": ("", "Instead of run.duration, in units of simulated time."),
-    "pace": ("", "Instead of run.pace: lockstep or realtime."),
-    "speed": ("", "Instead of run.speed: units of simulated time per second (realtime)."),
-    "processes": ("", "Instead of run.processes: auto, one_per_agent or a number."),
-    "namespace": ("", "Of all nodes and topics, such as /lab."),
+    "seed": ("", "Overrides run.seed."),
+    "duration": ("", "Overrides run.duration, in units of simulated time."),
+    "pace": ("", "Overrides run.pace: lockstep or realtime."),
+    "speed": ("", "Overrides run.speed: units of simulated time per second (realtime)."),
+    "processes": ("", "Overrides run.processes: auto, one_per_agent or a number."),
+    "namespace": ("", "Namespace of all nodes and topics, such as /lab."),
     "use_sim_time": ("false", "Whether to take the time from /clock (realtime)."),
 }
 """Default and description of each argument of network.launch.py."""
 REPLAY_ARGUMENTS = {
     "bag": ("", "The bag: a directory, or one of its files."),
-    "rate": ("1", "Seconds of the bag per second, or max: as fast as readers take it."),
-    "live": ("true", "Whether to watch it: errors beside their prediction, on the topic estimate too."),
-    "namespace": ("", "Of the network in the bag: where to watch it."),
-    "clock": ("", "Hz at which to publish the time of the bag on /clock; empty: not."),
-    "loop": ("false", "Whether to begin again at the end, for ever; not together with live."),
+    "rate": ("1", "Seconds of the bag per second, or max: as fast as the readers allow."),
+    "live": ("true", "Whether to watch it: errors next to their prediction, also on the topic estimate."),
+    "namespace": ("", "Namespace of the network in the bag, for live."),
+    "clock": ("", "Rate [Hz] at which the time of the bag is published on /clock; empty: it is not published."),
+    "loop": ("false", "Whether to start again at the end, without limit; not together with live."),
 }
 """The same for replay.launch.py."""
 
@@ -144,7 +144,7 @@ class LaunchedNetwork:
         return not self._running and not self._over
 
     def _what_is_left(self) -> str:
-        return "" if self.bag is None else f"; what there is of it is in {self.bag}"
+        return "" if self.bag is None else f"; its data so far are in {self.bag}"
 
     @property
     def analysis(self) -> list[str] | None:
@@ -187,7 +187,7 @@ def replay_commands(arguments: Mapping[str, str]) -> list[tuple[str, list[str]]]
     player = [str(Path(bag).expanduser()), "--rate", arguments["rate"].strip()]
     if flag(arguments, "loop"):
         if live:
-            raise InputError("loop: true: a run that begins again cannot be watched: give live:=false")
+            raise InputError("loop: true: a run that starts again cannot be watched: give live:=false")
         player.append("--loop")
     if clock := arguments["clock"].strip():
         player += ["--clock", clock]

@@ -232,7 +232,7 @@ def _standstill(supervisor: Supervisor) -> str:
     words = [f"{node}: {message}" for node, message in sorted(supervisor.account().waiting.items())]
     silent = [child.plan.name for child in supervisor.silent]
     if silent:
-        words.append("nothing heard from " + ", ".join(silent))
+        words.append("no report from " + ", ".join(silent))
     if not words and supervisor.steps:  # the processes that know are on another host
         last = min(supervisor.steps)
         words.append(f"slowest: agent {supervisor.steps.index(last) + 1}, at step {last}")
@@ -286,7 +286,7 @@ def _settle(bag: Path, result: RunResult) -> None:
             report = salvage_in_place(bag)
             result.failures.append(f"the bag was salvaged: {report.kept_messages} messages kept")
         if result.failures and not any(bag.glob("*.mcap")):
-            result.failures.append("nothing was recorded: it ended before the recorder had made a bag")
+            result.failures.append("nothing was recorded: the run ended before the recorder created a bag")
             return
         result.trajectory = read_bag(bag)
     except BagError as error:

@@ -56,8 +56,8 @@ class WebServer:
         except OSError as error:
             reason = error.strerror or str(error)
             raise InputError(
-                f"--web: cannot serve at {host}, port {port} ({reason}): give another port (--web 0: any that is "
-                "free), or another --web-host"
+                f"--web: cannot serve at {host}, port {port} ({reason}): give another port (--web 0: any "
+                "free one), or another --web-host"
             ) from error
         shown = f"[{host}]" if ":" in host else host
         self.address = f"http://{shown}:{self._server.server_address[1]}/"
@@ -115,7 +115,7 @@ class WebServer:
         """Send one browser what is newest until the end or until it has gone; runs in that browser's thread."""
         with self._changed:
             if self._browsers >= MOST_BROWSERS:
-                handler.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_BROWSERS} browsers are watching already")
+                handler.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"the limit of {MOST_BROWSERS} browsers is reached")
                 return
             self._browsers += 1
         try:
@@ -193,7 +193,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif path == "/favicon.ico":
             self._send(HTTPStatus.NO_CONTENT, b"", "image/x-icon")
         else:
-            self.refuse(HTTPStatus.NOT_FOUND, "there is / and /events")
+            self.refuse(HTTPStatus.NOT_FOUND, "not found: only / and /events are served")
 
     def refuse(self, status: HTTPStatus, words: str) -> None:
         """Answer with an error and its reason."""
