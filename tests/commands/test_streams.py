@@ -148,7 +148,7 @@ def test_devices_are_not_replaced_by_files(option: str, tmp_path: Path) -> None:
     words = ["compare", tmp_path / "bag"] if option == "--report" else ["transient", LINE_RING, "--times", "0"]
     result = CliRunner().invoke(main, [*map(str, words), option, str(pipe)])
     assert (result.exit_code, result.stdout) == (2, "")
-    assert "no regular file" in result.stderr
+    assert "not a regular file" in result.stderr
     assert pipe.is_fifo()
 
 

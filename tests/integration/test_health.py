@@ -68,7 +68,7 @@ def test_a_stopped_agent_is_named(network: Any) -> None:
     assert words in (f"step {step} of agent 2", "agents too far behind: 2")
     assert result["notes"] == []
     assert re.match(rf"note: no step for \d+ s: .*agent_1: at step {step}, waiting for {words}", note)
-    assert note.endswith("; nothing heard from agent_2\n")
+    assert note.endswith("; no report from agent_2\n")
 
     known = statuses(heard)
     assert {status["name"] for status in known} == {

@@ -142,5 +142,5 @@ def test_ctrl_c_while_waiting_for_readers(network: Any, twin_bag: Path, terminal
     screen.type(b"\x03")
     assert screen.process.wait(timeout=30) == 130
     assert screen.mode() == screen.before
-    screen.wait_for("stopped before it began")
+    screen.wait_for("stopped before the start")
     assert "Traceback" not in screen.text

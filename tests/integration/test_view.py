@@ -55,7 +55,7 @@ def test_panel_and_ctrl_c(network: Any, terminal: Any) -> None:
     seen = _plain(screen.text)
     assert re.search(r"step \d+ of 800 +\d+ % +\d+ steps/s", seen)
     assert re.search(r"graph (line|ring) +for [\d.e-]+ units of time", seen)
-    assert re.search(r"│ +5 +\d+ +\d+ +[\d.]+ +[\d.]+", seen)
+    assert re.search(r"│ +5 +\d+ +\d+ +[\d.]+ +- +[\d.]+", seen)
     screen.resize(40, 10)
     network.wait_for(lambda: screen.read(0.1) and _bottom(screen) == 40, 5, "a narrow panel")
     screen.type(b"\x03")

@@ -19,14 +19,14 @@ from msg_analysis.common.files import require_place
     )
 )
 @click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=BAG)
-@level_option("Chance of a false 'disagrees', all tests together.")
-@click.option("--report", type=FILE, metavar="FILE", help="Write a report (HTML) as well.")
+@level_option("Probability of a false 'disagrees', over all tests.")
+@click.option("--report", type=FILE, metavar="FILE", help="Also write an HTML report.")
 @json_option
 @click.pass_context
 def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level: float, report: Path | None) -> None:
-    """Compare what the run in BAG did with what theory predicts.
+    """Compare the run in BAG with its prediction.
 
-    Several bags, runs of one experiment with different seeds, get one verdict together.
+    Several bags, runs of one experiment with different seeds, get one joint verdict.
 
     Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
     """
@@ -58,14 +58,14 @@ def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level
     "form",
     type=click.Choice(["table", "markdown", "csv", "json"]),
     default="table",
-    help="A table says in words as well which system errors can be told apart.",
+    help="The table also says which system errors differ significantly.",
 )
-@level_option("Chance of telling any two system errors apart wrongly.")
+@level_option("Probability of any false difference of two system errors.")
 @json_option
 def tabulate(results: tuple[Path, ...], form: str, level: float, as_json: bool) -> None:
-    """Put saved results side by side: files that ``compare --json`` or ``msg-agents run`` wrote.
+    """Show saved results side by side: files written by `compare --json` or `msg-agents run`.
 
-    A RESULT may be the directory of a run, too. Independent runs, that is other seeds, are taken for granted.
+    A RESULT may also be the directory of a run. The runs are assumed to be independent (different seeds).
     """
     from msg_analysis.report.terminal import saved_results as saved
 

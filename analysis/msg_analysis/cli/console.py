@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
+import signal
 import stat
 import sys
 from collections.abc import Iterator
@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.exceptions import Exit
 
-from msg_analysis.common.json_numbers import finite
+from msg_analysis.common.exit_codes import INTERRUPTED, ExitCode, killed_by
+from msg_analysis.common.json_numbers import json_text
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-BAD_INPUT = 2
-INTERRUPTED = 130
-BROKEN_PIPE = 141
 NOT_WRITTEN = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF}
 
 
@@ -55,10 +53,10 @@ def _exit_codes() -> Iterator[None]:
         yield
     except InputError as error:
         complain(str(error))
-        raise Exit(BAD_INPUT) from error
+        raise Exit(ExitCode.BAD_INPUT) from error
     except BrokenPipeError as error:
         _drop_stdout()
-        raise Exit(BROKEN_PIPE) from error
+        raise Exit(killed_by(signal.SIGPIPE)) from error
     except OSError as error:
         if error.filename is not None:
             complain(f"{error.filename}: {error.strerror}")
@@ -68,7 +66,7 @@ def _exit_codes() -> Iterator[None]:
             complain(f"{place}: {error.strerror}: the result could not be written")
         else:
             raise
-        raise Exit(BAD_INPUT) from error
+        raise Exit(ExitCode.BAD_INPUT) from error
     except KeyboardInterrupt as error:
         raise Exit(INTERRUPTED) from error
 
@@ -129,6 +127,6 @@ def result_console() -> Console:
     return ResultConsole(highlight=False, markup=False)
 
 
-def print_json(document: dict[str, Any]) -> None:
+def print_json(document: dict[str, Any], indent: int | None = None) -> None:
     """Print one JSON object on stdout; infinite numbers and NaN become null."""
-    click.echo(json.dumps(finite(document), allow_nan=False))
+    click.echo(json_text(document, indent))

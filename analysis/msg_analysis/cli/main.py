@@ -6,7 +6,6 @@ input, 3 data incomplete. Slow imports are made inside the commands that need th
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,7 @@ from msg_analysis.cli.console import CommandGroup, examples, print_json, result_
 from msg_analysis.cli.options import (
     BAG,
     PATH,
-    InputPath,
+    SOURCE,
     duration_option,
     experiment_argument,
     json_option,
@@ -30,9 +29,6 @@ from msg_analysis.errors import InputError
 if TYPE_CHECKING:
     from msg_analysis.bags.format.storage_options import Compression
     from msg_analysis.sweep.conduct import OtherSoftware
-
-
-_SOURCE = InputPath(".yaml", ".yml", ".json", ".mcap", ".mcap.zstd", holds=("metadata.yaml", "*.mcap"))
 
 
 @click.group(cls=CommandGroup)
@@ -79,7 +75,7 @@ def simulate(
     split_size: float | None,
     as_json: bool,
 ) -> None:
-    """Run EXPERIMENT without ROS and write its bag, whose name is printed."""
+    """Simulate EXPERIMENT without ROS, write its bag and print the name of the bag."""
     from msg_analysis.api import Experiment
 
     loaded = Experiment.load(experiment)
@@ -115,23 +111,27 @@ def simulate(
     "--method",
     type=click.Choice(["auto", "exhaustive", "greedy", "swap"]),
     default="auto",
-    help="How to search; auto: exhaustive where there are at most 1000 sets, else swap.",
+    help="Search method. auto: exhaustive up to 1000 sets, otherwise swap.",
 )
 @click.option(
     "--law",
     type=click.Choice(["continuous", "emulated", "discrete"]),
-    show_default="the paper's, where there is one",
-    help="The law that the error is of.",
+    show_default="the paper's, if there is one",
+    help="Law of the agents.",
 )
 @click.option(
-    "--gain", type=float, metavar="KAPPA", default=float("inf"), help="Pull of the leaders; inf holds them in place."
+    "--gain",
+    type=float,
+    metavar="KAPPA",
+    default=float("inf"),
+    help="Gain of the leaders; inf: states held fixed.",
 )
-@click.option("--top", type=int, metavar="N", default=10, help="How many sets to list.")
+@click.option("--top", type=int, metavar="N", default=10, help="Number of sets to list.")
 @json_option
 def leaders(experiment: Path, count: int, method: str, law: str | None, gain: float, top: int, as_json: bool) -> None:
     """Find the best leaders for the network of EXPERIMENT, by joint robustness centrality.
 
-    Leaders that EXPERIMENT names do not count.
+    Leaders named in EXPERIMENT are ignored.
     """
     from msg_analysis.api import Experiment
     from msg_analysis.cli.progress import SolveProgress
@@ -163,17 +163,17 @@ def leaders(experiment: Path, count: int, method: str, law: str | None, gain: fl
     )
 )
 @click.argument("example", type=click.Choice(["1", "2", "3", "all"]), default="all")
-@click.option("--out", type=PATH, metavar="DIR", default=Path("figures"), help="Where the files are written.")
+@click.option("--out", type=PATH, metavar="DIR", default=Path("figures"), help="Output directory.")
 @click.option(
     "--format",
     "formats",
     type=click.Choice(["png", "svg", "pdf"]),
     multiple=True,
     default=("png", "svg", "pdf"),
-    help="Of the drawings. Repeatable.",
+    help="Format of the figures. Repeatable.",
 )
 @click.option(
-    "--emulate", is_flag=True, help="Run networks as well (msg-agents, minutes), and draw what they measured."
+    "--emulate", is_flag=True, help="Also run networks with msg-agents (takes minutes) and draw the measured values."
 )
 @sweep.other_software
 @json_option
@@ -188,11 +188,11 @@ def figures(
     other_software: OtherSoftware,
     as_json: bool,
 ) -> None:
-    """Draw the EXAMPLEs of the paper, with the numbers as CSV; print the files' names.
+    """Draw the EXAMPLEs of the paper, with the numbers as CSV; print the names of the files.
 
-    Files of the same names in the directory are replaced. With --emulate, real networks are run and their points drawn
-    on the curves, in files of their own; what has been run is kept, and exit code 1 says that some point disagrees with
-    theory, 3 that some network failed.
+    Existing files of the same names are replaced. With --emulate, networks are run, and the measured points are drawn
+    on the curves in separate files; finished runs are kept. Exit code 1: some point disagrees with theory, 3: some
+    network failed.
     """
     from msg_analysis.paper.figures import write_figures
 
@@ -211,10 +211,10 @@ def figures(
 
 
 @main.command(epilog=examples("msg-analysis info line_ring.yaml", "msg-analysis info line_ring_twin --json"))
-@click.argument("source", metavar="EXPERIMENT|BAG", type=_SOURCE)
+@click.argument("source", metavar="EXPERIMENT|BAG", type=SOURCE)
 @json_option
 def info(source: Path, as_json: bool) -> None:
-    """Explain an experiment file, or say what a bag holds."""
+    """Describe an experiment file, or the contents of a bag."""
     from msg_analysis.model.experiment.experiment import Experiment
     from msg_analysis.report.documents.info import describe_bag, describe_experiment
     from msg_analysis.report.terminal import bag_text, experiment_text
@@ -234,9 +234,9 @@ def info(source: Path, as_json: bool) -> None:
 @click.argument("out", type=PATH)
 @json_option
 def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
-    """Make OUT, a valid bag, of what is whole in the torn or damaged BAG; say what was dropped.
+    """Write the intact part of the torn or damaged BAG to OUT, a valid bag; report what was dropped.
 
-    BAG is left as it is; OUT must not exist.
+    BAG is not changed; OUT must not exist.
     """
     from msg_analysis.bags.salvage import salvage as salvage_bag
     from msg_analysis.report.documents.info import describe_salvage
@@ -268,7 +268,7 @@ def schema(what: str) -> None:
     else:
         from msg_analysis.model.experiment.experiment import json_schema
 
-    click.echo(json.dumps(json_schema(), indent=2))
+    print_json(json_schema(), indent=2)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,8 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from msg_analysis.common.files import RESULT_FILE
+
 _PLAIN = re.compile(r"[\w./~+,:@%=-]*")  # characters that a shell needs no quotes for
 
 
@@ -57,26 +59,27 @@ def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:
     return found + _paths(found[0], wanted) if len(found) == 1 and found[0].endswith("/") else found
 
 
-EXPERIMENT = InputPath(".yaml", ".yml", ".json")
+YAML = InputPath(".yaml", ".yml", ".json")  # experiments, sweeps, hosts
 BAG = InputPath(".mcap", ".mcap.zstd", holds=("metadata.yaml", "*.mcap"))
-RESULT = InputPath(".json", holds=("result.json",))
+SOURCE = InputPath(".yaml", ".yml", ".json", ".mcap", ".mcap.zstd", holds=("metadata.yaml", "*.mcap"))
+RESULT = InputPath(".json", holds=(RESULT_FILE,))
 RUN_RECORD = InputPath(".json")
 PATH = click.Path(path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-experiment_argument = click.argument("experiment", type=EXPERIMENT)
-seed_option = click.option("--seed", type=int, metavar="N", help="Instead of run.seed.")
+experiment_argument = click.argument("experiment", type=YAML)
+seed_option = click.option("--seed", type=int, metavar="N", help="Overrides run.seed.")
 duration_option = click.option(
-    "--duration", type=float, metavar="T", help="Instead of run.duration, in units of simulated time."
+    "--duration", type=float, metavar="T", help="Overrides run.duration, in units of simulated time."
 )
 
 
 class PositiveFloat(click.FloatRange):
-    """A finite number above 0."""
+    """A finite number above 0, at most ``most``."""
 
-    def __init__(self) -> None:
-        super().__init__(min=0, min_open=True)
+    def __init__(self, most: float | None = None) -> None:
+        super().__init__(min=0, min_open=True, max=most)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Refuse NaN and infinity, too; see click.ParamType."""
@@ -87,14 +90,8 @@ class PositiveFloat(click.FloatRange):
 
 
 def level_option(what: str) -> Callable[..., Any]:
-    """The option ``--level``, a probability above 0 and at most 0.5; ``what`` is its help text."""
-
-    def checked(_context: click.Context, _option: click.Parameter, value: float) -> float:
-        if not 0.0 < value <= 0.5:
-            raise click.BadParameter(f"{value:g}: expected a chance above 0, 0.5 at most")
-        return value
-
-    return click.option("--level", type=float, metavar="P", callback=checked, default=0.01, help=what)
+    """The option ``--level``, a probability; ``what`` is its help text."""
+    return click.option("--level", type=PositiveFloat(0.5), metavar="P", default=0.01, help=what)
 
 
 def suggest(*words: str) -> Callable[..., list[CompletionItem]]:

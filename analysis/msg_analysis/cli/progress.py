@@ -79,6 +79,6 @@ class SolveProgress(_Progress):
         super().__init__(title, time_left=False)
 
     def __call__(self, stage: str, done: int, total: int, best: float) -> None:
-        """Show stage, evaluations done and to do, and the least system error so far; see ``SearchProgress``."""
+        """Show stage, evaluations done and to do, and the smallest system error so far; see ``SearchProgress``."""
         found = f"{best:.6g}"
-        self._show(f"{self._title}: {stage}", done, total, f"least system error {found}", f"E {found}")
+        self._show(f"{self._title}: {stage}", done, total, f"smallest system error {found}", f"E {found}")

@@ -19,13 +19,13 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
             "--compression",
             type=click.Choice(COMPRESSIONS),
             default=DEFAULT_STORAGE.compression,
-            help="Of the bag, chunk by chunk.",
+            help="Compression of the chunks of the bag.",
         ),
         click.option(
             "--split-size",
             type=click.FloatRange(SMALLEST_SPLIT),
             metavar="MB",
-            help="Go on in a new file of the bag after so many MB (10^6 bytes).",
+            help="Start a new file of the bag after this many MB (10^6 bytes).",
         ),
     ):
         command = option(command)

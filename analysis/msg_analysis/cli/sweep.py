@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from msg_analysis.cli.console import complain, examples, print_json, result_console
-from msg_analysis.cli.options import PATH, InputPath, json_option
+from msg_analysis.cli.options import PATH, YAML, json_option
+from msg_analysis.common.exit_codes import ExitCode, killed_by
 from msg_analysis.common.json_numbers import finite
+from msg_analysis.common.notes import print_note
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.software import require_libraries
 
@@ -21,14 +23,12 @@ if TYPE_CHECKING:
     from msg_analysis.sweep.jobs.job import Job
     from msg_analysis.sweep.outcome_store import OutcomeStore
 
-DISAGREES, INCOMPLETE = 1, 3
-
 other_software = click.option(
     "--other-software",
     type=click.Choice(["refuse", "redo", "keep"]),
     default="refuse",
     show_default=True,
-    help="What to do with results in the directory that other versions made.",
+    help="What to do with results that other versions made.",
 )
 
 
@@ -39,22 +39,20 @@ other_software = click.option(
         "msg-analysis sweep rates.yaml --scheduler tcp://10.0.0.1:8786",
     )
 )
-@click.argument("sweep_file", metavar="SWEEP", type=InputPath(".yaml", ".yml", ".json"))
+@click.argument("sweep_file", metavar="SWEEP", type=YAML)
 @click.option("--out", type=PATH, metavar="DIR", show_default="sweeps/<name>", help="Directory of the results.")
 @click.option(
     "--workers",
     type=click.IntRange(1),
     metavar="N",
     show_default="one for each CPU; one where networks run",
-    help="Processes. A network needs a machine.",
+    help="Worker processes; each network needs a machine of its own.",
 )
 @click.option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of this Dask scheduler instead.")
-@click.option(
-    "--column", metavar="NAME", show_default="system_error", help="Column of the tables that is drawn and listed."
-)
-@click.option("--retry", is_flag=True, help="Try again what has failed.")
+@click.option("--column", metavar="NAME", show_default="system_error", help="Column of the tables to draw and list.")
+@click.option("--retry", is_flag=True, help="Repeat failed points.")
 @other_software
-@click.option("--keep-bags", is_flag=True, help="Keep the bags of networks that agree with the prediction, too.")
+@click.option("--keep-bags", is_flag=True, help="Also keep the bags of networks that agree with the prediction.")
 @json_option
 @click.pass_context
 def sweep(
@@ -70,15 +68,16 @@ def sweep(
     keep_bags: bool,
     as_json: bool,
 ) -> None:
-    """Predict, simulate or run an experiment at many values of its keys, as the file SWEEP says.
+    """Predict, simulate or run an experiment at many values of its keys, as described in the file SWEEP.
 
-    What has been done is kept: after an interruption, the same command goes on. Tables (Parquet, CSV, JSON) and a
-    figure are written beside it.
+    Results are kept: after an interruption, the same command continues. Tables (Parquet, CSV, JSON) and a figure are
+    written next to them.
 
-    Exit code 0: fine, 1: some run disagrees with its prediction, all runs judged together, 3: some point has no result.
+    Exit code 0: success, 1: some run disagrees with its prediction, all runs judged together, 3: some point has no
+    result.
     """
     if workers and scheduler:
-        raise InputError("--workers: given with --scheduler, whose workers are used: give one of them")
+        raise InputError("--workers: not together with --scheduler, which has workers of its own: give one of them")
     require_libraries()
     if not scheduler:
         from msg_analysis.sweep.jobs.workers import warm_up
@@ -150,7 +149,7 @@ def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Out
     from msg_analysis.sweep.jobs.workers import ENDING, WorkersLostError
 
     if store.damaged:
-        click.echo(f"note: {store.directory}: {store.damaged} lines cannot be read: done again", err=True)
+        print_note(f"{store.directory}: {store.damaged} lines cannot be read: their points are computed again")
     for number in ENDING:
         if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP
             signal.signal(number, _end)
@@ -159,15 +158,15 @@ def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Out
             return conduct(jobs, store, watch=progress.done, **how)
     except (KeyboardInterrupt, WorkersLostError) as error:
         there = sum(job.id in store.outcomes for job in jobs)
-        kept = f"{there} of {len(jobs)} points are kept in {store.directory}: the same command goes on"
+        kept = f"{there} of {len(jobs)} points are kept in {store.directory}: the same command continues"
         if isinstance(error, KeyboardInterrupt):
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the exit
             click.echo(f"\ninterrupted: {kept}", err=True)
             if isinstance(error, _EndedBySignal):
-                context.exit(128 + error.number)
+                context.exit(killed_by(error.number))
             raise
         complain(f"{error}: {kept}")
-        context.exit(INCOMPLETE)
+        context.exit(ExitCode.INCOMPLETE)
 
 
 def emulate(
@@ -198,7 +197,7 @@ def emulate(
     for outcome in failed:
         complain(f"no result: {outcome.reason}")
     if not points:
-        return INCOMPLETE
+        return ExitCode.INCOMPLETE
     files = write_figures(numbers, out, formats, points)
     if as_json:
         rows = [asdict(point) | {"agent": _number(point.agent)} for point in points]
@@ -209,7 +208,7 @@ def emulate(
         for path in files:
             click.echo(path)
         click.echo(summary(points, len(runs) - len(failed)))
-    return DISAGREES if disagreeing(points) else INCOMPLETE if failed else 0
+    return ExitCode.DISAGREES if disagreeing(points) else ExitCode.INCOMPLETE if failed else ExitCode.FINE
 
 
 def _number(agent: int | None) -> int | None:

@@ -32,10 +32,12 @@ if TYPE_CHECKING:
     default="emulated",
     help="The steps of the run, or the paper's continuous time.",
 )
-@click.option("--unreduced", is_flag=True, help="Consensus: of the states themselves, not of the disagreement.")
-@click.option("--fraction", type=float, metavar="F", default=0.05, help="Of the steady error, for the settling time.")
-@click.option("--moments", is_flag=True, help="With --json: means and second moments of every graph as well.")
-@click.option("--csv", "table", type=FILE, metavar="FILE", help="Write a table as well.")
+@click.option("--unreduced", is_flag=True, help="Consensus: errors of the states, not of the disagreement.")
+@click.option(
+    "--fraction", type=float, metavar="F", default=0.05, help="Fraction of the steady error, for the settling time."
+)
+@click.option("--moments", is_flag=True, help="With --json: also means and second moments of every graph.")
+@click.option("--csv", "table", type=FILE, metavar="FILE", help="Also write a CSV table.")
 @json_option
 def transient(
     experiment: Path,

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from msg_analysis.errors import InputError
 
+RESULT_FILE = "result.json"  # of a run, next to its bag
+
 
 def require_place(file: Path | None) -> None:
     """Refuse, before long work, a path where no file can be put: its directory is missing, or it is not a regular file.
@@ -19,7 +21,7 @@ def require_place(file: Path | None) -> None:
     if not file.parent.is_dir():
         raise InputError(f"{file}: no such directory {file.parent}: create it")
     if file.exists() and not file.is_file():
-        raise InputError(f"{file}: no regular file: name another")
+        raise InputError(f"{file}: not a regular file: choose another")
 
 
 def write_whole(path: Path, content: bytes) -> Path:

@@ -1,7 +1,8 @@
-"""Numbers in JSON documents, which has none that are infinite or undefined."""
+"""JSON documents. JSON has no infinite or undefined numbers: they become null."""
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -13,3 +14,8 @@ def finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def json_text(document: Any, indent: int | None = None) -> str:
+    """The document as JSON."""
+    return json.dumps(finite(document), indent=indent, allow_nan=False)

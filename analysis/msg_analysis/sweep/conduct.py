@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.errors import InputError
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.sweep.jobs.evaluate import evaluate
@@ -110,7 +111,9 @@ class Judgement:
     @property
     def exit_code(self) -> int:
         """0 agrees or only predictions, 1 disagrees, 3 something failed."""
-        return {"disagrees": 1, "incomplete": 3}.get(self.verdict or "", 0)
+        if self.verdict == "disagrees":
+            return ExitCode.DISAGREES
+        return ExitCode.INCOMPLETE if self.verdict == "incomplete" else ExitCode.FINE
 
 
 def judge_sweep(outcomes: Sequence[Outcome], level: float) -> Judgement:

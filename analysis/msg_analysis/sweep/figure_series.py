@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.problems import show
 from msg_analysis.sweep.plan import Sweep
 from msg_analysis.sweep.table import Row, column_names, is_number
 
 DEFAULT_COLUMN = "system_error"
-HALF = 1.959963984540054  # standard errors on each side of a 95 % interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +109,7 @@ def _offer(rows: Sequence[Row]) -> str:
 def _place(along: str, rows: Sequence[Row], names: Mapping[str, str | None]) -> Place:
     value = _mean(rows, names["value"])
     errors = _numbers(rows, names["error"])
-    half = HALF * math.hypot(*errors) / len(errors) if errors else None
+    half = HALF_WIDTH_95 * math.hypot(*errors) / len(errors) if errors else None
     return Place(
         x=rows[0][along],
         value=value,

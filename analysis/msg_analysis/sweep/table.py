@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msg_analysis.common.files import write_whole
+from msg_analysis.common.json_numbers import json_text
 from msg_analysis.sweep.conduct import Judgement
 from msg_analysis.sweep.jobs.job import Outcome
 from msg_analysis.sweep.plan import Sweep
@@ -98,10 +99,7 @@ def _text(value: Any) -> str:
 
 
 def write_tables(rows: Sequence[Row], document: Mapping[str, Any], directory: Path) -> list[Path]:
-    """Write ``results.parquet``, ``results.csv`` and ``results.json``, each whole or not at all.
-
-    The numbers of ``document``, which is written as JSON, must be finite.
-    """
+    """Write ``results.parquet``, ``results.csv`` and ``results.json``, each whole or not at all."""
     import pyarrow.csv
     import pyarrow.parquet
 
@@ -112,6 +110,6 @@ def write_tables(rows: Sequence[Row], document: Mapping[str, Any], directory: Pa
     content = {
         "parquet": parquet.getvalue(),
         "csv": text.getvalue(),
-        "json": json.dumps(document, indent=1, allow_nan=False).encode() + b"\n",
+        "json": json_text(document, 1).encode() + b"\n",
     }
     return [write_whole(directory / f"results.{name}", data) for name, data in content.items()]

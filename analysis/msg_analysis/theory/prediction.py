@@ -15,6 +15,7 @@ import networkx as nx
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from msg_analysis.common.json_numbers import finite
 from msg_analysis.common.markdown import markdown_table
 from msg_analysis.common.number_words import number_text
 from msg_analysis.errors import InputError
@@ -94,10 +95,10 @@ class Moments:
     def to_json(self) -> dict[str, Any]:
         """The document of one law; what is infinite or undefined is None."""
         document: dict[str, Any] = {
-            "system_error": _finite(self.system_error),
-            "node_errors": [_finite(e) for e in self.node_errors],
-            "system_certainty": _finite(self.system_certainty),
-            "node_certainty": [_finite(c) for c in self.node_certainty],
+            "system_error": finite(float(self.system_error)),
+            "node_errors": finite(self.node_errors.tolist()),
+            "system_certainty": finite(float(self.system_certainty)),
+            "node_certainty": finite(self.node_certainty.tolist()),
             "covariance": self.covariance.tolist(),
         }
         if self.law is not None:
@@ -306,7 +307,3 @@ def _holds_together(experiment: Experiment, mode: int) -> bool:
         return 0 in digraph and len(nx.descendants(digraph, 0)) == graph.agents
     parts = nx.condensation(digraph)
     return sum(int(degree == 0) for _, degree in parts.in_degree()) == 1
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import sys
 
-INTERRUPTED = 130
-
 
 def msg_agents() -> None:
     """The command line."""
@@ -49,5 +47,7 @@ def _run(*command: str) -> None:
     try:
         from msg_agents.cli.main import main
     except KeyboardInterrupt:  # the command group handles it only after these imports
+        from msg_analysis.common.exit_codes import INTERRUPTED
+
         sys.exit(INTERRUPTED)
     main([*command, *sys.argv[1:]], prog_name="msg-agents")

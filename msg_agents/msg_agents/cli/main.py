@@ -6,7 +6,6 @@ input, 3 incomplete data. Modules that take long to import are imported by the c
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +22,7 @@ from msg_analysis.cli.options import (
     BAG,
     PATH,
     RUN_RECORD,
-    InputPath,
+    YAML,
     PositiveFloat,
     duration_option,
     experiment_argument,
@@ -32,13 +31,13 @@ from msg_analysis.cli.options import (
     suggest,
 )
 from msg_analysis.cli.storage_options import storage, storage_options
+from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.common.files import RESULT_FILE, write_whole
+from msg_analysis.common.json_numbers import json_text
 
 if TYPE_CHECKING:
     from msg_agents.running.runner import RunResult
     from msg_analysis.bags.format.storage_options import Compression
-    from msg_analysis.model.experiment.experiment import Experiment
-
-DISAGREES, INCOMPLETE = 1, 3
 
 
 @click.group(cls=CommandGroup)
@@ -61,48 +60,48 @@ def main() -> None:
     type=PATH,
     metavar="DIR",
     default=Path("runs"),
-    help="Where the bag's directory <name>_<time> is made.",
+    help="Directory in which the bag's directory <name>_<time> is created.",
 )
-@click.option("--no-record", is_flag=True, help="Only run: no bag, no verdict.")
+@click.option("--no-record", is_flag=True, help="Do not record: no bag, no verdict.")
 @seed_option
 @duration_option
 @click.option(
     "--pace",
     metavar="PACE",
     shell_complete=suggest("lockstep", "realtime"),
-    help="Instead of run.pace: lockstep or realtime.",
+    help="Overrides run.pace: lockstep or realtime.",
 )
 @click.option(
     "--speed",
     type=float,
     metavar="SPEED",
-    help="Instead of run.speed: units of simulated time per second (realtime).",
+    help="Overrides run.speed: units of simulated time per second (realtime).",
 )
 @click.option(
     "--processes",
     metavar="P",
     shell_complete=suggest("auto", "one_per_agent"),
-    help="Instead of run.processes: auto, one_per_agent or a number.",
+    help="Overrides run.processes: auto, one_per_agent or a number.",
 )
 @click.option(
     "--restarts",
     type=click.IntRange(0),
     metavar="N",
     default=RESTARTS,
-    help="How often, in all, agents or the switcher are started again when they were killed.",
+    help="How often, in total, killed agents or the switcher are restarted.",
 )
 @click.option(
     "--domain",
     type=click.IntRange(0, LAST_DOMAIN),
     metavar="D",
-    show_default="a free one of the run's own",
+    show_default="a free one",
     help="ROS_DOMAIN_ID.",
 )
 @nodes.use_sim_time
 @click.option(
     "--pin/--no-pin",
     default=True,
-    help="Keep each process to one core, where there are more of them than cores: faster (lockstep).",
+    help="Pin each process to one core if there are more processes than cores: faster (lockstep).",
 )
 @storage_options
 @web_options
@@ -131,15 +130,14 @@ def run(
 ) -> None:
     """Run EXPERIMENT as a network of processes, record it, and compare the record with the theory.
 
-    On a terminal, a panel shows how the run stands; with --web, a page for browsers does, too.
+    On a terminal, a panel shows the progress; with --web, a page for browsers does, too.
     """
+    from msg_agents.running.experiment_overrides import load_with_overrides
     from msg_agents.running.runner import run_network
     from msg_agents.watching.run_view import RunView
 
-    changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
-    if processes is not None:
-        changes["processes"] = int(processes) if processes.isdigit() else processes
-    what = _load(experiment).with_run(**{key: value for key, value in changes.items() if value is not None})
+    changes = {"seed": seed, "duration": duration, "pace": pace, "speed": speed, "processes": processes}
+    what = load_with_overrides(experiment, changes)
     with page(web, web_host) as served:
         with RunView(what, served) as view:
             if served is not None:
@@ -152,11 +150,10 @@ def run(
                 use_sim_time=use_sim_time,
                 storage=storage(compression, split_size),
                 pin=pin,
-                on_note=view.note,
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
             )
-        _end(result, as_json, view.say)
+        _end(result, as_json, view.display.end)
 
 
 def _end(result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
@@ -169,7 +166,7 @@ def _end(result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None]
     say(_ending(result))
     _show(result, as_json)
     if result.failures or (result.bag is not None and result.comparison is None):
-        sys.exit(INCOMPLETE)
+        sys.exit(ExitCode.INCOMPLETE)
     if result.comparison is not None:
         sys.exit(result.comparison.exit_code)
 
@@ -192,7 +189,7 @@ def _ending(result: RunResult) -> dict[str, Any]:
 
 def _show(result: RunResult, as_json: bool) -> None:
     """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
-    from msg_agents.running.runner import REPORT_FILE, RESULT_FILE
+    from msg_agents.running.runner import REPORT_FILE
 
     document: dict[str, Any] = {"verdict": "incomplete" if result.failures else None}  # None: nothing to judge
     if result.comparison is not None:
@@ -207,7 +204,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         "failures": result.failures,
     }
     if result.bag is not None and result.comparison is not None:
-        (result.bag / RESULT_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        write_whole(result.bag / RESULT_FILE, json_text(document, 1).encode() + b"\n")
     if as_json:
         print_json(document)
         return
@@ -224,9 +221,9 @@ def _show(result: RunResult, as_json: bool) -> None:
 @click.argument("bag", type=BAG, required=False)
 @json_option
 def check(bag: Path | None, *, as_json: bool) -> None:
-    """Compute the run in BAG again with the offline twin; name the first agent and step that differ.
+    """Recompute the run in BAG with the offline twin; report the first agent and step that differ.
 
-    Without BAG, the newest one below ./runs is checked.
+    Without BAG, the newest bag below ./runs is checked.
     """
     from msg_analysis.bags.reader import read_bag
     from msg_analysis.twin.check import check as check_trajectory
@@ -241,23 +238,24 @@ def check(bag: Path | None, *, as_json: bool) -> None:
     else:
         missing = f", {outcome.missing} missing" if outcome.missing else ""
         click.echo(f"{path}: equal to the twin to the last bit: {outcome.compared} states{missing}")
-    sys.exit(DISAGREES if outcome.difference else INCOMPLETE if outcome.missing else 0)
+    sys.exit(ExitCode.DISAGREES if outcome.difference else ExitCode.INCOMPLETE if outcome.missing else ExitCode.FINE)
 
 
 def _newest_bag(directory: Path) -> Path:
     bags = sorted(directory.glob("*/metadata.yaml"), key=lambda file: file.stat().st_mtime)
     if not bags:
-        raise click.UsageError(f"no bag below {directory.absolute()}: name one")
+        raise click.UsageError(f"no bag below {directory.absolute()}: give one")
     return bags[-1].parent
 
 
 @main.command(epilog=examples("msg-agents prepare line_ring.yaml > run.json"))
 @experiment_argument
 def prepare(experiment: Path) -> None:
-    """Print the run record of a new run of EXPERIMENT: the file that the single nodes are started with."""
+    """Print the run record of a new run of EXPERIMENT: the file with which single nodes are started."""
+    from msg_analysis.model.experiment.experiment import Experiment
     from msg_analysis.twin.simulate import new_record
 
-    what = _load(experiment)
+    what = Experiment.load(experiment)
     what.require_available()
     click.echo(new_record(what).to_json())
 
@@ -269,14 +267,14 @@ def prepare(experiment: Path) -> None:
     )
 )
 @click.argument("run_record", type=RUN_RECORD)
-@click.argument("hosts", type=InputPath(".yaml", ".yml", ".json"))
-@click.option("--name", metavar="NAME", show_default="the name of this machine", help="Which of the hosts this is.")
+@click.argument("hosts", type=YAML)
+@click.option("--name", metavar="NAME", show_default="the name of this machine", help="Name of this host in HOSTS.")
 @click.option(
     "--out",
     type=PATH,
     metavar="DIR",
     default=Path("runs"),
-    help="Where the directory <name>_<time> is made: bag, report and logs on the recorder's host, logs on the others.",
+    help="Where <name>_<time> is created: bag, report and logs on the recorder's host, logs on the others.",
 )
 @click.option(
     "--discovery-timeout",
@@ -290,14 +288,14 @@ def prepare(experiment: Path) -> None:
     type=PositiveFloat(),
     metavar="SECONDS",
     default=30.0,
-    help="After how long this host ends when another one has left the run before its end [s].",
+    help="How long this host continues after another one has left the run before its end [s].",
 )
 @click.option(
     "--restarts",
     type=click.IntRange(0),
     metavar="N",
     default=RESTARTS,
-    help="How often, in all, what was killed on this host is started again.",
+    help="How often, in total, killed processes of this host are restarted.",
 )
 @click.option(
     "--profile", "only_profile", is_flag=True, help="Only print the discovery profile, for other ROS 2 tools."
@@ -318,10 +316,10 @@ def host(
     split_size: float | None,
     as_json: bool,
 ) -> None:
-    """Run this host's share of a network that is spread over several, as the file HOSTS says.
+    """Run this host's part of a network on several hosts, as described in the file HOSTS.
 
-    All hosts are given the same RUN_RECORD (of `msg-agents prepare`) and HOSTS, in any order. The recorder's host
-    compares the record with the theory, as `msg-agents run` does; the others end when the run does.
+    Give all hosts the same RUN_RECORD (from `msg-agents prepare`) and HOSTS; start them in any order. The recorder's
+    host compares the record with the theory, as `msg-agents run` does; the others end with the run.
     """
     from msg_agents.processes.hosts import Hosts, this_host
     from msg_agents.running.run_folder import workshop
@@ -346,7 +344,6 @@ def host(
             domain=places.domain,
             restarts=restarts,
             storage=storage(compression, split_size),
-            on_note=view.note,
             view=view,
             environment=places.environment(what, folder),
             record=record,
@@ -355,12 +352,6 @@ def host(
     _end(result, as_json)
     if not share.home and not as_json:
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
-
-
-def _load(path: Path) -> Experiment:
-    from msg_analysis.model.experiment.experiment import Experiment
-
-    return Experiment.load(path)
 
 
 for _command in (

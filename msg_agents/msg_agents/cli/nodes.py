@@ -17,13 +17,12 @@ from msg_agents.processes.environment import DISCOVERY_TIMEOUT
 from msg_analysis.cli.console import examples
 from msg_analysis.cli.options import PATH, RUN_RECORD, PositiveFloat, suggest
 from msg_analysis.cli.storage_options import storage, storage_options
+from msg_analysis.common.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from msg_agents.nodes.network_node import NetworkNode
     from msg_analysis.bags.format.storage_options import Compression
     from msg_analysis.model.run.record import RunRecord
-
-INCOMPLETE = 3
 
 use_sim_time = click.option(
     "--use-sim-time",
@@ -47,14 +46,14 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option(
             "--parameter-services",
             is_flag=True,
-            help="Offer the parameters to `ros2 param`: six services a node, which large networks cannot afford.",
+            help="Offer the parameters to `ros2 param`: six services per node, too many for large networks.",
         ),
         click.option("--lifeline", type=int, hidden=True),
         click.option(
             "--account",
             type=PATH,
             metavar="FILE",
-            help="File that says once a second what the nodes refused and wait for: for health checks.",
+            help="File, written once a second, with what the nodes refused and wait for: for health checks.",
         ),
     ):
         command = option(command)
@@ -67,7 +66,7 @@ _await = click.option(
     multiple=True,
     metavar="NODE",
     shell_complete=suggest("recorder"),
-    help="A node, such as recorder, that must be there before the run starts. Repeatable.",
+    help="A node, such as recorder, that must be present before the run starts. Repeatable.",
 )
 
 
@@ -75,8 +74,8 @@ _patience = click.option(
     "--patience",
     type=PositiveFloat(),
     metavar="SECONDS",
-    show_default="it waits for ever",
-    help="After how long it ends when others have left before the end [s].",
+    show_default="no limit",
+    help="How long to continue after other nodes have left before the end [s].",
 )
 
 
@@ -84,7 +83,7 @@ _checkpoint = click.option(
     "--checkpoint",
     type=click.Path(file_okay=False, path_type=Path),
     metavar="DIR",
-    help="Directory that keeps what is needed to go on after being killed: the same command then takes over.",
+    help="Directory for what is needed to continue after being killed: the same command then takes over.",
 )
 
 
@@ -232,7 +231,7 @@ def _run_nodes(
         account=account,
         patience=patience,
     ):
-        sys.exit(INCOMPLETE)
+        sys.exit(ExitCode.INCOMPLETE)
 
 
 def _make(directory: Path | None) -> Path | None:
@@ -242,7 +241,7 @@ def _make(directory: Path | None) -> Path | None:
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"--checkpoint: {directory}: cannot be made ({error.strerror}): name another") from error
+            raise InputError(f"--checkpoint: {directory}: cannot be made ({error.strerror}): choose another") from error
     return directory
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,23 +15,26 @@ from click.shell_completion import CompletionItem
 from msg_agents.cli.ros_command import RosCommand
 from msg_agents.cli.web_options import WebRosCommand, announce, page, web_options
 from msg_agents.processes.environment import LAST_DOMAIN
+from msg_agents.terminal.interruption import exit_on_signals
 from msg_analysis.cli.console import examples, print_json, result_console
 from msg_analysis.cli.options import BAG, PositiveFloat, json_option
+from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.common.notes import print_note
 
 if TYPE_CHECKING:
     from msg_agents.nodes.replay.player import Played
     from msg_agents.nodes.watching.live import Watched
-    from msg_agents.watching.web_server import Web
+    from msg_agents.watching.display import Display
+    from msg_agents.watching.snapshot import SnapshotSource
 
-INCOMPLETE = 3
 _domain = click.option(
-    "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Instead of the environment's ROS_DOMAIN_ID."
+    "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Overrides ROS_DOMAIN_ID of the environment."
 )
 _timeout = click.option(
     "--timeout",
     type=PositiveFloat(),
     metavar="SECONDS",
-    show_default="for ever",
+    show_default="no limit",
     help="How long to wait for a network [s].",
 )
 
@@ -81,7 +83,7 @@ class _Rate(click.types.FloatParamType):
     type=_Rate(),
     metavar="RATE",
     default="1",
-    help="Seconds of the bag per second; of a network's bag, units of simulated time. max: as fast as readers take it.",
+    help="Seconds of the bag per second; of a network's bag, units of simulated time. max: as fast as readers allow.",
 )
 @click.option(
     "--start-offset",
@@ -90,21 +92,21 @@ class _Rate(click.types.FloatParamType):
     metavar="SECONDS",
     help="Seconds of the bag to leave out at the start.",
 )
-@click.option("--duration", type=PositiveFloat(), metavar="SECONDS", help="Seconds of the bag to play; otherwise all.")
-@click.option("-l", "--loop", is_flag=True, help="Begin again at the end.")
-@click.option("--paused", is_flag=True, help="Stand at first; the space bar starts it.")
+@click.option("--duration", type=PositiveFloat(), metavar="SECONDS", help="Seconds of the bag to play.")
+@click.option("-l", "--loop", is_flag=True, help="Start again at the end.")
+@click.option("--paused", is_flag=True, help="Start paused; the space bar continues.")
 @click.option(
     "--clock",
     type=PositiveFloat(),
     metavar="HZ",
-    help="Publish the time of the bag on /clock so often a second.",
+    help="Publish the time of the bag on /clock at this rate.",
 )
 @click.option(
     "--topics",
     multiple=True,
     metavar="TOPIC",
     shell_complete=_topics_of_bag,
-    help="Only this topic; or a pattern such as '/agent_*/state'. Repeatable.",
+    help="Play only this topic, or pattern such as '/agent_*/state'. Repeatable.",
 )
 @click.option(
     "-x",
@@ -112,19 +114,17 @@ class _Rate(click.types.FloatParamType):
     multiple=True,
     metavar="TOPIC",
     shell_complete=_topics_of_bag,
-    help="Not this topic, or pattern. Repeatable.",
+    help="Do not play this topic, or pattern. Repeatable.",
 )
-@click.option(
-    "-m", "--remap", "remaps", multiple=True, metavar="OLD:=NEW", help="Another name for a topic. Repeatable."
-)
+@click.option("-m", "--remap", "remaps", multiple=True, metavar="OLD:=NEW", help="Rename a topic. Repeatable.")
 @click.option(
     "--wait-for-subscribers",
     "subscribers",
     type=click.IntRange(1),
     metavar="N",
-    help="Begin when every topic has N readers (latched topics, whose readers miss nothing, are not waited for).",
+    help="Start when every topic has N readers (except latched topics, whose readers miss nothing).",
 )
-@click.option("--await", "readers", multiple=True, metavar="NODE", help="Begin when NODE reads them. Repeatable.")
+@click.option("--await", "readers", multiple=True, metavar="NODE", help="Start when NODE reads the topics. Repeatable.")
 @click.option(
     "--wait-timeout",
     type=PositiveFloat(),
@@ -152,11 +152,11 @@ def play(
     domain: int | None,
     as_json: bool,
 ) -> None:
-    """Publish the messages of BAG again, a bag of ROS 2 with MCAP storage, in the order in which they were recorded.
+    """Play BAG, a bag of ROS 2 with MCAP storage: publish its messages in the recorded order.
 
-    No message is lost: readers that do not keep up hold the player back.
+    No message is lost: the player waits for slow readers.
 
-    On a terminal, space pauses and goes on, s or the right arrow plays one message, up and down change the rate.
+    On a terminal, space pauses and continues, s or the right arrow plays one message, up and down change the rate.
     """
     from msg_agents.nodes.replay.player import PlayOptions
     from msg_agents.nodes.replay.player import play as play_bag
@@ -176,7 +176,7 @@ def play(
         readers=readers,
         wait_timeout=wait_timeout,
     )
-    with _play_bar(bag.name) as bar:
+    with PlayBar(bag.name) as bar:
         try:
             played = play_bag(
                 bag, options, on_progress=bar.update, on_note=bar.note, on_stop=bar.hide, on_continue=bar.show
@@ -185,15 +185,15 @@ def play(
             if bar.played.begun:
                 bar.note(f"stopped at {bar.played.now:g} s of the bag after {bar.played.messages} messages")
             else:
-                bar.note("stopped before it began: nothing but latched messages has been played")
+                bar.note("stopped before the start: only latched messages were played")
             raise
-    held = f"; held back by readers for {played.held_back:.1f} s" if played.held_back >= 0.1 else ""
+    held = f"; waited {played.held_back:.1f} s for readers" if played.held_back >= 0.1 else ""
     click.echo(f"{played.messages} messages played in {played.seconds:.1f} s{held}", err=True)
     if as_json:
         print_json({"messages": played.messages, "seconds": played.seconds, "held_back": played.held_back})
 
 
-class _play_bar:  # noqa: N801  used like a function
+class PlayBar:
     """Prints notes on stderr and, on a terminal, a bar with the time in the bag and the rate."""
 
     def __init__(self, name: str) -> None:
@@ -213,9 +213,9 @@ class _play_bar:  # noqa: N801  used like a function
             transient=True,
             auto_refresh=False,  # no thread: it might hold a lock that a signal handler needs
         )
-        self._task = self._progress.add_task(name, total=None, state="looking for readers")
+        self._task = self._progress.add_task(name, total=None, state="waiting for readers")
 
-    def __enter__(self) -> _play_bar:
+    def __enter__(self) -> PlayBar:
         self.show()
         return self
 
@@ -231,39 +231,24 @@ class _play_bar:  # noqa: N801  used like a function
         self._progress.stop()
 
     def update(self, played: Played) -> None:
+        """Show how far it came."""
         self.played = played
         pace = "as fast as it goes" if math.isinf(played.rate) else f"x {played.rate:.3g}"
         state = f"{played.now:.1f}/{played.length:.1f} s  {'paused' if played.paused else pace}"
         if not played.begun:
-            state = "looking for readers"
+            state = "waiting for readers"
         self._progress.update(self._task, completed=played.now, total=played.length, state=state, refresh=True)
 
     def note(self, line: str) -> None:
-        from rich.text import Text
-
-        self._console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
-
-
-def _notes() -> Callable[[str], None]:
-    """A function that prints a note on stderr."""
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console(stderr=True)
-    return lambda line: console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)
+        """Print a note, above the bar."""
+        print_note(line, self._console)
 
 
 def _enter(domain: int | None) -> None:
     """Set the ROS domain, and let SIGTERM and SIGHUP end the process in order."""
     if domain is not None:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-
-    def end(number: int, _: object) -> None:
-        sys.exit(128 + number)
-
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # ignored under nohup
-            signal.signal(number, end)
+    exit_on_signals()
 
 
 @click.command(
@@ -278,7 +263,7 @@ def _enter(domain: int | None) -> None:
 @click.option(
     "--reliable",
     is_flag=True,
-    help="Miss no state, and hold the network back where that takes too long. By default it never waits.",
+    help="Receive every state: the network waits for this node if it is too slow. By default it never waits.",
 )
 @_timeout
 @json_option
@@ -287,84 +272,62 @@ def _enter(domain: int | None) -> None:
 def live(
     *, reliable: bool, timeout: float | None, as_json: bool, web: int | None, web_host: str, domain: int | None
 ) -> None:
-    """Watch a network, running or played: its errors up to now beside their prediction.
+    """Watch a network, running or played: its errors so far next to their prediction.
 
-    It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). The numbers are those of `msg-analysis
-    compare`, on the topic `estimate` too, but they are no verdict.
+    It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The numbers are those of `msg-analysis
+    compare`, also published on the topic `estimate`; they are not a verdict.
     """
+    from msg_agents.nodes.watching.live import watch
+    from msg_agents.watching.display import Display
     from msg_analysis.report.terminal.live_text import live_document
 
+    _enter(domain)
+    console = result_console()
+    panel = console.is_terminal and not as_json
     with page(web, web_host) as served:
-        found = _watch(reliable=reliable, timeout=timeout, as_json=as_json, domain=domain, served=served, host=web_host)
-        if served is not None and found is not None:
-            words = "The run has ended." if found.finished else "Nobody watches any more."
-            served.end({"text": words, "verdict": None if found.finished else "incomplete"})
+        if served is not None:
+            announce(served, web_host, print_note)
+        with Display(console, served, panel=panel, transient=False) as display:
+            view = LiveView(display, None if as_json or panel else click.echo)
+            found = watch(
+                reliable=reliable, timeout=timeout, on_report=view.show, on_note=print_note, on_look=display.check
+            )
+        if found is not None:
+            words = "The run has ended." if found.finished else "This page is no longer updated."
+            display.end({"text": words, "verdict": None if found.finished else "incomplete"})
     if found is None:
-        _notes()("no network was seen")
-        sys.exit(INCOMPLETE)
+        print_note("no network was seen")
+        sys.exit(ExitCode.INCOMPLETE)
     if as_json:
         print_json(live_document(found.report, found.record))
     elif found.report.note and not result_console().is_terminal:
-        _notes()(found.report.note)
+        print_note(found.report.note)
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(0 if found.finished else INCOMPLETE)  # all is done, and leaving the middleware may hang
+    # All is done, and leaving the middleware may hang.
+    os._exit(ExitCode.FINE if found.finished else ExitCode.INCOMPLETE)
 
 
-def _watch(
-    *, reliable: bool, timeout: float | None, as_json: bool, domain: int | None, served: Web | None, host: str
-) -> Watched | None:
-    """Watch a network and show it meanwhile; what was seen, or None without a network."""
-    from msg_agents.nodes.watching.live import watch
-    from msg_analysis.report.terminal.live_text import live_line, live_table
+class LiveView:
+    """Shows what has been seen of a network: drawn by ``display``, and as lines where these are wanted."""
 
-    _enter(domain)
-    note = _notes()
-    if served is not None:
-        announce(served, host, note)
-    publish = _publisher(served)
-    console = result_console()
-    if as_json or not console.is_terminal:
+    def __init__(self, display: Display, print_line: Callable[[str], None] | None) -> None:
+        self._display, self._print_line = display, print_line
+        self._source: SnapshotSource | None = None
 
-        def show(watched: Watched, rate: float) -> None:
-            publish(watched, rate)
-            if not as_json:
-                click.echo(live_line(watched.report, watched.record, rate))
+    def show(self, watched: Watched, rate: float) -> None:
+        """Show the newest report; ``rate`` in steps per second."""
+        from msg_agents.watching.snapshot import SnapshotSource
+        from msg_analysis.report.terminal.live_text import live_line
 
-        found = watch(reliable=reliable, timeout=timeout, on_report=show, on_note=note)
-    else:
-        from rich.live import Live
-
-        from msg_agents.terminal.job_control import JobControl
-
-        screen = Live(console=console, auto_refresh=False)
-        with screen, JobControl(before=screen.stop, after=lambda: screen.start(refresh=True)) as jobs:
-
-            def draw(watched: Watched, rate: float) -> None:
-                publish(watched, rate)
-                screen.update(live_table(watched.report, watched.record, rate), refresh=True)
-
-            found = watch(reliable=reliable, timeout=timeout, on_report=draw, on_note=note, on_look=jobs.check)
-    return found
-
-
-def _publisher(served: Web | None) -> Callable[[Watched, float], None]:
-    """A function that sends reports to the page; without a page it does nothing."""
-    if served is None:
-        return lambda *_: None
-    from msg_agents.watching.snapshot import Clockwork, moment_document, setting
-
-    clockworks: list[Clockwork] = []
-
-    def publish(watched: Watched, _: float) -> None:
-        if not clockworks:
-            clockworks.append(Clockwork(watched.record.experiment))
-            served.begin(setting(watched.record.experiment))
+        experiment, report = watched.record.experiment, watched.report
+        if self._source is None:
+            self._source = SnapshotSource(experiment)
+            self._display.begin(experiment)
         # The steps of single agents are not counted here: the newest step of any agent stands for all.
-        moment = clockworks[0].moment([watched.report.newest], watched.report)
-        served.show(moment_document(moment) | {"steps": []})
-
-    return publish
+        self._display.draw(self._source.snapshot([report.newest], report), experiment)
+        if self._print_line is not None:
+            self._print_line(live_line(report, watched.record, rate))
 
 
 @click.command(
@@ -376,9 +339,9 @@ def _publisher(served: Web | None) -> Callable[[Watched, float], None]:
     type=click.FloatRange(0, 1000, min_open=True),
     metavar="HZ",
     default=10.0,
-    help="Pictures a second.",
+    help="Updates per second.",
 )
-@click.option("--replica", type=click.IntRange(1), metavar="R", default=1, help="Which of the copies is drawn.")
+@click.option("--replica", type=click.IntRange(1), metavar="R", default=1, help="Replica to draw.")
 @click.option("--frame", metavar="FRAME", default="network", help="Frame of reference: the fixed frame of RViz.")
 @_timeout
 @_domain
@@ -386,11 +349,13 @@ def markers(*, rate: float, replica: int, frame: str, timeout: float | None, dom
     """Draw a network, running or played, for RViz and Foxglove: markers on the topic `markers`.
 
     Agents on a circle, coloured by how far their states are from the mean (or the reference), and the links of the
-    active graph. It ends with the run, or with Ctrl-C (exit code 3: not seen to its end). Nobody waits for it.
+    active graph. It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The network never waits
+    for it.
     """
     from msg_agents.nodes.watching.markers import show_markers
 
     _enter(domain)
-    over = show_markers(rate=rate, replica=replica - 1, frame=frame, timeout=timeout, on_note=_notes())
+    over = show_markers(rate=rate, replica=replica - 1, frame=frame, timeout=timeout, on_note=print_note)
     sys.stderr.flush()
-    os._exit(0 if over else INCOMPLETE)  # all is done, and leaving the middleware may hang
+    # All is done, and leaving the middleware may hang.
+    os._exit(ExitCode.FINE if over else ExitCode.INCOMPLETE)

@@ -11,7 +11,7 @@ import click
 from msg_agents.cli.ros_command import RosCommand
 
 if TYPE_CHECKING:
-    from msg_agents.watching.web_server import Web
+    from msg_agents.watching.web_server import WebServer
 
 PORT, HOST = 8421, "127.0.0.1"
 LOOPBACK = {"127.0.0.1", "localhost", "::1"}
@@ -25,7 +25,7 @@ def web_options(function: Function) -> Function:
         default=HOST,
         show_default=True,
         metavar="ADDRESS",
-        help="Where the page of --web is served; 0.0.0.0: to everybody who can reach this machine.",
+        help="Address of the page of --web; 0.0.0.0: for all machines that can reach this one.",
     )
     web = click.option(
         "--web",
@@ -34,7 +34,7 @@ def web_options(function: Function) -> Function:
         is_flag=False,
         flag_value=PORT,
         default=None,
-        help=f"Serve a live page for browsers on this port; {PORT} if none is named, 0: any that is free.",
+        help=f"Serve a live page for browsers on this port; {PORT} if none is given, 0: any free port.",
     )
     return web(host(function))
 
@@ -53,28 +53,24 @@ class WebCommand(click.Command):
         return super().parse_args(ctx, with_port(args))
 
 
-class WebRosCommand(RosCommand):
+class WebRosCommand(WebCommand, RosCommand):
     """A command of a ROS 2 node that takes ``--web`` with or without a port."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """See click.Command."""
-        return super().parse_args(ctx, with_port(args))
 
 
 @contextmanager
-def page(port: int | None, host: str) -> Iterator[Web | None]:
+def page(port: int | None, host: str) -> Iterator[WebServer | None]:
     """Serve the live page inside the context (port 0: any free port); None without a port."""
     if port is None:
         yield None
         return
-    from msg_agents.watching.web_server import Web
+    from msg_agents.watching.web_server import WebServer
 
-    with Web(host, port) as web:
+    with WebServer(host, port) as web:
         yield web
 
 
-def announce(web: Web, host: str, note: Callable[[str], None]) -> None:
+def announce(web: WebServer, host: str, note: Callable[[str], None]) -> None:
     """Note the address of the page, and that other machines can see it where that is so."""
     note(f"live page at {web.address}")
     if host not in LOOPBACK:
-        note("whoever can reach this machine can see the page; it is not encrypted and asks for no password")
+        note("all machines that can reach this one can see the page; it is not encrypted and has no password")

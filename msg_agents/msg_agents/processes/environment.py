@@ -12,6 +12,8 @@ MOST_PARTICIPANTS = 100  # that find each other in a domain on one machine: maxI
 UDP_PROFILE = Path(__file__).with_name("udp.xml")
 TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
 RESTARTS = 3  # of killed processes in a run, by default
+# The arithmetic of one agent is far too small for threads, which would only compete for the cores.
+SINGLE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
 DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
 PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
@@ -34,9 +36,7 @@ def discovery_scope() -> str:
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
     """Our environment with what the nodes need; another discovery range or profile of the user's is kept."""
     environment = {
-        # The arithmetic of one agent is far too small for threads, which would only compete for the cores.
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
+        **SINGLE_THREAD,
         **os.environ,
         "ROS_DOMAIN_ID": str(domain),
         "PYTHONUNBUFFERED": "1",

@@ -7,44 +7,47 @@ and output. Killed processes are not started again here.
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from msg_agents.processes.environment import SINGLE_THREAD
 from msg_agents.processes.process_plan import ProcessPlan, plan_network
+from msg_agents.running.experiment_overrides import load_with_overrides
 from msg_agents.running.run_folder import workshop
 from msg_agents.running.runner import REPORT_FILE, make_bag_directory
+from msg_agents.running.supervisor import failure_of
+from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record
 
 TRUE, FALSE = {"true", "1", "yes", "on"}, {"false", "0", "no", "off"}
 NETWORK_ARGUMENTS = {
-    "experiment": ("line_ring", "Experiment file, or the name of one in msg_agents_bringup."),
-    "out": ("runs", "Where the folder <name>_<time> of the bag is made."),
-    "record": ("true", "Whether to record; if false: no bag, no verdict."),
+    "experiment": ("line_ring", "Experiment file, or the name of one of msg_agents_bringup."),
+    "out": ("runs", "Directory in which the bag's directory <name>_<time> is created."),
+    "record": ("true", "Whether to record; otherwise there is no bag and no verdict."),
     "analyse": (
         "true",
         "Whether to compare the bag with the prediction afterwards: the launch fails if they disagree.",
     ),
-    "seed": ("", "Replaces run.seed."),
-    "duration": ("", "Replaces run.duration, in units of simulated time."),
-    "pace": ("", "Replaces run.pace: lockstep or realtime."),
-    "speed": ("", "Replaces run.speed: units of simulated time per second (realtime)."),
-    "processes": ("", "Replaces run.processes: auto, one_per_agent or a number."),
+    "seed": ("", "Overrides run.seed."),
+    "duration": ("", "Overrides run.duration, in units of simulated time."),
+    "pace": ("", "Overrides run.pace: lockstep or realtime."),
+    "speed": ("", "Overrides run.speed: units of simulated time per second (realtime)."),
+    "processes": ("", "Overrides run.processes: auto, one_per_agent or a number."),
     "namespace": ("", "Namespace of all nodes and topics, such as /lab."),
     "use_sim_time": ("false", "Whether to take the time from /clock (realtime)."),
 }
 """Default and description of each argument of network.launch.py."""
 REPLAY_ARGUMENTS = {
     "bag": ("", "The bag: a directory, or one of its files."),
-    "rate": ("1", "Seconds of the bag per second, or max: as fast as the readers accept messages."),
-    "live": ("true", "Whether to watch it: errors and their prediction, also on the topic estimate."),
+    "rate": ("1", "Seconds of the bag per second, or max: as fast as the readers allow."),
+    "live": ("true", "Whether to watch it: errors next to their prediction, also on the topic estimate."),
     "namespace": ("", "Namespace of the network in the bag, for live."),
-    "clock": ("", "Rate [Hz] at which to publish the time of the bag on /clock; empty: do not publish it."),
-    "loop": ("false", "Whether to repeat without end; not together with live."),
+    "clock": ("", "Rate [Hz] at which the time of the bag is published on /clock; empty: it is not published."),
+    "loop": ("false", "Whether to start again at the end, without limit; not together with live."),
 }
 """The same for replay.launch.py."""
 
@@ -87,11 +90,8 @@ def load_experiment(arguments: Mapping[str, str], share: Path) -> Experiment:
             except ValueError as error:
                 what = "a whole number" if kind is int else "a number"
                 raise InputError(f"{name}: {text}: expected {what}") from error
-    if pace := arguments["pace"].strip():
-        changes["pace"] = pace
-    if processes := arguments["processes"].strip():
-        changes["processes"] = int(processes) if processes.isdigit() else processes
-    experiment = Experiment.load(find_experiment(arguments["experiment"], share)).with_run(**changes)
+    changes |= {name: arguments[name].strip() or None for name in ("pace", "processes")}
+    experiment = load_with_overrides(find_experiment(arguments["experiment"], share), changes)
     experiment.require_available()
     return experiment
 
@@ -137,15 +137,14 @@ class LaunchedNetwork:
         ones do not, since they follow from it.
         """
         self._running.discard(name)
-        # A process that is done but hangs while it leaves the middleware ends itself by an alarm (``process.leave``).
-        if code not in (0, -signal.SIGALRM) and not self._over:
+        failure = failure_of(code)
+        if failure and not self._over:
             self._over = True
-            how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-            raise LaunchFailedError(f"{name}: {how}: the run is not complete" + self._what_is_left())
+            raise LaunchFailedError(f"{name}: {failure}: the run is not complete" + self._what_is_left())
         return not self._running and not self._over
 
     def _what_is_left(self) -> str:
-        return "" if self.bag is None else f"; what there is of it is in {self.bag}"
+        return "" if self.bag is None else f"; its data so far are in {self.bag}"
 
     @property
     def analysis(self) -> list[str] | None:
@@ -157,7 +156,10 @@ class LaunchedNetwork:
     def analysed(self, code: int) -> None:
         """Take note of the exit code of ``msg-analysis compare``; LaunchFailedError unless the run agrees."""
         if code:
-            verdict = {1: "the run disagrees with the prediction", 3: "data are incomplete: no verdict"}
+            verdict: dict[int, str] = {
+                ExitCode.DISAGREES: "the run disagrees with the prediction",
+                ExitCode.INCOMPLETE: "data are incomplete: no verdict",
+            }
             raise LaunchFailedError(f"msg-analysis: {verdict.get(code, f'exit code {code}')}")
 
     def close(self) -> None:
@@ -173,8 +175,8 @@ class LaunchedNetwork:
 
 
 def environment() -> dict[str, str]:
-    """Additions to the launch's environment: the nodes' arithmetic is too small for threads."""
-    return {name: os.environ.get(name, "1") for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")}
+    """Additions to the launch's environment."""
+    return {name: os.environ.get(name, number) for name, number in SINGLE_THREAD.items()}
 
 
 def replay_commands(arguments: Mapping[str, str]) -> list[tuple[str, list[str]]]:
@@ -185,7 +187,7 @@ def replay_commands(arguments: Mapping[str, str]) -> list[tuple[str, list[str]]]
     player = [str(Path(bag).expanduser()), "--rate", arguments["rate"].strip()]
     if flag(arguments, "loop"):
         if live:
-            raise InputError("loop: true: a run that begins again cannot be watched: give live:=false")
+            raise InputError("loop: true: a run that starts again cannot be watched: give live:=false")
         player.append("--loop")
     if clock := arguments["clock"].strip():
         player += ["--clock", clock]

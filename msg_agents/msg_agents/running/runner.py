@@ -21,6 +21,7 @@ from msg_agents.running.run_folder import workshop
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, Supervisor
 from msg_agents.stepping.stall_detection import StallDetector
 from msg_agents.terminal.interruption import Interruption
+from msg_agents.watching.view import CallbackView, View
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
@@ -33,11 +34,10 @@ from msg_analysis.twin.simulate import new_record
 from msg_analysis.wire.receiving import state_frame
 
 if TYPE_CHECKING:
-    from msg_agents.watching.run_view import RunView
     from msg_analysis.inference.verdict.comparison import Comparison
 
 POLL = 0.05  # s
-REPORT_FILE, RESULT_FILE = "report.html", "result.json"
+REPORT_FILE = "report.html"
 
 
 @dataclass(slots=True)
@@ -100,14 +100,14 @@ def run_network(
     pin: bool = True,
     on_progress: Callable[[int], None] = lambda _: None,
     on_note: Callable[[str], None] = lambda _: None,
-    view: RunView | None = None,
+    view: View | None = None,
     environment: Mapping[str, str] | None = None,
     record: RunRecord | None = None,
     share: Share | None = None,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
 
-    To be called from the main thread, since it handles signals; the callbacks and ``view`` are called from there.
+    To be called from the main thread, since it handles signals; the callbacks are called from there.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def run_network(
     on_note
         called with a line of text about each restart or stall
     view
-        shows the run while it goes on
+        shows the run while it goes on; ``on_progress`` and ``on_note`` are then not called
     environment
         changes to the environment of the processes
     record
@@ -150,6 +150,7 @@ def run_network(
     NotAvailableError, InputError
         the experiment cannot be run, or no domain is free; nothing was started, and no bag or log is left
     """
+    view = view or CallbackView(on_progress, on_note)
     experiment.require_available()
     count_processes(experiment, None if share is None else len(share.agents))
     if out is not None:
@@ -181,11 +182,9 @@ def run_network(
                 if pin and experiment.run.pace == "lockstep":
                     supervisor.cores = place(plans, available_cores(), first=chosen)
                 supervisor.start(plans)
-                if view is not None:
-                    view.begin(record, checkpoints if share is None else None)
-                _watch(supervisor, experiment.steps, result, restarts, interruption, on_progress, on_note, view)
-                if view is not None:
-                    view.end()
+                view.begin(record, checkpoints if share is None else None)
+                _watch(supervisor, experiment.steps, result, restarts, interruption, view)
+                view.end()
                 # Before the supervisor ends the rest: what ends because we end it has not failed.
                 _collect_failures(supervisor, result, interruption, restarts)
             result.strangers = supervisor.account().strangers()
@@ -206,28 +205,24 @@ def _watch(
     result: RunResult,
     restarts: int,
     interruption: Interruption,
-    on_progress: Callable[[int], None],
-    on_note: Callable[[str], None],
-    view: RunView | None = None,
+    view: View,
 ) -> None:
     """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
     began: float | None = None
     stall = StallDetector()
-    while interruption.caught is None and _revive(supervisor, result, restarts, on_note) and supervisor.awaited:
+    while interruption.caught is None and _revive(supervisor, result, restarts, view) and supervisor.awaited:
         time.sleep(POLL)
         supervisor.read_status()
-        if view is not None:
-            view.look(supervisor.steps)
+        view.look(supervisor.steps)
         reached = min(supervisor.steps, default=-1)
         if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
-            on_note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor)}")
+            view.note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor)}")
         if reached < 0:
             continue
         now = time.monotonic()
         began = began or now
         if reached < steps or not result.wall_time:
             result.wall_time = now - began
-        on_progress(reached)
     if result.wall_time:
         result.rate = min(supervisor.steps, default=0) / result.wall_time
 
@@ -237,14 +232,14 @@ def _standstill(supervisor: Supervisor) -> str:
     words = [f"{node}: {message}" for node, message in sorted(supervisor.account().waiting.items())]
     silent = [child.plan.name for child in supervisor.silent]
     if silent:
-        words.append("nothing heard from " + ", ".join(silent))
+        words.append("no report from " + ", ".join(silent))
     if not words and supervisor.steps:  # the processes that know are on another host
         last = min(supervisor.steps)
-        words.append(f"the last to get on is agent {supervisor.steps.index(last) + 1}, at step {last}")
-    return "; ".join(words) or "nobody says why"
+        words.append(f"slowest: agent {supervisor.steps.index(last) + 1}, at step {last}")
+    return "; ".join(words) or "cause unknown"
 
 
-def _revive(supervisor: Supervisor, result: RunResult, restarts: int, on_note: Callable[[str], None]) -> bool:
+def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View) -> bool:
     """Start killed processes again; False if one cannot be."""
     for child in supervisor.failures:
         if not child.resumes or len(result.restarts) >= restarts:
@@ -253,7 +248,7 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, on_note: C
         after = f" after step {step}" if step >= 0 else ""
         words = f" ({child.last_words()})" if child.process.returncode == CRASHED else ""
         result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
-        on_note(result.restarts[-1])
+        view.note(result.restarts[-1])
         supervisor.restart(child)
     return True
 
@@ -291,7 +286,7 @@ def _settle(bag: Path, result: RunResult) -> None:
             report = salvage_in_place(bag)
             result.failures.append(f"the bag was salvaged: {report.kept_messages} messages kept")
         if result.failures and not any(bag.glob("*.mcap")):
-            result.failures.append("nothing was recorded: it ended before the recorder had made a bag")
+            result.failures.append("nothing was recorded: the run ended before the recorder created a bag")
             return
         result.trajectory = read_bag(bag)
     except BagError as error:

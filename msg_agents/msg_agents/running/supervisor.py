@@ -29,6 +29,14 @@ CRASHED = 1  # exit code of Python after an uncaught exception
 ACCOUNTS = "accounts"
 
 
+def failure_of(code: int) -> str | None:
+    """How a process failed, in words, from its exit code or minus the signal that killed it; None if it ended well."""
+    # A process that has done its part and hangs in the middleware ends itself by an alarm: ``node_process.leave``.
+    if code in (0, -signal.SIGALRM):
+        return None
+    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
 @dataclass(slots=True)
 class Child:
     """A process of the network."""
@@ -61,12 +69,7 @@ class Child:
     def failure(self) -> str | None:
         """How it failed, in words; None if it is running or has ended well."""
         code = self.process.poll()
-        # A process that has done its part and hangs in the middleware ends itself by an alarm: see ``leave``.
-        if code is None or code in (0, -signal.SIGALRM):
-            return None
-        if code < 0:
-            return f"killed by {signal.Signals(-code).name}"
-        return f"exit code {code}"
+        return None if code is None else failure_of(code)
 
     @property
     def resumes(self) -> bool:
@@ -92,9 +95,7 @@ class Child:
 class Supervisor:
     """The processes of one run; at the end of the context they are ended.
 
-    Children run in sessions of their own, so that Ctrl-C in the terminal reaches the parent only, which then ends them
-    in order. Each holds the reading end of a pipe whose writing end only the parent has: when the parent ends, for
-    whatever reason, the pipe closes and the child leaves.
+    They have sessions of their own, so that Ctrl-C reaches only the parent; they end when its pipe to them closes.
     """
 
     logs: Path  # directory for what the children print

@@ -6,15 +6,34 @@ import signal
 from types import TracebackType
 from typing import Any, Self
 
+from msg_analysis.common.exit_codes import killed_by
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def exit_on_signals() -> None:
+    """Let SIGTERM and SIGHUP raise SystemExit from now on, as Ctrl-C raises KeyboardInterrupt."""
+
+    def end(number: int, _: object) -> None:
+        raise SystemExit(killed_by(number))
+
+    for number in SIGNALS[1:]:
+        if not _under_nohup(number):
+            signal.signal(number, end)
+
+
+def _under_nohup(number: signal.Signals) -> bool:
+    """Whether the signal stays ignored; SIGINT does not.
+
+    Scripts ignore SIGINT for what they start in the background, and then end that by ``kill -INT``.
+    """
+    return number != signal.SIGINT and signal.getsignal(number) is signal.SIG_IGN
 
 
 class Interruption:
     """Keeps the first signal until ``check``, as a context.
 
-    An exception that a handler raises appears wherever the process is, and is lost where nothing can be raised, such as
-    in a generator that is being closed or in a callback of an executor. SIGHUP stays ignored under ``nohup``.
-    SIGINT does not: scripts ignore it for what they start in the background, and then end that by ``kill -INT``.
+    An exception that a handler raises is lost in a generator that is being closed, or in a callback of an executor.
     """
 
     def __init__(self) -> None:
@@ -23,7 +42,7 @@ class Interruption:
 
     def __enter__(self) -> Self:
         for number in SIGNALS:
-            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            if not _under_nohup(number):
                 self._handlers[number] = signal.signal(number, self._catch)
         return self
 
@@ -38,7 +57,7 @@ class Interruption:
         if self.caught == signal.SIGINT:
             raise KeyboardInterrupt
         if self.caught is not None:
-            raise SystemExit(128 + self.caught)
+            raise SystemExit(killed_by(self.caught))
 
     def _catch(self, number: int, _: object) -> None:
         self.caught = self.caught or number

@@ -24,7 +24,7 @@ MOST_NODES = 20
 """Up to this many agents, each gets a standard error; for more it would cost the network too much CPU time."""
 
 
-class Observer:
+class RunObserver:
     """Estimates the errors of a run; ``checkpoints``: directory in which its agents keep their states.
 
     Its thread sets ``report`` (the newest numbers; None before the first) and ``note`` (why there are none).

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from msg_analysis.model.run.graph_path import Sojourn, sojourns
@@ -19,7 +19,7 @@ WINDOW = 3.0  # s over which speeds are measured
 GRAIN = 0.25  # s; least time between two measurements
 
 
-class Speeds:
+class StepRates:
     """Steps per second of every agent over the last ``WINDOW`` seconds."""
 
     def __init__(self) -> None:
@@ -42,8 +42,8 @@ class Speeds:
         return [(b - a) / (now - then) for a, b in zip(before, after, strict=True)]
 
 
-class Path:
-    """The sojourns of a run in order, to find that of a step."""
+class SojournFinder:
+    """Finds the sojourn of a step of a run."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._rest: Iterator[Sojourn] = sojourns(experiment, first_graph(experiment))
@@ -60,11 +60,12 @@ class Path:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class Snapshot:
     """The state of a run at one time."""
 
-    steps: list[int]  # newest step of every agent, -1: none; empty before the start
-    rates: list[float] = field(default_factory=list)  # steps per second of every agent; empty where not known
+    # Newest step of every agent, -1: none; empty before the start; a single one for all where only that is known.
+    steps: list[int]
+    rates: list[float] = field(default_factory=list)  # steps per second, as ``steps``; empty where not known
     sojourn: Sojourn | None = None  # of the slowest agent's next step; None before the start
     seconds: float = 0.0  # s since all agents were first seen to have a state
     left: float | None = None  # s until the end at the speed of the slowest agent; None where not known
@@ -82,29 +83,27 @@ class Moment:
         return min(self.rates, default=0.0)
 
 
-class Clockwork:
-    """Makes moments from the steps that the agents have reached."""
+class SnapshotSource:
+    """Makes snapshots of a run from the steps that its agents have reached."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._steps = experiment.steps
-        self._path, self._speeds = Path(experiment), Speeds()
+        self._sojourns, self._rates = SojournFinder(experiment), StepRates()
         self._began: float | None = None
 
-    def moment(self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None) -> Moment:
-        """The moment now, from the newest step of every agent (-1: none; empty before the start)."""
-        reached = min(steps, default=-1)
-        if reached < 0:
-            return Moment(list(steps), note=note)
+    def snapshot(self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None) -> Snapshot:
+        """The snapshot now, from the newest step of every agent (-1: none; empty before the start)."""
+        now = Snapshot(list(steps), report=report, note=note or (report.note if report else None))
+        if now.reached < 0:
+            return now
         self._began = self._began or time.monotonic()
-        self._speeds.add(steps)
-        rates = self._speeds.rates()
-        rate = min(rates, default=0.0)
-        left = (self._steps - reached) / rate if rate > 0 else None
-        sojourn = self._path.at(min(reached, self._steps - 1))
-        return Moment(list(steps), rates, sojourn, time.monotonic() - self._began, left, report, note)
+        self._rates.add(steps)
+        now = replace(now, rates=self._rates.rates(), seconds=time.monotonic() - self._began)
+        left = (self._steps - now.reached) / now.rate if now.rate > 0 else None
+        return replace(now, left=left, sojourn=self._sojourns.at(min(now.reached, self._steps - 1)))
 
 
-def setting(experiment: Experiment) -> dict[str, Any]:
+def run_description(experiment: Experiment) -> dict[str, Any]:
     """What does not change in a run, for a page that draws it: agents, graphs, positions."""
     from msg_analysis.report.figures.agent_places import places
 
@@ -130,21 +129,21 @@ def setting(experiment: Experiment) -> dict[str, Any]:
     }
 
 
-def moment_document(moment: Moment) -> dict[str, Any]:
-    """A moment for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1."""
-    report, sojourn = moment.report, moment.sojourn
+def snapshot_document(snapshot: Snapshot) -> dict[str, Any]:
+    """A snapshot for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1."""
+    report, sojourn = snapshot.report, snapshot.sojourn
     latest = report.latest if report else None
     return {
-        "steps": moment.steps,
-        "reached": moment.reached,
-        "rate": moment.rate,
-        "seconds": moment.seconds,
-        "left": moment.left,
+        "steps": snapshot.steps if len(snapshot.steps) > 1 else [],
+        "reached": snapshot.reached,
+        "rate": snapshot.rate,
+        "seconds": snapshot.seconds,
+        "left": snapshot.left,
         "graph": None if sojourn is None else sojourn.mode,
         "sojourn": None if sojourn is None else [sojourn.sequence + 1, sojourn.first_step, sojourn.last_step],
         "system": report.system.to_json() if report else None,
         "nodes": [node.to_json() for node in report.nodes] if report else None,
         "values": None if latest is None else latest[2].tolist(),
         "values_step": None if latest is None else latest[0],
-        "note": moment.note or (report.note if report else None),
+        "note": snapshot.note,
     }

@@ -11,12 +11,14 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from msg_analysis.common.intervals import HALF_WIDTH_95
+from msg_analysis.report.terminal.live_text import coverage, error_text
+
 if TYPE_CHECKING:
-    from msg_agents.watching.snapshot import Moment
+    from msg_agents.watching.snapshot import Snapshot
     from msg_analysis.inference.errors.estimates import Estimate
     from msg_analysis.model.experiment.experiment import Experiment
 
-HALF = 1.959963984540054  # standard errors from the middle to the end of a 95 % interval
 COLOURS = (
     "blue",
     "yellow",
@@ -32,37 +34,38 @@ FAR = 2.0  # standard errors
 _LEGEND = "  ● measured ◆ predicted"
 
 
-def show(moment: Moment, experiment: Experiment, *, width: int, height: int) -> RenderableType:
+def panel_of(snapshot: Snapshot, experiment: Experiment, *, width: int, height: int) -> RenderableType:
     """The panel, for a terminal of ``width`` by ``height`` characters."""
     agents = "1 agent" if experiment.agents == 1 else f"{experiment.agents} agents"
     title = Text(f"{experiment.name}: {agents}, {experiment.run.pace}", style="bold")
-    if moment.reached < 0:
-        waiting = "starting" if not moment.steps else "waiting for the first states"
+    if snapshot.reached < 0:
+        waiting = "starting" if not snapshot.steps else "waiting for the first states"
         return Panel(Text(waiting), title=title, title_align="left")
     inside = max(width - 4, 20)
-    lines: list[RenderableType] = [_progress(moment, experiment, inside), _graph(moment, experiment), Text()]
-    lines += _system(moment, inside)
+    lines: list[RenderableType] = [_progress(snapshot, experiment, inside), _graph(snapshot, experiment)]
+    lines.append(_coverage(snapshot, experiment))
+    lines += _system(snapshot, inside)
     room = height - FIXED_LINES
     if room >= 3:
-        lines += [Text(), *_agents(moment, experiment, room)]
+        lines += [Text(), *_agents(snapshot, experiment, room)]
     return Panel(Group(*lines), title=title, title_align="left")
 
 
-def plain_line(moment: Moment, experiment: Experiment) -> str:
+def plain_line(snapshot: Snapshot, experiment: Experiment) -> str:
     """The same as one line of text."""
-    parts = [f"step {moment.reached} of {experiment.steps}", f"{moment.rate:.0f} steps/s"]
-    if moment.sojourn is not None:
-        parts.append(f"graph {experiment.graph_list[moment.sojourn.mode].name}")
-    if moment.left is not None:
-        parts.append(f"{_duration(moment.left)} left")
+    parts = [f"step {snapshot.reached} of {experiment.steps}", f"{snapshot.rate:.0f} steps/s"]
+    if snapshot.sojourn is not None:
+        parts.append(f"graph {experiment.graph_list[snapshot.sojourn.mode].name}")
+    if snapshot.left is not None:
+        parts.append(f"{_duration(snapshot.left)} left")
     return ", ".join(parts)
 
 
-def _progress(moment: Moment, experiment: Experiment, width: int) -> RenderableType:
-    share = moment.reached / experiment.steps
-    text = f"step {moment.reached} of {experiment.steps}  {100 * share:.0f} %  {moment.rate:.0f} steps/s"
-    if moment.left is not None:
-        text += f"  {_duration(moment.left)} left"
+def _progress(snapshot: Snapshot, experiment: Experiment, width: int) -> RenderableType:
+    share = snapshot.reached / experiment.steps
+    text = f"step {snapshot.reached} of {experiment.steps}  {100 * share:.0f} %  {snapshot.rate:.0f} steps/s"
+    if snapshot.left is not None:
+        text += f"  {_duration(snapshot.left)} left"
     bar = ProgressBar(
         total=1.0, completed=share, width=max(width - len(text) - 2, 4), complete_style="cyan", finished_style="green"
     )
@@ -71,14 +74,14 @@ def _progress(moment: Moment, experiment: Experiment, width: int) -> RenderableT
     return line if width > len(text) + 6 else Text(text, no_wrap=True, overflow="ellipsis")
 
 
-def _graph(moment: Moment, experiment: Experiment) -> Text:
+def _graph(snapshot: Snapshot, experiment: Experiment) -> Text:
     text = Text("graph ", no_wrap=True, overflow="ellipsis")
-    sojourn = moment.sojourn
+    sojourn = snapshot.sojourn
     if sojourn is None:
         return text + Text("-")
     graph = experiment.graph_list[sojourn.mode]
     text.append(graph.name, style=f"bold {COLOURS[sojourn.mode % len(COLOURS)]}")
-    now, dt = moment.reached, experiment.step_length
+    now, dt = snapshot.reached, experiment.step_length
     # The end of the run cuts the last sojourn short.
     end = "the end" if sojourn.last_step == experiment.steps - 1 else f"{sojourn.last_step + 1}"
     held = (now - sojourn.first_step) * dt
@@ -86,21 +89,24 @@ def _graph(moment: Moment, experiment: Experiment) -> Text:
     return text
 
 
-def _system(moment: Moment, width: int) -> list[RenderableType]:
-    report = moment.report
+def _coverage(snapshot: Snapshot, experiment: Experiment) -> Text:
+    """What the errors below are computed from."""
+    report = snapshot.report
+    if report is None or not report.steps:
+        return Text()
+    text = f"simulated time {snapshot.reached * experiment.step_length:g}, errors of {', '.join(coverage(report))}"
+    return Text(text, style="dim", no_wrap=True, overflow="ellipsis")
+
+
+def _system(snapshot: Snapshot, width: int) -> list[RenderableType]:
+    report = snapshot.report
     if report is None or report.system.measured is None:
-        return [Text(moment.note or "system error: nothing yet", no_wrap=True, overflow="ellipsis"), Text()]
+        return [Text(snapshot.note or "system error: no data yet", no_wrap=True, overflow="ellipsis"), Text()]
     system = report.system
-    text = Text("system error ", no_wrap=True, overflow="ellipsis")
-    text.append(f"{system.measured:.4g}", style="bold")
-    if system.standard_error is not None:
-        text.append(f" ± {HALF * system.standard_error:.2g} (95 %)")
-    if system.predicted is not None:
-        text.append(f", predicted {system.predicted:.4g}")
-    if system.z is not None:
-        text.append(f", z {system.z:+.2f}", style="bold red" if abs(system.z) > 4 else "")
-    if report.note:
-        text.append(f"  {report.note}")
+    style = "bold red" if abs(system.z or 0.0) > 4 else ""
+    text = Text(f"system error {error_text(system)}", style=style, no_wrap=True, overflow="ellipsis")
+    if snapshot.note:
+        text.append(f"  {snapshot.note}")
     return [text, gauge(system, min(width - len(_LEGEND), 60))]
 
 
@@ -109,7 +115,7 @@ def gauge(estimate: Estimate, width: int) -> Text:
     measured, predicted, error = estimate.measured, estimate.predicted, estimate.standard_error
     if measured is None or predicted is None or not error or not math.isfinite(error) or width < 10:
         return Text()
-    low, high = measured - HALF * error, measured + HALF * error
+    low, high = measured - HALF_WIDTH_95 * error, measured + HALF_WIDTH_95 * error
     left, right = min(low, predicted) - error, max(high, predicted) + error
     cells = [" "] * width
 
@@ -127,46 +133,50 @@ def gauge(estimate: Estimate, width: int) -> Text:
     return text.append(_LEGEND, style="dim not bold default")
 
 
-def _agents(moment: Moment, experiment: Experiment, room: int) -> list[RenderableType]:
+def _agents(snapshot: Snapshot, experiment: Experiment, room: int) -> list[RenderableType]:
     """One row per agent; of many, a summary and the rows that are furthest off, or slowest."""
-    nodes = moment.report.nodes if moment.report else []
+    nodes = snapshot.report.nodes if snapshot.report else []
+    steps_known = len(snapshot.steps) == experiment.agents
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for name in ("agent", "step", "steps/s", "error", "predicted", "z"):
+    for name in ("agent", *(("step", "steps/s") if steps_known else ()), "error", "± 95 %", "predicted", "z"):
         table.add_column(name, justify="right", no_wrap=True)
     order = list(range(experiment.agents))
     tail: list[RenderableType] = []
     if experiment.agents > room - 1:
-        tail = [_summary(moment)]
         judged = any(node.z is not None for node in nodes)
-        order.sort(key=lambda i: -abs(nodes[i].z or 0.0) if judged else moment.steps[i])
+        if judged:
+            order.sort(key=lambda i: -abs(nodes[i].z or 0.0))
+        elif steps_known:
+            order.sort(key=lambda i: snapshot.steps[i])
         order = order[: max(room - 3, 0)]
-        tail.append(Text(f"above, the {'agents furthest off' if judged else 'slowest agents'}", style="dim"))
+        which = "agents with the largest |z|" if judged else "slowest agents" if steps_known else "first agents"
+        tail = [_summary(snapshot, experiment), Text(f"above: the {which}", style="dim")]
     for i in order:
-        rate = f"{moment.rates[i]:.0f}" if moment.rates else "-"
-        node = nodes[i] if i < len(nodes) else None
-        numbers = ["-"] * 3 if node is None else [_number(node.measured), _number(node.predicted), _z(node.z)]
-        style = "red" if node is not None and abs(node.z or 0.0) > 4 else ""
-        table.add_row(str(i + 1), str(moment.steps[i]), rate, *numbers, style=style)
+        cells = [str(i + 1)]
+        if steps_known:
+            cells += [str(snapshot.steps[i]), f"{snapshot.rates[i]:.0f}" if snapshot.rates else "-"]
+        node = nodes[i] if nodes else None
+        cells += _errors(node) if node else ["-"] * 4
+        table.add_row(*cells, style="red" if node and abs(node.z or 0.0) > 4 else "")
     return [table, *tail] if order else tail
 
 
-def _summary(moment: Moment) -> Text:
-    steps, rates = moment.steps, moment.rates
-    text = f"{len(steps)} agents at steps {min(steps)} to {max(steps)}"
-    if rates:
+def _summary(snapshot: Snapshot, experiment: Experiment) -> Text:
+    steps, rates = snapshot.steps, snapshot.rates
+    text = f"{experiment.agents} agents at step"
+    text += f"s {min(steps)} to {max(steps)}" if len(steps) > 1 else f" {steps[0]}"
+    if len(rates) > 1:
         text += f", {min(rates):.0f} to {max(rates):.0f} steps/s"
-    judged = [abs(node.z) for node in (moment.report.nodes if moment.report else []) if node.z is not None]
+    judged = [abs(node.z) for node in (snapshot.report.nodes if snapshot.report else []) if node.z is not None]
     if judged:
-        text += f"; {sum(z > FAR for z in judged)} errors are off by more than {FAR:g} standard errors"
+        text += f"; {sum(z > FAR for z in judged)} differ from the prediction by more than {FAR:g} standard errors"
     return Text(text, no_wrap=True, overflow="ellipsis")
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
-
-
-def _z(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.1f}"
+def _errors(node: Estimate) -> list[str]:
+    half = None if node.standard_error is None else HALF_WIDTH_95 * node.standard_error
+    numbers = ((node.measured, ".4g"), (half, ".2g"), (node.predicted, ".4g"), (node.z, "+.1f"))
+    return ["-" if value is None else f"{value:{form}}" for value, form in numbers]
 
 
 def _duration(seconds: float) -> str:

@@ -36,7 +36,7 @@ HEADERS = {
 }
 
 
-class Web:
+class WebServer:
     """Serves the page at ``address`` from when it is made until ``close``; port 0: any free one.
 
     Its methods may be called from any thread. InputError: the port is taken, or the address is not one of this machine.
@@ -56,8 +56,8 @@ class Web:
         except OSError as error:
             reason = error.strerror or str(error)
             raise InputError(
-                f"--web: cannot serve at {host}, port {port} ({reason}): give another port (--web 0: any that is "
-                "free), or another --web-host"
+                f"--web: cannot serve at {host}, port {port} ({reason}): give another port (--web 0: any "
+                "free one), or another --web-host"
             ) from error
         shown = f"[{host}]" if ":" in host else host
         self.address = f"http://{shown}:{self._server.server_address[1]}/"
@@ -73,13 +73,13 @@ class Web:
         self.close()
 
     def begin(self, setting: dict[str, Any]) -> None:
-        """Show a run, given by ``moment.setting``."""
+        """Show a run, given by ``snapshot.run_description``."""
         with self._changed:
             self._setting = finite(setting)
             self._tell()
 
     def show(self, moment: dict[str, Any]) -> None:
-        """Show the current state of the run, given by ``moment.moment_document``."""
+        """Show the current state of the run, given by ``snapshot.snapshot_document``."""
         system = moment["system"] or {}
         with self._changed:
             self._moment = finite(moment)
@@ -115,7 +115,7 @@ class Web:
         """Send one browser what is newest until the end or until it has gone; runs in that browser's thread."""
         with self._changed:
             if self._browsers >= MOST_BROWSERS:
-                handler.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_BROWSERS} browsers are watching already")
+                handler.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"the limit of {MOST_BROWSERS} browsers is reached")
                 return
             self._browsers += 1
         try:
@@ -152,7 +152,7 @@ class _Server(ThreadingHTTPServer):
     allow_reuse_address = True
     request_queue_size = 64
 
-    def __init__(self, web: Web, host: str, port: int, family: socket.AddressFamily) -> None:
+    def __init__(self, web: WebServer, host: str, port: int, family: socket.AddressFamily) -> None:
         self.address_family = family
         self.web = web
         page = resources.files("msg_agents.watching") / "pages" / "live.html"
@@ -193,7 +193,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif path == "/favicon.ico":
             self._send(HTTPStatus.NO_CONTENT, b"", "image/x-icon")
         else:
-            self.refuse(HTTPStatus.NOT_FOUND, "there is / and /events")
+            self.refuse(HTTPStatus.NOT_FOUND, "not found: only / and /events are served")
 
     def refuse(self, status: HTTPStatus, words: str) -> None:
         """Answer with an error and its reason."""

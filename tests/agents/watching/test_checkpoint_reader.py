@@ -10,7 +10,7 @@ import pytest
 
 from msg_agents.recovery.checkpoint import Checkpoint
 from msg_agents.watching.checkpoint_reader import BLOCK, CheckpointReader
-from msg_agents.watching.run_observer import Observer
+from msg_agents.watching.run_observer import RunObserver
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.arithmetic.payload import to_payload
 from msg_analysis.model.experiment.experiment import Experiment
@@ -112,7 +112,7 @@ def test_half_written_states_do_not_count(tmp_path: Path) -> None:
 def test_the_observer_has_the_numbers_of_the_comparison(tmp_path: Path) -> None:
     trajectory = simulate(_experiment())
     writers = Writers(trajectory, tmp_path)
-    observer = Observer(trajectory.record, tmp_path)
+    observer = RunObserver(trajectory.record, tmp_path)
     writers.write(400)
     observer.look(400)
     observer.end()

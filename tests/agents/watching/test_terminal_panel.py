@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
 
-from msg_agents.watching.snapshot import Clockwork, Moment, Path, moment_document, setting
-from msg_agents.watching.terminal_panel import gauge, plain_line, show
+from msg_agents.watching.snapshot import Snapshot, SnapshotSource, SojournFinder, run_description, snapshot_document
+from msg_agents.watching.terminal_panel import gauge, panel_of, plain_line
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.online.running_errors import LiveReport
 from msg_analysis.model.experiment.experiment import Experiment
@@ -35,7 +36,7 @@ def _report(agents: int, *, judged: bool = True) -> LiveReport:
     return LiveReport(0, 4000, 4001, 4001, Estimate(1.45, 1.41, 0.03, 1.33), nodes, None)
 
 
-def _moment(agents: int, **changes: object) -> Moment:
+def _snapshot(agents: int, **changes: object) -> Snapshot:
     values: dict[str, object] = {
         "steps": [4000 + i % 7 for i in range(agents)],
         "rates": [500.0 + i for i in range(agents)],
@@ -44,12 +45,12 @@ def _moment(agents: int, **changes: object) -> Moment:
         "left": 61.2,
         "report": _report(agents),
     }
-    return Moment(**(values | changes))  # type: ignore[arg-type]
+    return Snapshot(**(values | changes))  # type: ignore[arg-type]
 
 
-def _lines(moment: Moment, experiment: Experiment, width: int, height: int) -> list[str]:
+def _lines(snapshot: Snapshot, experiment: Experiment, width: int, height: int) -> list[str]:
     console = Console(file=io.StringIO(), width=width, height=height, force_terminal=True, color_system=None)
-    console.print(show(moment, experiment, width=width, height=height))
+    console.print(panel_of(snapshot, experiment, width=width, height=height))
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue().rstrip("\n").split("\n")
 
@@ -58,13 +59,13 @@ def _lines(moment: Moment, experiment: Experiment, width: int, height: int) -> l
 @pytest.mark.parametrize("agents", [3, 5, 20, 100])
 @pytest.mark.parametrize("judged", [True, False])
 def test_fits(width: int, height: int, agents: int, judged: bool) -> None:
-    lines = _lines(_moment(agents, report=_report(agents, judged=judged)), _experiment(agents), width, height)
+    lines = _lines(_snapshot(agents, report=_report(agents, judged=judged)), _experiment(agents), width, height)
     assert max(map(len, lines)) <= width
     assert len(lines) <= max(height, 9)  # of less, the terminal shows the beginning
 
 
 def test_says_how_it_stands() -> None:
-    text = "\n".join(_lines(_moment(5), _experiment(), 120, 24))
+    text = "\n".join(_lines(_snapshot(5), _experiment(), 120, 24))
     for words in (
         "net: 5 agents, lockstep",
         "step 4000 of 8000  50 %  500 steps/s  1:02 left",
@@ -73,25 +74,39 @@ def test_says_how_it_stands() -> None:
         "system error 1.45 ± 0.059 (95 %), predicted 1.41, z +1.33",
     ):
         assert words in text
-    assert re.search(r"\b5 +4004 +504 +1\.08 +1 +\+1\.6", text)
+    assert re.search(r"\b5 +4004 +504 +1\.08 +0\.098 +1 +\+1\.6", text)
+    assert "simulated time 200, errors of 4001 steps, 0 missing" in text
+
+
+def test_a_watched_network_has_one_step_for_all() -> None:
+    """Then no agent has a step of its own, in the panel and on the page; missing steps and refusals are told."""
+    report = replace(_report(5), last=4099, first=1, refused={"not finite": 3})
+    snapshot = _snapshot(5, steps=[4000], rates=[500.0], report=report)
+    text = "\n".join(_lines(snapshot, _experiment(), 120, 24))
+    assert "step 4000 of 8000  50 %  500 steps/s  1:02 left" in text
+    assert "errors of 4001 steps since step 1, 98 missing, not finite: 3" in text
+    assert re.search(r"│ +5 +1\.08 +0\.098 +1 +\+1\.6", text)
+    assert snapshot_document(snapshot)["steps"] == []
+    many = "\n".join(_lines(_snapshot(100, steps=[4000], rates=[500.0]), _experiment(100), 80, 24))
+    assert "100 agents at step 4000" in many
 
 
 def test_many_agents_are_summed_up() -> None:
-    text = "\n".join(_lines(_moment(100), _experiment(100), 80, 24))
+    text = "\n".join(_lines(_snapshot(100), _experiment(100), 80, 24))
     assert "100 agents at steps 4000 to 4006, 500 to 599 steps/s" in text
-    assert "agents furthest off" in text
+    assert "above: the agents with the largest |z|" in text
     assert re.search(r"│ +100 ", text)
     assert not re.search(r"│ +1 ", text)
 
 
 def test_before_anything_is_known() -> None:
     experiment = _experiment()
-    assert "starting" in "\n".join(_lines(Moment([]), experiment, 80, 24))
-    assert "waiting for the first states" in "\n".join(_lines(Moment([-1] * 5), experiment, 80, 24))
-    text = "\n".join(_lines(_moment(5, report=None, rates=[], left=None, note="why not"), experiment, 80, 24))
+    assert "starting" in "\n".join(_lines(Snapshot([]), experiment, 80, 24))
+    assert "waiting for the first states" in "\n".join(_lines(Snapshot([-1] * 5), experiment, 80, 24))
+    text = "\n".join(_lines(_snapshot(5, report=None, rates=[], left=None, note="why not"), experiment, 80, 24))
     assert "why not" in text
     assert "left" not in text
-    assert plain_line(_moment(5), experiment) == (
+    assert plain_line(_snapshot(5), experiment) == (
         "step 4000 of 8000, 500 steps/s, graph a ring [bold] of $$ a very long name, 1:02 left"
     )
 
@@ -115,7 +130,7 @@ def test_the_sojourns_are_those_of_the_run() -> None:
     """Beside the path of the offline twin."""
     experiment = _experiment()
     modes = simulate(experiment).modes
-    path = Path(experiment)
+    path = SojournFinder(experiment)
     for step in range(0, 8000, 37):
         sojourn = path.at(step)
         assert sojourn is not None
@@ -126,11 +141,11 @@ def test_the_sojourns_are_those_of_the_run() -> None:
 
 def test_documents_for_the_page() -> None:
     experiment = _experiment()
-    found = setting(experiment)
+    found = run_description(experiment)
     assert [graph["name"] for graph in found["graphs"]] == [graph.name for graph in experiment.graph_list]
     assert found["graphs"][0]["links"] == [[0, 1], [1, 2], [2, 3], [3, 4]]
     assert len(found["places"]) == 5
-    moment = moment_document(_moment(5))
-    assert moment["system"]["measured"] == 1.45
-    assert moment["sojourn"] == [42, 3990, 4010]
-    assert Clockwork(experiment).moment([]).reached == -1
+    snapshot = snapshot_document(_snapshot(5))
+    assert snapshot["system"]["measured"] == 1.45
+    assert snapshot["sojourn"] == [42, 3990, 4010]
+    assert SnapshotSource(experiment).snapshot([]).reached == -1

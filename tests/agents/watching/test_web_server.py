@@ -15,23 +15,23 @@ from click.testing import CliRunner
 
 from msg_agents.cli.main import main
 from msg_agents.cli.web_options import WebCommand, web_options
-from msg_agents.watching.web_server import MOST_BROWSERS, Web
+from msg_agents.watching.web_server import MOST_BROWSERS, WebServer
 from msg_analysis.errors import InputError
 
 MOMENT = {"system": {"measured": 1.5, "predicted": 1.4, "standard_error": 0.1}, "values_step": 7, "reached": 8}
 
 
 @pytest.fixture
-def web() -> Iterator[Web]:
-    with Web("127.0.0.1", 0) as served:
+def web() -> Iterator[WebServer]:
+    with WebServer("127.0.0.1", 0) as served:
         yield served
 
 
-def _connection(web: Web) -> http.client.HTTPConnection:
+def _connection(web: WebServer) -> http.client.HTTPConnection:
     return http.client.HTTPConnection(web.address.removeprefix("http://").rstrip("/"), timeout=20)
 
 
-def _get(web: Web, path: str, **headers: str) -> http.client.HTTPResponse:
+def _get(web: WebServer, path: str, **headers: str) -> http.client.HTTPResponse:
     connection = _connection(web)
     connection.request("GET", path, headers=headers)
     return connection.getresponse()
@@ -40,7 +40,7 @@ def _get(web: Web, path: str, **headers: str) -> http.client.HTTPResponse:
 class Events:
     """Reads a stream of events."""
 
-    def __init__(self, web: Web) -> None:
+    def __init__(self, web: WebServer) -> None:
         self._response = _get(web, "/events")
         assert self._response.status == 200
         assert self._response.getheader("Content-Type", "").startswith("text/event-stream")
@@ -56,7 +56,7 @@ class Events:
         return None
 
 
-def test_page(web: Web) -> None:
+def test_page(web: WebServer) -> None:
     page = _get(web, "/")
     text = page.read().decode()
     assert page.status == 200
@@ -79,12 +79,12 @@ def test_page(web: Web) -> None:
         ("", 403),
     ],
 )
-def test_only_under_our_own_name(web: Web, host: str, status: int) -> None:
+def test_only_under_our_own_name(web: WebServer, host: str, status: int) -> None:
     """A page from elsewhere whose name points here all of a sudden (DNS rebinding) gets nothing."""
     assert _get(web, "/", Host=host).status == status
 
 
-def test_events(web: Web) -> None:
+def test_events(web: WebServer) -> None:
     """Who comes early waits; who comes late gets what was, with the history."""
     early = Events(web)
     web.begin({"name": "net", "agents": 2})
@@ -105,7 +105,7 @@ def test_events(web: Web) -> None:
         assert found[-1] == ("end", {"text": "over", "verdict": "agrees"})
 
 
-def test_who_is_slow_or_goes_holds_nobody_up(web: Web) -> None:
+def test_who_is_slow_or_goes_holds_nobody_up(web: WebServer) -> None:
     """One browser never reads, one goes at once, one reads: 300 large moments are taken at once."""
     web.begin({"name": "net"})
     deaf = socket.create_connection(("127.0.0.1", int(web.address.rstrip("/").rpartition(":")[2])))
@@ -130,7 +130,7 @@ def test_who_is_slow_or_goes_holds_nobody_up(web: Web) -> None:
     deaf.close()
 
 
-def test_not_too_many(web: Web) -> None:
+def test_not_too_many(web: WebServer) -> None:
     web.begin({"name": "net"})
     streams = [Events(web) for _ in range(MOST_BROWSERS)]
     assert all(stream.next() for stream in streams)
@@ -139,7 +139,7 @@ def test_not_too_many(web: Web) -> None:
 
 
 def test_the_end_reaches_who_watches() -> None:
-    with Web("localhost", 0) as web:
+    with WebServer("localhost", 0) as web:
         events = Events(web)
         web.begin({"name": "net"})
         assert events.next() is not None
@@ -149,15 +149,15 @@ def test_the_end_reaches_who_watches() -> None:
     assert found[-1] == "end"
 
 
-def test_the_port_is_taken(web: Web) -> None:
+def test_the_port_is_taken(web: WebServer) -> None:
     port = int(web.address.rstrip("/").rpartition(":")[2])
     with pytest.raises(InputError, match=f"--web: cannot serve at 127.0.0.1, port {port} .*in use.*another port"):
-        Web("127.0.0.1", port)
+        WebServer("127.0.0.1", port)
     with pytest.raises(InputError, match="cannot serve at nosuchhost"):
-        Web("nosuchhost.invalid", 0)
+        WebServer("nosuchhost.invalid", 0)
 
 
-def test_a_taken_port_ends_the_command_before_anything_starts(web: Web, tmp_path: Any) -> None:
+def test_a_taken_port_ends_the_command_before_anything_starts(web: WebServer, tmp_path: Any) -> None:
     experiment = tmp_path / "net.yaml"
     experiment.write_text("name: net\ngraphs: {line: {path: [1, 2, 3]}}\nrun: {duration: 5}\n")
     port = web.address.rstrip("/").rpartition(":")[2]

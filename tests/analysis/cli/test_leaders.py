@@ -105,7 +105,7 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.
     monkeypatch.setattr(progress, "_LINE_PERIOD", 0.0)
     result = call("leaders", LINE_RING, "--count", "2", "--method", "swap", "--json")
     assert json.loads(result.stdout)["sets"]
-    assert "line_ring: greedy: 1 of 10, least system error" in result.stderr
+    assert "line_ring: greedy: 1 of 10, smallest system error" in result.stderr
     assert "\x1b" not in result.stderr
 
 

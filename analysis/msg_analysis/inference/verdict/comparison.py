@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.markdown import markdown_table
 from msg_analysis.common.number_words import half_width_text, measured_text, number_text, z_text
 from msg_analysis.inference.blame.causes import Cause
@@ -29,7 +30,12 @@ from msg_analysis.types import FloatArray
 
 Verdict = Literal["agrees", "disagrees", "incomplete", "unpredicted"]
 
-EXIT_CODES: dict[Verdict, int] = {"agrees": 0, "disagrees": 1, "incomplete": 3, "unpredicted": 0}
+EXIT_CODES: dict[Verdict, ExitCode] = {
+    "agrees": ExitCode.FINE,
+    "disagrees": ExitCode.DISAGREES,
+    "incomplete": ExitCode.INCOMPLETE,
+    "unpredicted": ExitCode.FINE,
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from bokeh.models import (
 )
 from bokeh.palettes import PuOr, interp_palette
 
+from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.report.documents.comparison_words import TIMES
 from msg_analysis.report.figures.palette import (
     BLACK,
@@ -35,7 +36,6 @@ from msg_analysis.report.figures.palette import (
 from msg_analysis.report.html.plot_style import SANS, new_figure, place_legend, plain_legend
 from msg_analysis.types import FloatArray
 
-HALF = 1.959963984540054  # standard errors on each side of a 95 % interval
 MOST_LINES = 8  # agents whose convergence is drawn at once
 _NUMBERED = 8  # most agents with which heat maps show numbers
 _POINTS = 200  # at most, on the line of an agent
@@ -45,7 +45,7 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
     """The running system error, of ``Comparison.running`` with (points,) each, beside the predicted one."""
     time, mean, error = running["time"], running["system_error"], running["standard_error"]
     centre = predicted if predicted is not None else mean[-1]
-    low, high = centre - HALF * error, centre + HALF * error
+    low, high = centre - HALF_WIDTH_95 * error, centre + HALF_WIDTH_95 * error
     plot = new_figure(270, x_axis_label="simulated time", y_axis_label="system error", x_range=(0.0, float(time[-1])))
     data = {"time": time, "mean": mean, "low": low, "high": high, "z": (mean - centre) / np.where(error > 0, error, 1)}
     source = ColumnDataSource(data)
@@ -70,7 +70,7 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
     agents = np.arange(1, len(nodes) + 1)
     measured, predicted, error = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
     apart = np.nan_to_num(_column(nodes, "p_holm"), nan=1.0) < level
-    half = HALF * error
+    half = HALF_WIDTH_95 * error
     data = {
         "agent": agents,
         "measured": measured,
@@ -152,7 +152,7 @@ def agent_convergence(
     parts = (sums / ends[:, None] / scale).T
     everything = ColumnDataSource({"part": parts.ravel().astype(np.float32)}, name="all_agents")
     times = ColumnDataSource({"time": (ends * dt).astype(np.float32)}, name="all_times")
-    widths = ColumnDataSource({"width": HALF * error / scale}, name="all_widths")
+    widths = ColumnDataSource({"width": HALF_WIDTH_95 * error / scale}, name="all_widths")
     lines = ColumnDataSource({key: [] for key in ("xs", "ys", "agent", "colour", "dash")}, name="lines")
     bands = ColumnDataSource({key: [] for key in ("xs", "ys", "colour")}, name="bands")
     plot = new_figure(270, x_axis_label="simulated time", y_axis_label="measured / predicted")
@@ -235,7 +235,7 @@ def innovation_sizes(
 ) -> UIElement:
     """Variance of each agent's innovations relative to the predicted one, and where 95 % of such ratios lie."""
     agents = np.arange(1, len(ratios) + 1)
-    half = HALF * np.sqrt(2.0 / max(samples, 1))
+    half = HALF_WIDTH_95 * np.sqrt(2.0 / max(samples, 1))
     inside = np.abs(ratios - 1.0) <= half
     data = {
         "agent": agents,

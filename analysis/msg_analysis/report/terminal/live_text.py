@@ -1,20 +1,15 @@
-"""A running network as one line, as a terminal table or as a JSON document."""
+"""A running network as one line or as a JSON document."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Group, RenderableType
-from rich.table import Table
-from rich.text import Text
-
-from msg_analysis.common.number_words import half_width_text, measured_text, number_text, z_text
-from msg_analysis.inference.errors.estimates import Estimate
-from msg_analysis.inference.online.running_errors import LiveReport
+from msg_analysis.common.number_words import measured_text, number_text, z_text
 from msg_analysis.model.run.record import RunRecord
-from msg_analysis.report.documents.comparison_words import furthest
 
-MOST_ROWS = 20  # agents in the table: a screen; of more, those with the largest abs(z)
+if TYPE_CHECKING:  # these take long to import, while a network starts
+    from msg_analysis.inference.errors.estimates import Estimate
+    from msg_analysis.inference.online.running_errors import LiveReport
 
 
 def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
@@ -37,51 +32,20 @@ def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
 
 def live_line(report: LiveReport, record: RunRecord, rate: float) -> str:
     """Step, system error and missing steps in one line; ``rate`` in steps per second."""
-    parts = [f"step {max(report.newest, 0)} of {record.experiment.steps}", _system(report.system)]
-    return ", ".join(parts + _account(report, rate))
+    parts = [f"step {max(report.newest, 0)} of {record.experiment.steps}", f"system error {error_text(report.system)}"]
+    return ", ".join(parts + (coverage(report) if report.steps else ["no complete step yet"]) + [f"{rate:.0f} steps/s"])
 
 
-def live_table(report: LiveReport, record: RunRecord, rate: float) -> RenderableType:
-    """A table of the errors, and below it what ``live_line`` counts; ``rate`` in steps per second."""
-    experiment = record.experiment
-    time = max(report.newest, 0) * experiment.step_length
-    table = Table(
-        title=f"{experiment.name}: step {max(report.newest, 0)} of {experiment.steps}, simulated time {time:g}",
-        title_justify="left",
-    )
-    for name in ("error", "measured", "± (95 %)", "predicted", "z"):
-        table.add_column(name, justify="left" if name == "error" else "right")
-    table.add_row("system", *_cells(report.system))
-    cut = len(report.nodes) > MOST_ROWS
-    for agent in furthest([node.z for node in report.nodes], MOST_ROWS) if cut else range(len(report.nodes)):
-        table.add_row(f"agent {agent + 1}", *_cells(report.nodes[agent]))
-    lines = [Text(", ".join(_account(report, rate)))]
-    if cut:
-        lines.append(Text(f"the {MOST_ROWS} agents with the largest |z|, of {len(report.nodes)}"))
-    if report.note:
-        lines.append(Text(report.note))
-    return Group(table, *lines)
-
-
-def _account(report: LiveReport, rate: float) -> list[str]:
-    if not report.steps:
-        return ["no complete step yet"]
+def coverage(report: LiveReport) -> list[str]:
+    """Steps in the errors, incomplete ones, and refused messages by reason."""
     since = f" since step {report.first}" if report.first else ""
-    parts = [f"{report.steps} steps{since}", f"{report.missing} missing", f"{rate:.0f} steps/s"]
+    parts = [f"{report.steps} steps{since}", f"{report.missing} missing"]
     return parts + [f"{reason}: {count}" for reason, count in report.refused.items()]
 
 
-def _system(error: Estimate) -> str:
-    text = f"system error {measured_text(error.measured, error.interval)}"
-    if error.predicted is not None:
-        text += f", predicted {number_text(error.predicted)}"
-    return text + (f", z = {z_text(error.z)}" if error.z is not None else "")
-
-
-def _cells(error: Estimate) -> list[str]:
-    return [
-        number_text(error.measured),
-        half_width_text(error.interval),
-        number_text(error.predicted),
-        z_text(error.z),
-    ]
+def error_text(estimate: Estimate) -> str:
+    """An error next to its prediction: ``1.45 ± 0.059 (95 %), predicted 1.41, z = +1.33``."""
+    text = measured_text(estimate.measured, estimate.interval)
+    if estimate.predicted is not None:
+        text += f", predicted {number_text(estimate.predicted)}"
+    return text + (f", z = {z_text(estimate.z)}" if estimate.z is not None else "")

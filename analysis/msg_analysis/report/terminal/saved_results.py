@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.text import Text
 from scipy import stats
 
+from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.common.markdown import markdown_table
 from msg_analysis.common.number_words import half_width_text, measured_text, number_text, p_text, z_text
 from msg_analysis.errors import InputError
@@ -23,8 +24,6 @@ from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.errors.ranking import Ranking, rank_estimates
 from msg_analysis.report.documents.comparison_words import order_statements
 from msg_analysis.report.terminal.tables import number_table
-
-RESULT_FILE = "result.json"
 
 
 @dataclass(frozen=True, slots=True)
