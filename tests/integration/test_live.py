@@ -81,7 +81,8 @@ def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> N
     assert result.trajectory.completeness.complete
     last = ended(live)[0].splitlines()[-1]
     found = re.fullmatch(
-        r"step 10000 of 10000, system error ([\d.]+) .*, (\d+) steps(?: since step (\d+))?, 0 missing, \d+ steps/s", last
+        r"step 10000 of 10000, system error ([\d.]+) .*, (\d+) steps(?: since step (\d+))?, 0 missing, \d+ steps/s",
+        last,
     )
     assert found, last
     first = int(found[3] or 0)

@@ -93,7 +93,7 @@ def gone(pid: int) -> bool:
 
 
 def participants(domain: int) -> int:
-    """Number of processes of this machine that take part in a ROS domain: each has a port of its own (RTPS, 9.6.1.1)."""
+    """Number of processes of this machine in a ROS domain: each has a port of its own (RTPS, 9.6.1.1)."""
     lines = Path("/proc/net/udp").read_text().splitlines()[1:]
     ports = {int(line.split()[1].rpartition(":")[2], 16) for line in lines}
     return sum(7400 + 250 * domain + 10 + 2 * number in ports for number in range(119))
