@@ -34,7 +34,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     modules: dict[Path, list[pytest.Item]] = {}
     for item in items:
         modules.setdefault(item.path, []).append(item)
-    networks = {path for path, tests in modules.items() if tests[-1].get_closest_marker("integration")}
+    networks = {
+        path for path, tests in modules.items() if all(test.get_closest_marker("integration") for test in tests)
+    }
     total = Counter(path in networks for path, tests in modules.items() for _ in tests)
     before: Counter[bool] = Counter()
     place = {}
