@@ -84,12 +84,28 @@ def test_help_needs_no_ros() -> None:
     assert process.stdout.splitlines()[-1] == "[]", process.stderr
 
 
-def test_processes_of_a_run_import_little() -> None:
-    """With these a network would take twice as long to start: every agent is a process that imports all it needs."""
+PROCESSES = {
+    "agent": [*modules("msg_agents", AGENTS, "nodes/agents"), "msg_agents.nodes.node_process"],
+    "recorder": ["msg_agents.nodes.recorder", "msg_agents.nodes.node_process"],
+    "switcher": ["msg_agents.nodes.switcher", "msg_agents.nodes.node_process"],
+}
+
+
+@pytest.mark.parametrize("process", PROCESSES)
+def test_processes_of_a_run_import_little(process: str) -> None:
+    """With these a network would take twice as long to start: every agent is a process that imports all it needs.
+
+    What they import when they run: tests/integration/test_lockstep.py.
+    """
+    pytest.importorskip("rclpy")
+    loaded = loaded_by([*PROCESSES[process], "msg_analysis.model.step.step_model"])
+    assert {"rclpy", "msg_agents.nodes.network_node", "msg_analysis.wire.messages"} <= loaded
+    assert {name.split(".")[0] for name in loaded}.isdisjoint({"scipy", "networkx", "matplotlib", "rich", "rosbags"})
+
+
+def test_parsing_an_experiment_imports_little() -> None:
     code = (
         "import sys\n"
-        "import msg_agents.nodes.agents.agent, msg_agents.nodes.agents.agent_group, msg_agents.nodes.node_process\n"
-        "import msg_agents.nodes.recorder, msg_agents.nodes.switcher\n"
         "from msg_analysis.model.experiment.experiment import Experiment\n"
         "from msg_analysis.model.step.step_model import build_model\n"
         "document = {'name': 'two', 'graphs': {'pair': {'path': [1, 2]}, 'grid': {'grid': [1, 2]}},\n"

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import yaml
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
@@ -20,15 +19,10 @@ from msg_analysis.twin.simulate import simulate
 STEPS, AGENTS = 300, 5
 
 
-@pytest.fixture
-def result(network: Any) -> RunResult:
+def test_any_reader_finds_everything(network: Any) -> None:
+    """One run, looked at from all sides: rosbags, the plain MCAP reader, metadata.yaml, the logs; and run again."""
     result: RunResult = network.run(network.experiment(run={"processes": 2}))
     assert result.failures == []
-    return result
-
-
-def test_any_reader_finds_everything(result: RunResult) -> None:
-    """One run, looked at from all sides: rosbags, the plain MCAP reader, metadata.yaml, the logs."""
     assert result.bag is not None
     _rosbags(result)
     _mcap(result.bag)
@@ -36,6 +30,20 @@ def test_any_reader_finds_everything(result: RunResult) -> None:
     logs = sorted(file.name for file in (result.bag / "log").iterdir())
     assert logs == ["agents_1_to_2.log", "agents_3_to_5.log", "recorder.log", "run.json", "switcher.log"]
     assert [file.name for file in result.bag.glob(".*")] == []
+    _the_seed_is_the_run(network, result)
+
+
+def _the_seed_is_the_run(network: Any, result: RunResult) -> None:
+    """The same seed gives the same contents, whatever the processes; another seed gives others."""
+    first = result.trajectory
+    assert first is not None
+    again = network.run(network.experiment(run={"processes": 1})).trajectory
+    assert again.record.run != first.record.run
+    assert np.array_equal(again.states, first.states)
+    assert np.array_equal(again.modes, first.modes)
+    other = simulate(network.experiment(run={"seed": 8}))  # equal to its network: test_lockstep.py
+    assert not np.array_equal(other.states[-1], first.states[-1])
+    assert not np.array_equal(other.modes, first.modes)
 
 
 def _rosbags(result: RunResult) -> None:
@@ -183,16 +191,3 @@ def test_recorder_killed_between_two_files(network: Any) -> None:
         states = sum(info.msgcount for topic, info in reader.topics.items() if topic.endswith("state"))
         assert states == trajectory.completeness.received
         assert sum(1 for _ in reader.messages()) == reader.message_count
-
-
-def test_the_seed_is_the_run(network: Any, result: RunResult) -> None:
-    """The same seed gives the same contents, whatever the processes; another seed gives others."""
-    first = result.trajectory
-    assert first is not None
-    again = network.run(network.experiment(run={"processes": 1})).trajectory
-    other = network.run(network.experiment(run={"processes": 1, "seed": 8})).trajectory
-    assert again.record.run != first.record.run
-    assert np.array_equal(again.states, first.states)
-    assert np.array_equal(again.modes, first.modes)
-    assert not np.array_equal(other.states[-1], first.states[-1])
-    assert not np.array_equal(other.modes, first.modes)

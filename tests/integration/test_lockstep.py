@@ -39,8 +39,18 @@ CASES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("processes", [1, 2, "one_per_agent"])
-@pytest.mark.parametrize("case", CASES)
+LAYOUTS: dict[str, list[Any]] = {
+    "consensus": [1, 2, "one_per_agent"],
+    "tracking": [2],
+    "noise by graph": ["one_per_agent"],
+    "grounded": [1],
+    "discrete": [2],  # with one process per agent: on another processor, below
+    "disconnected": ["one_per_agent"],
+}
+"""Every law, and every number of processes: what one agent computes does not depend on the other."""
+
+
+@pytest.mark.parametrize(("case", "processes"), [(case, count) for case in CASES for count in LAYOUTS[case]])
 def test_equals_the_twin(network: Any, case: str, processes: Any) -> None:
     """300 steps: more than the window of the lockstep and more than one block of noise."""
     changes = CASES[case]
@@ -69,23 +79,30 @@ def test_a_network_on_another_processor(network: Any) -> None:
     assert np.array_equal(simulate(network.experiment(**CASES["discrete"])).states, states)
 
 
-def test_progress_and_rate(network: Any) -> None:
+def test_progress_the_other_executor_and_what_is_imported(network: Any) -> None:
+    """The executor that a ROS 2 without the events executor falls back to; every process names what it imports."""
     seen: list[int] = []
-    result = network.run(network.experiment(run={"processes": 1}), on_progress=seen.append)
-    assert seen == sorted(seen)
-    assert seen[-1] == 300
-    assert result.rate > 0
-    assert result.wall_time > 0
-
-
-@pytest.mark.parametrize("executor", ["single"])
-def test_the_other_executor(network: Any, executor: str) -> None:
-    """The one that a ROS 2 without the events executor falls back to."""
-    result = network.run(network.experiment(run={"processes": 2}), environment={"MSG_AGENTS_EXECUTOR": executor})
+    environment = {"MSG_AGENTS_EXECUTOR": "single", "PYTHONPROFILEIMPORTTIME": "1"}
+    what = network.experiment(run={"processes": 2})
+    result = network.run(what, environment=environment, on_progress=seen.append)
     assert result.failures == []
     assert result.trajectory is not None
     assert check(result.trajectory).difference is None
     assert result.trajectory.completeness.complete
+
+    assert seen == sorted(seen)
+    assert seen[-1] == 300
+    assert result.wall_time > 0
+    assert result.rate == 300 / result.wall_time
+
+    logs = {log.stem: log.read_text() for log in (result.bag / "log").glob("*.log")}
+    assert set(logs) == {"agents_1_to_2", "agents_3_to_5", "recorder", "switcher"}
+    for name, log in logs.items():  # with any of these a network would take twice as long to start
+        imported = {
+            line.rpartition("|")[2].strip().split(".")[0] for line in log.splitlines() if "import time:" in line
+        }
+        assert {"rclpy", "numpy", "msg_agents", "msg_analysis"} <= imported, name
+        assert imported.isdisjoint({"scipy", "networkx", "matplotlib", "rich", "rosbags"}), name
 
 
 def test_two_runs_at_the_same_time(network: Any) -> None:

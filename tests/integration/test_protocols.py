@@ -28,8 +28,10 @@ class Broken(Protocol):
 """
 
 
-@pytest.mark.parametrize("processes", ["one_per_agent", 2])
-@pytest.mark.parametrize("name", ["metropolis", "saturated", "integral_action"])
+@pytest.mark.parametrize(
+    ("name", "processes"),
+    [("metropolis", "one_per_agent"), ("saturated", 2), ("integral_action", "one_per_agent"), ("integral_action", 2)],
+)
 def test_examples(network: Any, name: str, processes: int | str) -> None:
     """The verdict of a linear one is a test at level 0.01; the seeds of the examples are among the 99 %."""
     what = Experiment.load(EXPERIMENTS / f"{name}.yaml")

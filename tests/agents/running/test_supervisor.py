@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -37,6 +38,15 @@ signal.signal(signal.SIGINT, lambda *_: sys.exit(0))
 print("ready", flush=True)
 signal.pause()
 """
+# Takes the place of msg_agents in ``python -m msg_agents``: writes on the status pipe what it reads from a named pipe.
+REPORTER = """
+import json, os, sys
+status = int(sys.argv[sys.argv.index("--status") + 1])
+for line in open(sys.argv[2]):
+    os.write(status, json.loads(line).encode())
+    print("written", flush=True)
+"""
+NAMES = ["agent_1", "agent_2", "recorder", "switcher"]
 
 
 @pytest.fixture
@@ -44,11 +54,11 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Child]]:
     """Starts a child that is no node, waits until it is up, and sees to it that it goes."""
     children: list[Child] = []
 
-    def start_child(code: str, name: str = "agent_1") -> Child:
+    def start_child(code: str, name: str = "agent_1", *, number: int = 1, resumes: bool = False) -> Child:
         log = tmp_path / f"{name}.log"
         with log.open("wb") as output:
             process = subprocess.Popen([sys.executable, "-P", "-c", code], stdout=output, stderr=output)
-        child = Child(ProcessPlan(name, ()), process, log)
+        child = Child(ProcessPlan(name, (), resumes=resumes), process, log, number)
         children.append(child)
         wait_for(lambda: "ready" in log.read_text() or not child.running)
         return child
@@ -80,6 +90,13 @@ def gone(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except (FileNotFoundError, ProcessLookupError):
         return True
+
+
+def participants(domain: int) -> int:
+    """Number of processes of this machine in a ROS domain: each has a port of its own (RTPS, 9.6.1.1)."""
+    lines = Path("/proc/net/udp").read_text().splitlines()[1:]
+    ports = {int(line.split()[1].rpartition(":")[2], 16) for line in lines}
+    return sum(7400 + 250 * domain + 10 + 2 * number in ports for number in range(119))
 
 
 @pytest.mark.usefixtures("impatient")
@@ -159,51 +176,63 @@ def test_failures_in_words(
     ],
 )
 def test_which_deaths_are_worth_a_restart(start: Callable[..., Child], code: str, number: int, resumes: bool) -> None:
-    child = start(code)
-    child.process.wait()
-    child.number = number
-    assert not child.resumes  # without a checkpoint, never
-    child.plan = ProcessPlan("agent_1", (), resumes=True)
-    assert child.resumes == resumes
-
-
-@pytest.mark.parametrize("still_there", ["agent_1", "switcher"])
-def test_who_is_killed_after_the_end_has_not_failed(
-    tmp_path: Path, start: Callable[..., Child], still_there: str
-) -> None:
-    names = ["agent_1", "agent_2", "recorder", "switcher"]
-    children = {
-        name: start("import os; os.kill(os.getpid(), 9)" if name == still_there else "", name) for name in names
-    }
-    for child in children.values():
+    with_checkpoint, without = (start(code, name, number=number, resumes=name == "agent_1") for name in NAMES[:2])
+    for child in (with_checkpoint, without):
         child.process.wait()
-    supervisor = Supervisor(tmp_path, {}, list(children.values()))
-    assert supervisor.over
-    assert supervisor.failures == []
-    children["recorder"].process.returncode = -9
-    assert supervisor.over == (still_there == "agent_1")
-    assert children["recorder"] in supervisor.failures
+    assert with_checkpoint.resumes == resumes
+    assert not without.resumes
 
 
-def test_status_is_read_in_pieces(tmp_path: Path) -> None:
-    supervisor = Supervisor(tmp_path, {})
-    reading, writing = os.pipe()
-    os.set_blocking(reading, False)
-    supervisor._status = (reading, writing)
-    for piece, steps in [
-        (b"", []),
-        (b"[1, -", []),
-        (b"1]\n[2", [1, -1]),
-        (b", 0]\n[3, 1]\n", [3, 1]),
-        (b"[4, 2]\n", [4, 2]),
-    ]:
-        os.write(writing, piece)
+@pytest.mark.parametrize(
+    ("killed", "over", "failed"),
+    [
+        (["agent_1"], True, []),
+        (["switcher"], True, []),
+        (["agent_1", "recorder"], True, ["recorder"]),
+        (["switcher", "recorder"], False, ["recorder", "switcher"]),
+    ],
+    ids=["an agent", "the switcher", "an agent and the recorder", "the switcher and the recorder"],
+)
+def test_who_is_killed_after_the_end_has_not_failed(
+    tmp_path: Path, start: Callable[..., Child], killed: list[str], over: bool, failed: list[str]
+) -> None:
+    """Except for the recorder, and only if the end is known: from the switcher, or from all the others."""
+    children = [start("import os; os.kill(os.getpid(), 9)" if name in killed else "", name) for name in NAMES]
+    for child in children:
+        child.process.wait()
+    supervisor = Supervisor(tmp_path, {}, children)
+    assert supervisor.over == over
+    assert [child.plan.name for child in supervisor.failures] == failed
+
+
+def test_a_status_line_may_come_in_pieces(tmp_path: Path) -> None:
+    """From a process that the supervisor has started: part of a line counts once the rest of it has come."""
+    (tmp_path / "msg_agents.py").write_text(REPORTER)
+    orders = tmp_path / "orders"
+    os.mkfifo(orders)
+    with Supervisor(tmp_path, os.environ | {"PYTHONPATH": str(tmp_path)}) as supervisor:
+        supervisor.start([ProcessPlan("switcher", ("switcher", str(orders)))])
+        (child,) = supervisor.children
         supervisor.read_status()
-        assert supervisor.steps == steps
-    os.close(writing)
-    supervisor.read_status()  # the switcher has gone
-    assert supervisor.steps == [4, 2]
-    os.close(reading)
+        assert supervisor.steps == []
+        with orders.open("w") as pieces:
+            for number, (piece, steps) in enumerate(
+                [
+                    ("[1, -", []),
+                    ("1]\n[2", [1, -1]),
+                    (", 0]\n[3, 1]\n", [3, 1]),
+                    ("[4, 2]", [3, 1]),
+                    ("\n", [4, 2]),
+                ],
+                start=1,
+            ):
+                print(json.dumps(piece), file=pieces, flush=True)
+                wait_for(lambda number=number: child.log.read_text().count("written") == number)
+                supervisor.read_status()
+                assert supervisor.steps == steps
+        assert child.process.wait() == 0
+        supervisor.read_status()  # the switcher has gone
+        assert supervisor.steps == [4, 2]
 
 
 @pytest.fixture
@@ -252,8 +281,7 @@ def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, run_file: Path,
             pids = [int(word) for word in parent.stdout.readline().split()]
             assert len(pids) == 3
             if not early:
-                wait_for(lambda: (tmp_path / "bag").exists())
-                time.sleep(1.0)
+                wait_for(lambda: (tmp_path / "bag").exists() and participants(domain) == 3)
             parent.kill()
         try:
             wait_for(lambda: all(gone(pid) for pid in pids), 10.0)
@@ -270,8 +298,7 @@ def test_real_nodes_end_in_order_when_told(tmp_path: Path, run_file: Path) -> No
     ]
     with free_domain() as domain, Supervisor(tmp_path, node_environment(domain)) as supervisor:
         supervisor.start(plans)
-        wait_for(lambda: (tmp_path / "bag").exists())
-        time.sleep(1.0)
+        wait_for(lambda: (tmp_path / "bag").exists() and participants(domain) == 2)
     # 3: their part was not done; nobody had to be killed, and the recorder has closed its bag.
     logs = {child.plan.name: child.log.read_text() for child in supervisor.children}
     assert [child.failure for child in supervisor.children] == ["exit code 3", "exit code 3"], logs

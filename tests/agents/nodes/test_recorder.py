@@ -1,0 +1,81 @@
+"""The recorder node, given its messages by hand."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+import rclpy
+
+from msg_agents.nodes.recorder import Recorder
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.ros_domain import free_domain
+from msg_agents.stepping.synchronizer import AGAIN, Refusal
+from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.twin.simulate import new_record
+from msg_analysis.wire.messages import StateCodec
+
+AGENTS, DT = 2, 0.05
+STEPS = 5 * AGAIN
+
+
+@pytest.fixture
+def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recorder]:
+    """A recorder that hears no other node."""
+    experiment = Experiment.parse(
+        {
+            "name": "pair",
+            "graphs": {"line": {"path": [1, 2]}},
+            "run": {"dt": DT, "duration": STEPS * DT, "start": "zero", "replicas": 1},
+        }
+    )
+    with free_domain() as domain:
+        for name, value in node_environment(domain).items():
+            monkeypatch.setenv(name, value)
+        rclpy.init()
+        node = Recorder(record=new_record(experiment), directory=tmp_path / "bag")
+        yield node
+        node.finish(complete=False, deadline=time.monotonic())
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def sizes(value: object) -> Iterator[int]:
+    """Of a container, and of all in it."""
+    if isinstance(value, dict | list | set | tuple):
+        yield len(value)
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from sizes(each)
+
+
+def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> None:
+    """It keeps 2 AGAIN steps per topic at most, however long the run, and the last AGAIN for what is sent again."""
+    receivers = {s.topic_name: s.callback for s in recorder.subscriptions if s.topic_name.endswith("/state")}
+    codecs = {f"/agent_{i}/state": StateCodec(recorder.run, i, 1, DT) for i in range(1, AGENTS + 1)}
+    assert set(receivers) == set(codecs)
+
+    def send(step: int) -> None:
+        for topic, codec in codecs.items():
+            receivers[topic](codec.wrap(step, min(step, 1), step.to_bytes(8, "little")))
+
+    most = 0
+    for step in range(STEPS):
+        send(step)
+        if step % 500 == 499:
+            most = max(most, *sizes(vars(recorder)))
+    assert AGAIN <= most <= 2 * AGAIN
+    newest = STEPS - 1
+    for step in range(newest - AGAIN + 1, newest + 1):
+        send(step)
+    send(newest - 2 * AGAIN)
+    send(STEPS)
+    recorder.finish(complete=False, deadline=time.monotonic())
+    assert recorder.bag.messages == AGENTS * (STEPS + 1)
+    assert recorder.repeated == AGENTS * AGAIN
+    assert recorder.refused == {(topic, Refusal.PAST): 1 for topic in codecs}
+    assert max(sizes(vars(recorder))) <= 2 * AGAIN
