@@ -64,7 +64,7 @@ def test_alone(network: Any, run_file: Path, command: tuple[str, ...], missing: 
     error = re.search(r"^error: after 3 s (.*) did not discover: (.*?)\. Are they running", stderr, re.MULTILINE)
     assert error, stderr
     assert error[2].split(", ") == missing
-    assert f"ROS_DOMAIN_ID ({domain})" in stderr
+    assert f"in ROS_DOMAIN_ID {domain} and" in stderr
     assert "Traceback" not in stderr
 
 
