@@ -1,6 +1,6 @@
 """Conducting a sweep: outcomes that are there are kept, the other jobs are done, and all are judged together.
 
-``workers`` decides where a job runs, ``point`` what is done in it.
+``jobs.workers`` decides where a job runs, ``jobs.evaluate`` what is done in it.
 """
 
 from __future__ import annotations

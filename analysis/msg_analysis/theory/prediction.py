@@ -245,9 +245,7 @@ def _steady(step: StepModel, run: StepModel, problem: str) -> tuple[MomentSolver
         if step.dt >= limit:
             _require_stability(solver)
     except InputError as error:
-        if step.dt < limit:
-            raise
-        if not limit:
+        if step.dt < limit or not limit:
             raise
         raise InputError(f"{error}; every dt below {limit:.4g} is stable, whatever the switching and delay") from error
     return solver, steady

@@ -14,7 +14,7 @@ from msg_analysis.types import FloatArray, IntArray
 class HeardRegression:
     """Score test: innovations do not depend on what the agents heard, with the weights it was used with.
 
-    As ``regression.StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as
+    As ``gain_regression.StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as
     published, and the covariance of the innovations is that of each step. In real time the agents make a step one after
     the other. With correlated noise, a value that is used may contain a part of the noise of the same step; so each
     innovation is first freed of what those made earlier in the step say about it (``position``, needed only then).

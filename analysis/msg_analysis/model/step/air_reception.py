@@ -1,4 +1,4 @@
-"""What all agents hear in a step with noise or loss on the air: the vectorised part of ``air``, for the twin."""
+"""What all agents hear in a step with noise or loss on the air: ``air`` for all at once, for the twin."""
 
 from __future__ import annotations
 
