@@ -178,13 +178,9 @@ def _ending(result: RunResult) -> dict[str, Any]:
     if result.comparison is None:
         return {"text": "The run has ended.", "verdict": None}
     verdict = result.comparison.verdict
-    words = {
-        "agrees": "The run has ended; it agrees with the prediction.",
-        "disagrees": "The run has ended; it disagrees with the prediction.",
-        "incomplete": "The run has ended; the data are incomplete.",
-        "unpredicted": "The run has ended; there is no prediction.",
-    }
-    return {"text": words[verdict], "verdict": verdict}
+    words = {"incomplete": "the data are incomplete", "unpredicted": "there is no prediction"}
+    outcome = words.get(verdict, f"it {verdict} with the prediction")
+    return {"text": f"The run has ended; {outcome}.", "verdict": verdict}
 
 
 def _show(result: RunResult, as_json: bool) -> None:

@@ -21,7 +21,7 @@ from msg_agents.running.run_folder import workshop
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, Supervisor
 from msg_agents.stepping.stall_detection import StallDetector
 from msg_agents.terminal.interruption import Interruption
-from msg_agents.watching.view import CallbackView, View
+from msg_agents.watching.view import View
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
@@ -150,7 +150,7 @@ def run_network(
     NotAvailableError, InputError
         the experiment cannot be run, or no domain is free; nothing was started, and no bag or log is left
     """
-    view = view or CallbackView(on_progress, on_note)
+    view = view or View(on_progress, on_note)
     experiment.require_available()
     count_processes(experiment, None if share is None else len(share.agents))
     if out is not None:

@@ -67,7 +67,6 @@ class Snapshot:
     steps: list[int]
     rates: list[float] = field(default_factory=list)  # steps per second, as ``steps``; empty where not known
     sojourn: Sojourn | None = None  # of the slowest agent's next step; None before the start
-    seconds: float = 0.0  # s since all agents were first seen to have a state
     left: float | None = None  # s until the end at the speed of the slowest agent; None where not known
     report: LiveReport | None = None  # the errors up to now
     note: str | None = None  # about the errors
@@ -89,16 +88,14 @@ class SnapshotSource:
     def __init__(self, experiment: Experiment) -> None:
         self._steps = experiment.steps
         self._sojourns, self._rates = SojournFinder(experiment), StepRates()
-        self._began: float | None = None
 
     def snapshot(self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None) -> Snapshot:
         """The snapshot now, from the newest step of every agent (-1: none; empty before the start)."""
         now = Snapshot(list(steps), report=report, note=note or (report.note if report else None))
         if now.reached < 0:
             return now
-        self._began = self._began or time.monotonic()
         self._rates.add(steps)
-        now = replace(now, rates=self._rates.rates(), seconds=time.monotonic() - self._began)
+        now = replace(now, rates=self._rates.rates())
         left = (self._steps - now.reached) / now.rate if now.rate > 0 else None
         return replace(now, left=left, sojourn=self._sojourns.at(min(now.reached, self._steps - 1)))
 
@@ -137,7 +134,6 @@ def snapshot_document(snapshot: Snapshot) -> dict[str, Any]:
         "steps": snapshot.steps if len(snapshot.steps) > 1 else [],
         "reached": snapshot.reached,
         "rate": snapshot.rate,
-        "seconds": snapshot.seconds,
         "left": snapshot.left,
         "graph": None if sojourn is None else sojourn.mode,
         "sojourn": None if sojourn is None else [sojourn.sequence + 1, sojourn.first_step, sojourn.last_step],

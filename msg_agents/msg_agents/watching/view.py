@@ -9,32 +9,22 @@ from msg_analysis.model.run.record import RunRecord
 
 
 class View:
-    """Takes what a run tells; this one shows nothing. The thread that runs the network calls all methods."""
+    """Follows a run; the thread that runs the network calls all methods. This one hands on steps and notes."""
+
+    def __init__(self, on_progress: Callable[[int], None], on_note: Callable[[str], None]) -> None:
+        self._on_progress, self._on_note = on_progress, on_note
 
     def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
         """The processes have been started; ``checkpoints``: directory of the agents' states, if they are kept here."""
 
     def look(self, steps: Sequence[int]) -> None:
         """The newest step of every agent (-1: none; empty before the start), about 20 times a second."""
-
-    def note(self, line: str) -> None:
-        """A line of text about a restart or stall."""
-
-    def end(self) -> None:
-        """The run is over; its processes may still be there."""
-
-
-class CallbackView(View):
-    """Calls functions with the step that every agent has reached, once all have started, and with the notes."""
-
-    def __init__(self, on_progress: Callable[[int], None], on_note: Callable[[str], None]) -> None:
-        self._on_progress, self._on_note = on_progress, on_note
-
-    def look(self, steps: Sequence[int]) -> None:
-        """See View."""
         if (reached := min(steps, default=-1)) >= 0:
             self._on_progress(reached)
 
     def note(self, line: str) -> None:
-        """See View."""
+        """A line of text about a restart or stall."""
         self._on_note(line)
+
+    def end(self) -> None:
+        """The run is over; its processes may still be there."""

@@ -41,7 +41,6 @@ def _snapshot(agents: int, **changes: object) -> Snapshot:
         "steps": [4000 + i % 7 for i in range(agents)],
         "rates": [500.0 + i for i in range(agents)],
         "sojourn": Sojourn(41, 1, 3990, 4010),
-        "seconds": 8.0,
         "left": 61.2,
         "report": _report(agents),
     }
