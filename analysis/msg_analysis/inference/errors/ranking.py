@@ -13,7 +13,6 @@ from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.types import FloatArray, IntArray
 
 MAX_PAIRS = 4950  # pairs tested, at most: 100 agents
-SHOWN = 12  # statements in words, at most
 EQUAL = 1e-9  # relative difference of predicted errors that counts as none
 
 
