@@ -95,7 +95,7 @@ def runs_of(example: int) -> list[Run]:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A measured certainty beside its prediction."""
+    """A measured certainty next to its prediction."""
 
     run: Run
     quantity: str  # SYSTEM, NODE or CENTRALITY

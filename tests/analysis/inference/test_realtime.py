@@ -249,7 +249,7 @@ def test_power_on_a_late_machine(late_timers, truth, found_by):
 def test_the_pattern_law_finds_a_wrong_gain_by_itself(late_timers):
     result = compare(late_timers.run(LONG, truth=other_gain(0.6), **lateness(late_timers)))
     assert result.laws.pattern.supported is False
-    assert "agents did something else" in result.laws.pattern.why
+    assert "an agent did not follow its law" in result.laws.pattern.why
 
 
 def test_what_is_said_to_be_used_but_was_not(late_timers):

@@ -170,7 +170,7 @@ def test_shipped_experiments_are_the_examples(
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_table(examples: dict[int, Example], number: int) -> None:
     example = examples[number]
-    lines = figures.csv_text(example).splitlines()
+    lines = paper.csv_text(example).splitlines()
     comments = [line for line in lines if line.startswith("# ")]
     assert lines[: len(comments)] == comments
     assert any("reconstructed" in line for line in comments) == (number != 1) == example.reconstructed

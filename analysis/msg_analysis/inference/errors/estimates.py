@@ -1,4 +1,4 @@
-"""Measured errors beside their expectations."""
+"""Measured errors next to their expectations."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from msg_analysis.types import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A measured error beside its prediction; None where a number is not available.
+    """A measured error next to its prediction; None where a number is not available.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ def beside(measured: FloatArray, predicted: FloatArray, errors: FloatArray) -> t
 
 
 def estimate(measured: float, predicted: float, error: float, scale: float) -> Estimate:
-    """A measured error beside its prediction; a standard error of rounding size, relative to ``scale``, gives no z."""
+    """A measured error next to its prediction; a standard error of rounding size, relative to ``scale``, gives no z."""
     if error <= 1e-12 * scale or error == 0.0:  # without noise: rounding only
         return Estimate(float(measured), float(predicted), float(error))
     z = float((measured - predicted) / error)

@@ -1,4 +1,4 @@
-"""A run beside its prediction: the input of every test."""
+"""A run next to its prediction: the input of every test."""
 
 from __future__ import annotations
 

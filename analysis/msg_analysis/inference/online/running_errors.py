@@ -1,4 +1,4 @@
-"""Errors of a network beside their prediction while it runs: the numbers of a comparison, one step at a time.
+"""Errors of a network next to their prediction while it runs: the numbers of a comparison, one step at a time.
 
 Measured are time means with the standard errors of ``errors.time_means``: of a complete run of up to ``EVERY_STEP``
 agents, both give the same. Only sums are kept. Per step, the system error takes O(m^2), and so do the node errors: with
@@ -47,7 +47,7 @@ class LiveReport:
 
 
 class LiveEstimate:
-    """The errors of a run beside their prediction, from the states as they arrive.
+    """The errors of a run next to their prediction, from the states as they arrive.
 
     In real time agents are at different steps at the same moment, and the expected errors depend on their timing: then
     there is no standard error, and the prediction is that of agents that are never late. ``nodes`` asks for standard

@@ -28,7 +28,7 @@ SUPPORT = {True: "supported", False: "not supported", None: "not decided"}
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """A law beside the log."""
+    """A law next to the log."""
 
     system_error: Estimate  # measured, and predicted by this law
     supported: bool | None  # whether the log supports it; None where that is not decided

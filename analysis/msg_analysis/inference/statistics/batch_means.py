@@ -13,7 +13,7 @@ BATCHES = 20
 def batch_interval(series: FloatArray, level: float = 0.95) -> tuple[float, float] | None:
     """95 % (by default) interval for the mean of a correlated stationary series, from 20 batch means and Student's t.
 
-    Its coverage is too low when the graphs switch slowly compared with a batch. It is reported beside the martingale
+    Its coverage is too low when the graphs switch slowly compared with a batch. It is reported next to the martingale
     interval as a model-free check.
 
     Parameters

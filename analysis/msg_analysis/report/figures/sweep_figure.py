@@ -85,7 +85,7 @@ def _mark_failures(axes: Axes, picture: Picture, labels: Sequence[str], numbers:
 
 
 def _legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[Any]) -> None:
-    """Above the axes: what lines and points mean; beside them: the colours of the series."""
+    """Above the axes: what lines and points mean; next to them: the colours of the series."""
     entries: list[tuple[Line2D, str]] = []
     if picture.measured:
         entries.append((Line2D([], [], color=DARK_GREY, marker="o", ls="", ms=4.5), "measured, 95 % interval"))

@@ -42,7 +42,7 @@ _POINTS = 200  # at most, on the line of an agent
 
 
 def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> UIElement:
-    """The running system error, of ``Comparison.running`` with (points,) each, beside the predicted one."""
+    """The running system error, of ``Comparison.running`` with (points,) each, next to the predicted one."""
     time, mean, error = running["time"], running["system_error"], running["standard_error"]
     centre = predicted if predicted is not None else mean[-1]
     low, high = centre - HALF_WIDTH_95 * error, centre + HALF_WIDTH_95 * error
@@ -66,7 +66,7 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
 
 
 def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
-    """Node errors with 95 % intervals beside the predicted ones; marked if p < ``level``; agents can be chosen."""
+    """Node errors with 95 % intervals next to the predicted ones; marked if p < ``level``; agents can be chosen."""
     agents = np.arange(1, len(nodes) + 1)
     measured, predicted, error = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
     apart = np.nan_to_num(_column(nodes, "p_holm"), nan=1.0) < level

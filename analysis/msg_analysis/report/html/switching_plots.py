@@ -66,7 +66,7 @@ def active_graph(
 
 
 def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> UIElement:
-    """Share of the time of every graph beside the stationary law (n,), in the order of ``active_graph``."""
+    """Share of the time of every graph next to the stationary law (n,), in the order of ``active_graph``."""
     present = modes[modes >= 0]
     share = np.bincount(present, minlength=len(names)) / max(len(present), 1)
     places = np.arange(len(names))
