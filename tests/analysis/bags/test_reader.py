@@ -270,10 +270,10 @@ def test_no_bag(tmp_path: Path, make_run: MakeRun) -> None:
     with pytest.raises(BagError, match="not a bag"):
         read_bag(tmp_path)
     (tmp_path / "empty.mcap").touch()
-    with pytest.raises(BagError, match="is empty"):
+    with pytest.raises(BagError, match="empty: nothing was recorded"):
         read_bag(tmp_path / "empty.mcap")
     (tmp_path / "text.mcap").write_text("name: line_ring")
-    with pytest.raises(BagError, match="no MCAP file"):
+    with pytest.raises(BagError, match="not an MCAP file"):
         read_bag(tmp_path / "text.mcap")
     with pytest.raises(BagError, match="latched topic `experiment` is missing"):
         read_bag(_mcap(tmp_path / "x.mcap", _messages(run)[1:]))
