@@ -20,6 +20,7 @@ from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record
 from msg_analysis.wire.messages import StateCodec
 
+pytestmark = pytest.mark.filterwarnings("ignore:module .sre_:DeprecationWarning")  # of a package that rclpy imports
 AGENTS, DT = 2, 0.05
 STEPS = 5 * AGAIN
 
