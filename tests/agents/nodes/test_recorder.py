@@ -15,14 +15,15 @@ import rclpy
 from msg_agents.nodes.recorder import Recorder
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.ros_domain import free_domain
-from msg_agents.stepping.synchronizer import AGAIN, Refusal
+from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.model.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record
 from msg_analysis.wire.messages import StateCodec
+from msg_analysis.wire.refusals import Refusal
 
 pytestmark = pytest.mark.filterwarnings("ignore:module .sre_:DeprecationWarning")  # of a package that rclpy imports
 AGENTS, DT = 2, 0.05
-STEPS = 5 * AGAIN
+STEPS = 5 * RESEND_LIMIT
 
 
 @pytest.fixture
@@ -55,7 +56,7 @@ def sizes(value: object) -> Iterator[int]:
 
 
 def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> None:
-    """It keeps 2 AGAIN steps per topic at most, however long the run, and the last AGAIN for what is sent again."""
+    """At most 2 RESEND_LIMIT steps per topic are kept, however long the run; the last RESEND_LIMIT are recognised again."""
     receivers = {s.topic_name: s.callback for s in recorder.subscriptions if s.topic_name.endswith("/state")}
     codecs = {f"/agent_{i}/state": StateCodec(recorder.run, i, 1, DT) for i in range(1, AGENTS + 1)}
     assert set(receivers) == set(codecs)
@@ -69,14 +70,14 @@ def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> 
         send(step)
         if step % 500 == 499:
             most = max(most, *sizes(vars(recorder)))
-    assert AGAIN <= most <= 2 * AGAIN
+    assert RESEND_LIMIT <= most <= 2 * RESEND_LIMIT
     newest = STEPS - 1
-    for step in range(newest - AGAIN + 1, newest + 1):
+    for step in range(newest - RESEND_LIMIT + 1, newest + 1):
         send(step)
-    send(newest - 2 * AGAIN)
+    send(newest - 2 * RESEND_LIMIT)
     send(STEPS)
     recorder.finish(complete=False, deadline=time.monotonic())
     assert recorder.bag.messages == AGENTS * (STEPS + 1)
-    assert recorder.repeated == AGENTS * AGAIN
-    assert recorder.refused == {(topic, Refusal.PAST): 1 for topic in codecs}
-    assert max(sizes(vars(recorder))) <= 2 * AGAIN
+    assert recorder.repeated == AGENTS * RESEND_LIMIT
+    assert recorder.refused == {(topic, Refusal.TOO_OLD): 1 for topic in codecs}
+    assert max(sizes(vars(recorder))) <= 2 * RESEND_LIMIT
