@@ -56,7 +56,7 @@ def sizes(value: object) -> Iterator[int]:
 
 
 def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> None:
-    """At most 2 RESEND_LIMIT steps per topic are kept, however long the run; the last RESEND_LIMIT are recognised again."""
+    """At most 2 RESEND_LIMIT steps per topic are kept, however long the run; the last RESEND_LIMIT are recognised."""
     receivers = {s.topic_name: s.callback for s in recorder.subscriptions if s.topic_name.endswith("/state")}
     codecs = {f"/agent_{i}/state": StateCodec(recorder.run, i, 1, DT) for i in range(1, AGENTS + 1)}
     assert set(receivers) == set(codecs)
