@@ -267,7 +267,7 @@ def test_salvage_of_nothing(bag: Path, tmp_path: Path) -> None:
     (mcap,) = bag.glob("*.mcap")
     head = tmp_path / "head.mcap"
     head.write_bytes(mcap.read_bytes()[:3000])
-    for path, reason in ((head, "no whole message"), (tmp_path / "nope", "not found"), (LINE_RING, "no MCAP file")):
+    for path, reason in ((head, "no whole message"), (tmp_path / "nope", "not found"), (LINE_RING, "not an MCAP file")):
         result = call("salvage", path, tmp_path / "out")
         assert (result.exit_code, result.stdout) == (2, "")
         assert reason in result.stderr
