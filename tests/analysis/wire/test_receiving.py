@@ -21,7 +21,8 @@ RECORD = new_record(
             "graphs": {"line": {"path": [1, 2]}},
             "run": {"dt": 0.1, "duration": 1, "start": "zero", "replicas": 2},
         }
-    )
+    ),
+    uuid.UUID(int=4),
 )
 RUN, OTHER = RECORD.run.bytes, uuid.UUID(int=5).bytes
 
@@ -47,6 +48,7 @@ def state(**changes: Any) -> bytes:
         (state(state=np.array([1, np.nan])), Refusal.NOT_FINITE),
         (state(step=9), "of the receiver"),
     ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_refused_states(data: bytes, reason: str) -> None:
     taken, refused = [], []
