@@ -27,7 +27,7 @@ import msg_analysis
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.inference.verdict.comparison import Comparison
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.sweep.jobs.workers import Lost, Workers
 from msg_analysis.twin.simulate import new_record, simulate
@@ -124,12 +124,12 @@ FALSE: dict[str, tuple[Mapping[str, Any], tuple[str, int | None, list[int] | Non
 
 
 @functools.cache
-def experiment(case: str) -> tuple[Experiment, Experiment]:
+def experiment(case: str) -> tuple[ValidExperiment, ValidExperiment]:
     """What is run, and what the record claims."""
     if case in TRUE:
-        true = Experiment.parse(TRUE[case])
+        true = ValidExperiment.parse(TRUE[case])
         return true, true
-    return Experiment.parse(FALSE[case][0]), Experiment.parse(line_ring(**LONG))
+    return ValidExperiment.parse(FALSE[case][0]), ValidExperiment.parse(line_ring(**LONG))
 
 
 def one_run(job: tuple[str, int], _stopping: Callable[[], bool]) -> dict[str, Any]:

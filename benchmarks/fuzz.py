@@ -32,7 +32,7 @@ from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import InputError
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment import memory
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.report.documents.info import describe_bag, describe_experiment
 
 ROOT = Path(__file__).parents[1]
@@ -107,11 +107,11 @@ def fuzz_experiment(seed: int, files: list[Path], folder: Path) -> str:
         data += b"\n" + BOMB.encode()
     target.write_bytes(data)
     try:
-        experiment = Experiment.load(target)
+        experiment = ValidExperiment.load(target)
         experiment.unavailable()
         if max(experiment.agents, experiment.chain.modes) <= SMALL:
             describe_experiment(experiment)
-            assert Experiment.parse(experiment.to_document()).to_document() == experiment.to_document()
+            assert ValidExperiment.parse(experiment.to_document()).to_document() == experiment.to_document()
     except InputError as error:
         _check_words(error)
         return "refused"

@@ -23,7 +23,7 @@ from msg_analysis.bags import writer
 from msg_analysis.bags.format.mcap_file import MAGIC
 from msg_analysis.bags.format.storage_options import COMPRESSIONS, Storage
 from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
 from msg_analysis.wire.messages import decode_string, encode_string
 
@@ -50,7 +50,7 @@ def make_bags(directory: Path) -> list[Path]:
     }
     bags = []
     for name, document in kinds.items():
-        trajectory = simulate(Experiment.parse(document))
+        trajectory = simulate(ValidExperiment.parse(document))
         for compression in COMPRESSIONS:
             bags.append(directory / f"{name}_{compression}")
             split = 12_000 if compression == "zstd" else None

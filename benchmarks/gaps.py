@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from msg_analysis.inference.online.running_errors import RunningErrors
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -29,7 +29,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=400)
     runs = parser.parse_args().runs
-    experiment = Experiment.parse(EXPERIMENT)
+    experiment = ValidExperiment.parse(EXPERIMENT)
     prediction, steps = predict(experiment), np.arange(experiment.steps)
     chance = np.random.default_rng(1)
     kept = {

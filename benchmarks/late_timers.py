@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.model.step.phases import phases
@@ -34,7 +34,7 @@ def busy(share: float, mean: float) -> Lateness:
 
 
 def run(
-    experiment: Experiment,
+    experiment: ValidExperiment,
     *,
     late: Lateness = never,
     slow: Lateness = never,

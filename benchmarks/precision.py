@@ -16,7 +16,7 @@ from pathlib import Path
 
 from msg_agents.running.runner import run_network
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
 
 EXPERIMENT = Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml"
@@ -27,11 +27,11 @@ MARGIN = 1.1
 """In length. The standard error is an estimate too: in runs of this length it comes out a few per cent up or down."""
 
 
-def with_run(**changes: object) -> Experiment:
+def with_run(**changes: object) -> ValidExperiment:
     """The demo experiment with another ``run`` section."""
-    document = Experiment.load(EXPERIMENT).to_document()
+    document = ValidExperiment.load(EXPERIMENT).to_document()
     document["run"] |= changes
-    return Experiment.parse(document)
+    return ValidExperiment.parse(document)
 
 
 def length_needed(replicas: int) -> float:

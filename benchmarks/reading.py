@@ -56,13 +56,13 @@ class Stopwatch:
 def make_bag(directory: Path, states: int, replicas: int) -> None:
     """A bag with at least so many states."""
     from msg_analysis.bags.trajectory_writer import write_trajectory
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
     from msg_analysis.twin.simulate import simulate
 
-    document = Experiment.load(EXPERIMENT).to_document()
+    document = ValidExperiment.load(EXPERIMENT).to_document()
     steps = -(-states // len(TOPICS)) - 1
     document["run"] |= {"duration": round(steps * document["run"]["dt"], 6), "replicas": replicas}
-    write_trajectory(simulate(Experiment.parse(document)), directory)
+    write_trajectory(simulate(ValidExperiment.parse(document)), directory)
 
 
 def without_chunks(directory: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from msg_analysis.bags.format.storage_options import COMPRESSIONS, Storage
 from msg_analysis.bags.writer import BagWriter
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
 from msg_analysis.wire.messages import StateCodec, stamp_ns
 from msg_analysis.wire.topics import network_topics
@@ -28,7 +28,7 @@ def messages(replicas: int) -> list[tuple[str, bytes, int]]:
         "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
         "run": {"dt": 0.05, "duration": 200.0, "replicas": replicas},
     }
-    run = simulate(Experiment.parse(experiment))
+    run = simulate(ValidExperiment.parse(experiment))
     codecs = [StateCodec(run.record.run.bytes, i + 1, replicas, 0.05) for i in range(5)]
     found = []
     for k, states in enumerate(run.states):

@@ -51,7 +51,7 @@ __all__ = [
 ]
 
 
-class Experiment(model.Experiment):
+class Experiment(model.ValidExperiment):
     """A Markov-switching network and one run of it.
 
     Make one with :meth:`load` (a file) or :meth:`parse` (a dictionary); :meth:`with_run` changes its run.
@@ -60,7 +60,7 @@ class Experiment(model.Experiment):
     __slots__ = ()
 
     @classmethod
-    def of(cls, experiment: model.Experiment) -> Self:
+    def of(cls, experiment: model.ValidExperiment) -> Self:
         """The same experiment with the methods of this class.
 
         Parameters

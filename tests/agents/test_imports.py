@@ -106,7 +106,7 @@ def test_processes_of_a_run_import_little(process: str) -> None:
 def test_parsing_an_experiment_imports_little() -> None:
     code = (
         "import sys\n"
-        "from msg_analysis.model.experiment.experiment import Experiment\n"
+        "from msg_analysis.model.experiment.experiment import ValidExperiment\n"
         "from msg_analysis.model.step.step_model import build_model\n"
         "document = {'name': 'two', 'graphs': {'pair': {'path': [1, 2]}, 'grid': {'grid': [1, 2]}},\n"
         "            'switching': {'generator': [[-1, 1], [1, -1]]}}\n"

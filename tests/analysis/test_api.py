@@ -13,7 +13,7 @@ import pytest
 
 import msg_analysis
 from msg_analysis import BagError, Experiment, ExperimentError, InputError, Run, compare, read_bag, write_report
-from msg_analysis.model.experiment.experiment import Experiment as ModelExperiment
+from msg_analysis.model.experiment.experiment import ValidExperiment as ModelExperiment
 
 ROOT = Path(__file__).parents[2]
 LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"
@@ -133,7 +133,7 @@ def test_transient(experiment: Experiment) -> None:
         np.testing.assert_allclose(course.times, times)
         np.testing.assert_allclose(course.system_error, GOLDEN[law]["system_error"], rtol=1e-6)
         assert course.node_errors.shape == (3, 5)
-    with pytest.raises(InputError, match="no whole number of steps"):
+    with pytest.raises(InputError, match="not a multiple of the step"):
         experiment.transient([0.01])
 
 

@@ -348,7 +348,7 @@ def test_there_is_something_to_look_at() -> None:
     "path",
     [
         "msg_analysis.api.Experiment",  # exported
-        "msg_analysis.model.experiment.experiment.Experiment",  # its base
+        "msg_analysis.model.experiment.experiment.ValidExperiment",  # its base
         "msg_analysis.errors.BagError",  # exported, and in a module that docs/api.md names
     ],
 )

@@ -17,7 +17,7 @@ from pages import EXPERIMENTS, PAGES, ROOT, Shown, blocks, console, experiments,
 
 from msg_agents.cli.main import main as agents
 from msg_analysis.cli.main import main as analysis
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 
 PROGRAMS: dict[str, click.Group] = {"msg-agents": agents, "msg-analysis": analysis}
 NEEDS_NETWORK = ("msg-agents check", "msg-analysis compare runs/loud")  # shown by tests/integration/test_docs.py
@@ -32,7 +32,7 @@ def name(page: Path) -> str:
 def test_experiments_are_valid(page: Path) -> None:
     for text in experiments(page).values():
         if "protocol: {name: median" not in text:  # made by its reader; tests/analysis/model/test_protocols.py does so
-            Experiment.parse(yaml.safe_load(text))
+            ValidExperiment.parse(yaml.safe_load(text))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -112,7 +112,7 @@ def printed(command: str, exit_code: int = 0) -> str:
 def by_the_twin(command: str) -> str:
     """What ``msg-agents run FILE`` prints: its bag equals the twin's to the last bit, which other tests prove."""
     file = next(word for word in shlex.split(command) if word.endswith(".yaml"))
-    return compared(json.dumps(Experiment.load(file).to_document()))
+    return compared(json.dumps(ValidExperiment.load(file).to_document()))
 
 
 @functools.cache

@@ -32,7 +32,7 @@ from msg_agents.running.run_folder import PREFIX
 from msg_agents.running.runner import RunResult, run_network
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
@@ -178,9 +178,9 @@ class Network:
         )
 
     @staticmethod
-    def experiment(**changes: Any) -> Experiment:
+    def experiment(**changes: Any) -> ValidExperiment:
         """See ``document``."""
-        return Experiment.parse(document(**changes))
+        return ValidExperiment.parse(document(**changes))
 
     def file(self, name: str = "net.yaml", **changes: Any) -> Path:
         """An experiment file."""
@@ -188,7 +188,7 @@ class Network:
         path.write_text(yaml.safe_dump(document(**changes)))
         return path
 
-    def run(self, what: Experiment, out: str = "runs", **options: Any) -> RunResult:
+    def run(self, what: ValidExperiment, out: str = "runs", **options: Any) -> RunResult:
         """A whole run from this process, without comparison and report."""
         return run_network(what, self.directory / out, **options)
 

@@ -14,7 +14,7 @@ import yaml
 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
@@ -34,7 +34,7 @@ class Broken(Protocol):
 )
 def test_examples(network: Any, name: str, processes: int | str) -> None:
     """The verdict of a linear one is a test at level 0.01; the seeds of the examples are among the 99 %."""
-    what = Experiment.load(EXPERIMENTS / f"{name}.yaml")
+    what = ValidExperiment.load(EXPERIMENTS / f"{name}.yaml")
     result = network.run(what.with_run(duration=600 * what.step_length, processes=processes))
     assert result.failures == []
     trajectory = result.trajectory

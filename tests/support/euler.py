@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.protocol import Heard, LinearProtocol, Protocol
 from msg_analysis.types import FloatArray
 
@@ -26,8 +26,8 @@ def document(protocol: dict[str, Any] | None, **changes: Any) -> dict[str, Any]:
     }
 
 
-def experiment(protocol: dict[str, Any] | None, **changes: Any) -> Experiment:
-    return Experiment.parse(document(protocol, **changes))
+def experiment(protocol: dict[str, Any] | None, **changes: Any) -> ValidExperiment:
+    return ValidExperiment.parse(document(protocol, **changes))
 
 
 class Euler(LinearProtocol):

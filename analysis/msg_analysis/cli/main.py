@@ -215,14 +215,14 @@ def figures(
 @json_option
 def info(source: Path, as_json: bool) -> None:
     """Describe an experiment file, or the contents of a bag."""
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
     from msg_analysis.report.documents.info import describe_bag, describe_experiment
     from msg_analysis.report.terminal import bag_text, experiment_text
 
     if source.is_dir() or ".mcap" in source.suffixes:
         document, show = describe_bag(source), bag_text.print_bag
     else:
-        document, show = describe_experiment(Experiment.load(source)), experiment_text.print_experiment
+        document, show = describe_experiment(ValidExperiment.load(source)), experiment_text.print_experiment
     if as_json:
         print_json(document)
     else:

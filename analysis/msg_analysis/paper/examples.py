@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import scipy.optimize
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.model.network.markov_chain import MarkovChain
 from msg_analysis.theory.leaders.selection import LeaderProblem
@@ -106,15 +106,15 @@ class _Network:
     """Graphs that are checked once, then used with many chains."""
 
     name: str
-    base: Experiment
+    base: ValidExperiment
     generator: Generator
 
     @classmethod
     def of(cls, name: str, graphs: dict[str, Any], generator: Generator) -> _Network:
         document = {"name": name, "graphs": graphs, "switching": {"generator": generator(1.0, 1.0, 1.0).tolist()}}
-        return cls(name, Experiment.parse(document, source=name), generator)
+        return cls(name, ValidExperiment.parse(document, source=name), generator)
 
-    def at(self, epsilon: float, r12: float, r21: float) -> Experiment:
+    def at(self, epsilon: float, r12: float, r21: float) -> ValidExperiment:
         chain = MarkovChain("continuous", self.generator(epsilon, r12, r21))
         return dataclasses.replace(self.base, chain=chain)
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show, translate
 from msg_analysis.model.experiment.yaml_document import read_yaml
 from msg_analysis.sweep.dotted_keys import KeyProblemError, put
@@ -124,7 +124,7 @@ def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path,
         try:
             for key, value in values.items():
                 document = put(document, key, value)
-            experiment = Experiment.parse(document, source=str(path), directory=directory)
+            experiment = ValidExperiment.parse(document, source=str(path), directory=directory)
             lines = experiment.unavailable("predict" if spec.kind == "predict" else "run")
         except KeyProblemError as error:
             lines = [str(error)]
@@ -141,7 +141,7 @@ def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path,
     return Sweep(path.stem, spec, name, tuple(points))
 
 
-def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: Experiment) -> Iterator[Point]:
+def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: ValidExperiment) -> Iterator[Point]:
     document = experiment.to_document()
     if spec.kind == "predict":
         yield Point(values, None, None, Job.of("predict", document))

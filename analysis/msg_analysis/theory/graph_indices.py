@@ -46,7 +46,10 @@ class GraphIndices:
 
 
 def algebraic_connectivity(graph: Graph) -> float:
-    """Second smallest real part of the Laplacian's eigenvalues, at least 0: the rate of agreement under this graph."""
+    """Second smallest real part of the Laplacian's eigenvalues, at least 0: the rate of agreement under this graph.
+
+    Fiedler, Czechoslovak Mathematical Journal 1973.
+    """
     laplacian = graph.laplacian
     values = np.linalg.eigvalsh(laplacian) if graph.symmetric else np.linalg.eigvals(laplacian)
     return max(float(np.sort(values.real)[1]), 0.0)

@@ -28,7 +28,7 @@ from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
 ERROR_ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding
@@ -135,7 +135,7 @@ class Prediction:
         the air, loss or delay
     """
 
-    experiment: Experiment
+    experiment: ValidExperiment
     step: StepModel
     solver: MomentSolver
     steady: FloatArray
@@ -192,7 +192,7 @@ class Prediction:
         return document
 
 
-def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction:
+def predict(experiment: ValidExperiment, step: StepModel | None = None) -> Prediction:
     """Steady-state prediction of an experiment (Propositions 2 and 3 of the paper, 7 and 8 in discrete time).
 
     Parameters
@@ -221,7 +221,7 @@ def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction
     return Prediction(experiment, step, solver, steady, emulated, continuous, paper)
 
 
-def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
+def stationary_start_factor(experiment: ValidExperiment, mode: int) -> FloatArray:
     """(m, m) square root S of the law of x(0) given g(0) = mode in the steady state: S S^T = C_g0 / pi_g0.
 
     C are the steady second moments of the experiment's steps, in real time those of the sequential law. S is the
@@ -294,7 +294,7 @@ def _static(system: JumpSystem) -> Moments | None:
     return Moments(covariance)
 
 
-def _holds_together(experiment: Experiment, mode: int) -> bool:
+def _holds_together(experiment: ValidExperiment, mode: int) -> bool:
     """Whether one graph held fixed bounds the errors: one agent, or the reference, reaches all others."""
     graph = experiment.graph_list[mode]
     digraph: nx.DiGraph = nx.DiGraph()

@@ -23,7 +23,7 @@ from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 TransientLaw = Literal["emulated", "continuous"]
 
@@ -107,7 +107,7 @@ def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | Non
     return Snapshot(law, np.multiply.outer(law, y), np.multiply.outer(law, np.outer(y, y)))
 
 
-def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
+def start_of(experiment: ValidExperiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
     """The start that ``run.start`` and ``switching.initial`` define, for one of the experiment's laws.
 
     ``stationary``: (n, d, d) second moments for ``run.start: stationary``.
@@ -134,7 +134,7 @@ class SolvedTransient:
 
 
 def solve_transient(
-    experiment: Experiment,
+    experiment: ValidExperiment,
     times: FloatArray,  # (T,) ascending [units of simulated time]
     *,
     law: TransientLaw = "emulated",
@@ -159,7 +159,7 @@ def solve_transient(
     return SolvedTransient(transient(whole, start, _steps(times, unit)), system, steady, unit)
 
 
-def unreduced_consensus(experiment: Experiment) -> JumpSystem:
+def unreduced_consensus(experiment: ValidExperiment) -> JumpSystem:
     """Consensus in continuous time with the mean of the agents included: its second moments grow without bound.
 
     Proposition 1 of the paper with Z_i = L_i. In steps, ``systems.emulated(step, "tracking")`` reduces nothing either.
@@ -311,7 +311,7 @@ def _check_times(system: JumpSystem, times: FloatArray) -> None:
         )
 
 
-def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, float | None]:
+def _system(experiment: ValidExperiment, law: TransientLaw) -> tuple[JumpSystem, float | None]:
     """The reduced system of a law, and the time of a step (None in continuous time)."""
     if law == "emulated":
         return systems.emulated(build_run_model(experiment), experiment.problem), experiment.step_length

@@ -8,7 +8,7 @@ import numpy as np
 
 from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.arithmetic.update_law import step
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.step.air_reception import padded_inputs
 from msg_analysis.model.step.phases import phases
 from msg_analysis.model.step.sequential_law import ideal_uses
@@ -19,7 +19,7 @@ from msg_analysis.types import FloatArray, IntArray
 class IdealTimers:
     """A run in real time in which every agent steps when it is due, and hears at once what others made."""
 
-    def __init__(self, experiment: Experiment, model: StepModel) -> None:
+    def __init__(self, experiment: ValidExperiment, model: StepModel) -> None:
         self._phase = phases(experiment)
         self._dt = experiment.step_length
         self._model = model

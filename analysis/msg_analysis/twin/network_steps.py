@@ -8,7 +8,7 @@ import numpy as np
 
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.arithmetic.update_law import step
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.step.air_reception import AirReception, padded_inputs
 from msg_analysis.model.step.process_noise import ProcessNoise
 from msg_analysis.model.step.step_model import StepModel
@@ -17,7 +17,7 @@ from msg_analysis.types import FloatArray, IntArray
 
 
 def states(
-    experiment: Experiment,
+    experiment: ValidExperiment,
     model: StepModel,
     modes: IntArray,
     start: FloatArray,
@@ -36,7 +36,7 @@ def states(
     return _synchronous(model, modes, start, drives, reception, first)
 
 
-def _drives(experiment: Experiment, model: StepModel, modes: IntArray, first: int) -> Iterator[FloatArray]:
+def _drives(experiment: ValidExperiment, model: StepModel, modes: IntArray, first: int) -> Iterator[FloatArray]:
     """For every step of a path of graphs, (m, R): the noise of all agents, plus what the reference adds."""
     noise = ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas)
     offsets = [offset[:, None] for offset in model.offsets]

@@ -7,7 +7,7 @@ import uuid
 import numpy as np
 
 from msg_analysis.model.arithmetic.payload import from_payload
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.protocol_binding import AgentProtocol
 from msg_analysis.model.run.agent_law import ProtocolLaw
 from msg_analysis.model.run.graph_path import mode_path
@@ -22,7 +22,7 @@ from msg_analysis.twin.start import draw_start
 from msg_analysis.types import BoolArray
 
 
-def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecord:
+def new_record(experiment: ValidExperiment, run: uuid.UUID | None = None) -> RunRecord:
     """Everything that a new run of an experiment starts from; ``run``: its id, a new random one if not given."""
     model = build_model(experiment)
     modes = mode_path(experiment, model.initial)
@@ -35,7 +35,7 @@ def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecor
     return RunRecord(run or uuid.uuid4(), experiment, start, matrices=matrices)
 
 
-def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Trajectory:
+def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) -> Trajectory:
     """Run an experiment without ROS, or repeat the run of a record (then its experiment is used); see ``api``.
 
     The states equal those of a network run to the last bit: in lockstep, or with ideal timers and no delay.

@@ -12,7 +12,7 @@ import numpy as np
 
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.model.arithmetic.update_law import weighted_sum
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.graph_path import past_modes
 from msg_analysis.model.step.step_model import StepModel, Wiring
 from msg_analysis.twin.network_steps import states
@@ -29,7 +29,7 @@ GRID = 2.0**-12
 """Unit of x(0), in standard deviations, where the past would be longer: far more than processors differ by."""
 
 
-def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatArray:
+def draw_start(experiment: ValidExperiment, model: Wiring, first_mode: int) -> FloatArray:
     """(m, replicas) x(0): zero, the given values, or drawn from the stationary law given g(0) = ``first_mode``."""
     replicas = experiment.run.replicas
     start = experiment.run.start
@@ -42,7 +42,7 @@ def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatA
     return _gaussian(experiment, first_mode) if found is None else found
 
 
-def _from_the_past(experiment: Experiment, model: StepModel, first_mode: int) -> FloatArray | None:
+def _from_the_past(experiment: ValidExperiment, model: StepModel, first_mode: int) -> FloatArray | None:
     """x(0) at the end of a past that is long enough; None where that would take too long."""
     size = experiment.agents * experiment.run.replicas
     steps, before = STEPS_PER_BLOCK, None
@@ -54,7 +54,9 @@ def _from_the_past(experiment: Experiment, model: StepModel, first_mode: int) ->
     return None
 
 
-def _end_of_the_past(experiment: Experiment, model: StepModel, first_mode: int, steps: int) -> tuple[FloatArray, float]:
+def _end_of_the_past(
+    experiment: ValidExperiment, model: StepModel, first_mode: int, steps: int
+) -> tuple[FloatArray, float]:
     """x(0) of a past of so many steps that begins at the reference, and the size of its rounding errors.
 
     In consensus only differences between agents are stationary: their average is put to 0.
@@ -74,7 +76,7 @@ def _same(change: FloatArray, size: FloatArray, floor: float) -> bool:
     return bool((changes <= TOLERANCE * np.maximum(sizes, TOLERANCE * sizes.max()) + floor).all())
 
 
-def _gaussian(experiment: Experiment, first_mode: int) -> FloatArray:
+def _gaussian(experiment: ValidExperiment, first_mode: int) -> FloatArray:
     """x(0) with the second moments of the stationary law, rounded so that processors agree."""
     from msg_analysis.theory.prediction import stationary_start_factor  # here, since it is seldom needed
 

@@ -248,10 +248,10 @@ def _newest_bag(directory: Path) -> Path:
 @experiment_argument
 def prepare(experiment: Path) -> None:
     """Print the run record of a new run of EXPERIMENT: the file with which single nodes are started."""
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
     from msg_analysis.twin.simulate import new_record
 
-    what = Experiment.load(experiment)
+    what = ValidExperiment.load(experiment)
     what.require_available()
     click.echo(new_record(what).to_json())
 

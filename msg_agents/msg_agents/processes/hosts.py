@@ -25,7 +25,7 @@ from msg_agents.processes.environment import (
 )
 from msg_agents.processes.process_plan import Share, wanted_processes
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show, translate
 from msg_analysis.model.experiment.spec import expected
 from msg_analysis.model.experiment.yaml_document import read_yaml
@@ -92,12 +92,12 @@ class Hosts:
     agents: dict[str, tuple[int, ...]]  # indices from 0, ascending, by host
 
     @classmethod
-    def load(cls, path: Path, experiment: Experiment) -> Hosts:
+    def load(cls, path: Path, experiment: ValidExperiment) -> Hosts:
         """Read a hosts file (YAML); InputError if it cannot be read or does not fit the experiment."""
         return cls.parse(read_yaml(path), experiment, source=str(path))
 
     @classmethod
-    def parse(cls, document: Any, experiment: Experiment, source: str = "hosts") -> Hosts:
+    def parse(cls, document: Any, experiment: ValidExperiment, source: str = "hosts") -> Hosts:
         """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
         if not isinstance(document, dict):
             raise ExperimentError(
@@ -142,12 +142,12 @@ class Hosts:
             raise InputError(f"--name: {name}: has no agents and is not the recorder: there is nothing to run on it")
         return Share(self.agents[name], name == self.recorder, discovery_timeout, patience)
 
-    def participants(self, experiment: Experiment) -> int:
+    def participants(self, experiment: ValidExperiment) -> int:
         """How many participants to look for on each host: more than run on any."""
         most = max(wanted_processes(experiment, len(agents)) for agents in self.agents.values())
         return min(most + 2 + VISITORS, MOST_PARTICIPANTS)
 
-    def profile(self, experiment: Experiment) -> str:
+    def profile(self, experiment: ValidExperiment) -> str:
         """The Fast DDS profile with which the processes of all hosts find each other."""
         ET.register_namespace("", _NAMESPACE)
         tree = ET.parse(LOOPBACK_PROFILE)  # drops its comments, which are about another profile
@@ -171,7 +171,7 @@ class Hosts:
         ET.indent(tree, "  ")
         return ET.tostring(tree.getroot(), encoding="unicode", xml_declaration=True) + "\n"
 
-    def environment(self, experiment: Experiment, folder: Path) -> dict[str, str]:
+    def environment(self, experiment: ValidExperiment, folder: Path) -> dict[str, str]:
         """Environment of the processes, with the profile written to ``folder``; the user's own profile is kept."""
         profile = folder / "hosts.xml"
         profile.write_text(self.profile(experiment), encoding="utf-8")

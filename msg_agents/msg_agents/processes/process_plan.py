@@ -10,7 +10,7 @@ from pathlib import Path
 from msg_agents.processes.environment import DISCOVERY_TIMEOUT
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, MEGABYTE, Storage
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 
 RECORDER, SWITCHER = "recorder", "switcher"
 SMALL = 8
@@ -41,13 +41,13 @@ class Share:
     patience: float  # s that companions may be gone before a node ends itself
 
 
-def wanted_processes(experiment: Experiment, agents: int) -> int:
+def wanted_processes(experiment: ValidExperiment, agents: int) -> int:
     """Most processes that an experiment may have for so many agents, on a machine of any number of cores."""
     wanted = experiment.run.processes
     return min(agents, wanted) if isinstance(wanted, int) else agents
 
 
-def count_processes(experiment: Experiment, agents: int | None = None) -> int:
+def count_processes(experiment: ValidExperiment, agents: int | None = None) -> int:
     """Number of processes for ``agents`` agents (None: all) on this machine; InputError: too many for discovery."""
     agents = experiment.agents if agents is None else agents
     wanted, count = experiment.run.processes, wanted_processes(experiment, agents)
@@ -71,7 +71,7 @@ def discovery_timeout(agents: int, processes: int) -> float:
 
 
 def plan_network(
-    experiment: Experiment,
+    experiment: ValidExperiment,
     run_file: Path,  # run record, read by every node
     bag: Path | None,  # directory to record to; None: no recorder
     checkpoints: Path | None = None,  # directory of the states for a takeover; None: killed processes cannot resume

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.yaml_document import read_yaml
 
 
-def load_with_overrides(path: Path, run: Mapping[str, Any]) -> Experiment:
+def load_with_overrides(path: Path, run: Mapping[str, Any]) -> ValidExperiment:
     """The experiment, checked once, after values of ``run`` were replaced; None replaces nothing.
 
     ``processes`` may be a number as text.
@@ -21,4 +21,4 @@ def load_with_overrides(path: Path, run: Mapping[str, Any]) -> Experiment:
     document = read_yaml(path)
     if isinstance(document, dict) and isinstance(section := document.get("run", {}), dict):
         document["run"] = section | changes
-    return Experiment.parse(document, source=str(path), directory=path.parent)
+    return ValidExperiment.parse(document, source=str(path), directory=path.parent)

@@ -20,7 +20,7 @@ from msg_agents.running.runner import REPORT_FILE, make_bag_directory
 from msg_agents.running.supervisor import failure_of
 from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import new_record
 
 TRUE, FALSE = {"true", "1", "yes", "on"}, {"false", "0", "no", "off"}
@@ -80,7 +80,7 @@ def find_experiment(name: str, share: Path) -> Path:
     raise InputError(f"experiment: {name}: expected a file, or one of {known}")
 
 
-def load_experiment(arguments: Mapping[str, str], share: Path) -> Experiment:
+def load_experiment(arguments: Mapping[str, str], share: Path) -> ValidExperiment:
     """The experiment with the changes of the launch arguments; InputError if it is wrong or cannot be run."""
     changes: dict[str, Any] = {}
     for name, kind in (("seed", int), ("duration", float), ("speed", float)):

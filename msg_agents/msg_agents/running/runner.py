@@ -27,7 +27,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.writer import RECORDING_MARKER
 from msg_analysis.errors import BagError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.simulate import new_record
@@ -77,7 +77,7 @@ class RunResult:
     comparison: Comparison | None = None
 
 
-def make_bag_directory(experiment: Experiment, out: Path) -> Path:
+def make_bag_directory(experiment: ValidExperiment, out: Path) -> Path:
     """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name."""
     stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
     candidate, number = out / stem, 2
@@ -90,7 +90,7 @@ def make_bag_directory(experiment: Experiment, out: Path) -> Path:
 
 
 def run_network(
-    experiment: Experiment,
+    experiment: ValidExperiment,
     out: Path | None,
     *,
     domain: int | None = None,

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from msg_agents.watching.web_server import WebServer
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
 class Display:
@@ -46,7 +46,7 @@ class Display:
         """Whether anything is drawn."""
         return self.panel or self._web is not None
 
-    def begin(self, experiment: Experiment) -> None:
+    def begin(self, experiment: ValidExperiment) -> None:
         """Give the page what does not change in a run."""
         if self._web is not None:
             self._web.begin(run_description(experiment))
@@ -56,7 +56,7 @@ class Display:
         if self.panel:
             self._jobs.check()
 
-    def draw(self, snapshot: Snapshot, experiment: Experiment) -> None:
+    def draw(self, snapshot: Snapshot, experiment: ValidExperiment) -> None:
         """Draw a snapshot in place of the last one."""
         if self.panel:
             size = self._console.size

@@ -17,7 +17,7 @@ from msg_analysis.common.notes import print_note
 
 if TYPE_CHECKING:
     from msg_agents.watching.web_server import WebServer
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
     from msg_analysis.model.run.record import RunRecord
 
 REFRESH = 0.25  # s between two updates
@@ -27,7 +27,7 @@ LINES = 10.0  # s between two lines where there is no terminal
 class RunView(View):
     """Shows a run in all these ways; a context."""
 
-    def __init__(self, experiment: Experiment, web: WebServer | None = None) -> None:
+    def __init__(self, experiment: ValidExperiment, web: WebServer | None = None) -> None:
         from rich.console import Console
 
         self._experiment = experiment

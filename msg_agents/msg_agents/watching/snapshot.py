@@ -13,7 +13,7 @@ from msg_analysis.model.step.step_model import first_graph
 
 if TYPE_CHECKING:
     from msg_analysis.inference.online.running_errors import LiveReport
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 WINDOW = 3.0  # s over which speeds are measured
 GRAIN = 0.25  # s; least time between two measurements
@@ -45,7 +45,7 @@ class StepRates:
 class SojournFinder:
     """Finds the sojourn of a step of a run."""
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: ValidExperiment) -> None:
         self._rest: Iterator[Sojourn] = sojourns(experiment, first_graph(experiment))
         self._now = next(self._rest, None)
 
@@ -85,7 +85,7 @@ class Snapshot:
 class SnapshotSource:
     """Makes snapshots of a run from the steps that its agents have reached."""
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: ValidExperiment) -> None:
         self._steps = experiment.steps
         self._sojourns, self._rates = SojournFinder(experiment), StepRates()
 
@@ -100,7 +100,7 @@ class SnapshotSource:
         return replace(now, left=left, sojourn=self._sojourns.at(min(now.reached, self._steps - 1)))
 
 
-def run_description(experiment: Experiment) -> dict[str, Any]:
+def run_description(experiment: ValidExperiment) -> dict[str, Any]:
     """What does not change in a run, for a page that draws it: agents, graphs, positions."""
     from msg_analysis.report.figures.agent_places import places
 

@@ -17,7 +17,7 @@ from msg_analysis.report.terminal.live_text import coverage, error_text
 if TYPE_CHECKING:
     from msg_agents.watching.snapshot import Snapshot
     from msg_analysis.inference.errors.estimates import Estimate
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 COLOURS = (
     "blue",
@@ -34,7 +34,7 @@ FAR = 2.0  # standard errors
 _LEGEND = "  ● measured ◆ predicted"
 
 
-def panel_of(snapshot: Snapshot, experiment: Experiment, *, width: int, height: int) -> RenderableType:
+def panel_of(snapshot: Snapshot, experiment: ValidExperiment, *, width: int, height: int) -> RenderableType:
     """The panel, for a terminal of ``width`` by ``height`` characters."""
     agents = "1 agent" if experiment.agents == 1 else f"{experiment.agents} agents"
     title = Text(f"{experiment.name}: {agents}, {experiment.run.pace}", style="bold")
@@ -51,7 +51,7 @@ def panel_of(snapshot: Snapshot, experiment: Experiment, *, width: int, height: 
     return Panel(Group(*lines), title=title, title_align="left")
 
 
-def plain_line(snapshot: Snapshot, experiment: Experiment) -> str:
+def plain_line(snapshot: Snapshot, experiment: ValidExperiment) -> str:
     """The same as one line of text."""
     parts = [f"step {snapshot.reached} of {experiment.steps}", f"{snapshot.rate:.0f} steps/s"]
     if snapshot.sojourn is not None:
@@ -61,7 +61,7 @@ def plain_line(snapshot: Snapshot, experiment: Experiment) -> str:
     return ", ".join(parts)
 
 
-def _progress(snapshot: Snapshot, experiment: Experiment, width: int) -> RenderableType:
+def _progress(snapshot: Snapshot, experiment: ValidExperiment, width: int) -> RenderableType:
     share = snapshot.reached / experiment.steps
     text = f"step {snapshot.reached} of {experiment.steps}  {100 * share:.0f} %  {snapshot.rate:.0f} steps/s"
     if snapshot.left is not None:
@@ -74,7 +74,7 @@ def _progress(snapshot: Snapshot, experiment: Experiment, width: int) -> Rendera
     return line if width > len(text) + 6 else Text(text, no_wrap=True, overflow="ellipsis")
 
 
-def _graph(snapshot: Snapshot, experiment: Experiment) -> Text:
+def _graph(snapshot: Snapshot, experiment: ValidExperiment) -> Text:
     text = Text("graph ", no_wrap=True, overflow="ellipsis")
     sojourn = snapshot.sojourn
     if sojourn is None:
@@ -89,7 +89,7 @@ def _graph(snapshot: Snapshot, experiment: Experiment) -> Text:
     return text
 
 
-def _coverage(snapshot: Snapshot, experiment: Experiment) -> Text:
+def _coverage(snapshot: Snapshot, experiment: ValidExperiment) -> Text:
     """What the errors below are computed from."""
     report = snapshot.report
     if report is None or not report.steps:
@@ -133,7 +133,7 @@ def gauge(estimate: Estimate, width: int) -> Text:
     return text.append(_LEGEND, style="dim not bold default")
 
 
-def _agents(snapshot: Snapshot, experiment: Experiment, room: int) -> list[RenderableType]:
+def _agents(snapshot: Snapshot, experiment: ValidExperiment, room: int) -> list[RenderableType]:
     """One row per agent; of many, a summary and the rows that are furthest off, or slowest."""
     nodes = snapshot.report.nodes if snapshot.report else []
     steps_known = len(snapshot.steps) == experiment.agents
@@ -161,7 +161,7 @@ def _agents(snapshot: Snapshot, experiment: Experiment, room: int) -> list[Rende
     return [table, *tail] if order else tail
 
 
-def _summary(snapshot: Snapshot, experiment: Experiment) -> Text:
+def _summary(snapshot: Snapshot, experiment: ValidExperiment) -> Text:
     steps, rates = snapshot.steps, snapshot.rates
     text = f"{experiment.agents} agents at step"
     text += f"s {min(steps)} to {max(steps)}" if len(steps) > 1 else f" {steps[0]}"

@@ -19,7 +19,7 @@ from msg_agents.cli.main import main
 from msg_agents.cli.ros_command import RosCommand, split_arguments
 from msg_agents.nodes.ros.node_parameters import describe, name_of, options_of
 from msg_agents.processes.ros_domain import free_domain
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import new_record
 
 BIN = Path(sys.executable).parent
@@ -30,7 +30,7 @@ RUN = {"name": "pair", "graphs": {"a": {"path": [1, 2]}}, "run": {"dt": 0.1, "du
 @pytest.fixture
 def run_file(tmp_path: Path) -> Path:
     file = tmp_path / "run.json"
-    file.write_text(new_record(Experiment.parse(RUN)).to_json())
+    file.write_text(new_record(ValidExperiment.parse(RUN)).to_json())
     return file
 
 

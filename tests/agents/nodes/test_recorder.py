@@ -16,7 +16,7 @@ from msg_agents.nodes.recorder import Recorder
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.ros_domain import free_domain
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import new_record
 from msg_analysis.wire.messages import StateCodec
 from msg_analysis.wire.refusals import Refusal
@@ -29,7 +29,7 @@ STEPS = 5 * RESEND_LIMIT
 @pytest.fixture
 def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recorder]:
     """A recorder that hears no other node."""
-    experiment = Experiment.parse(
+    experiment = ValidExperiment.parse(
         {
             "name": "pair",
             "graphs": {"line": {"path": [1, 2]}},

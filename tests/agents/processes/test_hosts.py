@@ -13,11 +13,11 @@ from msg_agents.processes.environment import PEERS_VARIABLE, PROFILE_VARIABLES
 from msg_agents.processes.hosts import Hosts
 from msg_agents.processes.process_plan import Share, plan_network
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
-def experiment(agents: int = 5, processes: Any = "auto") -> Experiment:
-    return Experiment.parse(
+def experiment(agents: int = 5, processes: Any = "auto") -> ValidExperiment:
+    return ValidExperiment.parse(
         {
             "name": "spread",
             "problem": "consensus",

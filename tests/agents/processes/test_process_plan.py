@@ -15,11 +15,11 @@ from msg_agents.processes.core_pinning import place
 from msg_agents.processes.environment import DISCOVERY_TIMEOUT
 from msg_agents.processes.process_plan import MOST_PROCESSES, RECORDER, ProcessPlan, count_processes, plan_network
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
-def experiment(agents: int, processes: Any) -> Experiment:
-    return Experiment.parse(
+def experiment(agents: int, processes: Any) -> ValidExperiment:
+    return ValidExperiment.parse(
         {
             "name": "plan",
             "problem": "consensus",

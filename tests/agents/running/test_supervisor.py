@@ -21,7 +21,7 @@ from msg_agents.processes.process_plan import ProcessPlan
 from msg_agents.processes.ros_domain import free_domain
 from msg_agents.running import supervisor as module
 from msg_agents.running.supervisor import Child, Supervisor
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import new_record
 
 STUBBORN = """
@@ -237,7 +237,7 @@ def test_a_status_line_may_come_in_pieces(tmp_path: Path) -> None:
 
 @pytest.fixture
 def run_file(tmp_path: Path) -> Path:
-    experiment = Experiment.parse(
+    experiment = ValidExperiment.parse(
         {
             "name": "waiting",
             "problem": "consensus",

@@ -13,7 +13,7 @@ from msg_agents.watching.checkpoint_reader import BLOCK, CheckpointReader
 from msg_agents.watching.run_observer import RunObserver
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.arithmetic.payload import to_payload
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.simulate import simulate
@@ -22,14 +22,14 @@ from msg_analysis.wire.receiving import state_frame
 from msg_analysis.wire.topics import agent_name
 
 
-def _experiment(duration: float = 20, **changes: Any) -> Experiment:
+def _experiment(duration: float = 20, **changes: Any) -> ValidExperiment:
     document = {
         "name": "net",
         "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
         "switching": {"generator": [[-1, 1], [1, -1]]},
         "run": {"dt": 0.05, "duration": duration, "replicas": 2, "seed": 3},
     }
-    return Experiment.parse(document | changes)
+    return ValidExperiment.parse(document | changes)
 
 
 class Writers:

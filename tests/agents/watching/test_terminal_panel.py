@@ -13,14 +13,14 @@ from msg_agents.watching.snapshot import Snapshot, SnapshotSource, SojournFinder
 from msg_agents.watching.terminal_panel import gauge, panel_of, plain_line
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.online.running_errors import LiveReport
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.graph_path import Sojourn
 from msg_analysis.twin.simulate import simulate
 
 
-def _experiment(agents: int = 5) -> Experiment:
+def _experiment(agents: int = 5) -> ValidExperiment:
     numbers = list(range(1, agents + 1))
-    return Experiment.parse(
+    return ValidExperiment.parse(
         {
             "name": "net",
             "graphs": {"line": {"path": numbers}, "a ring [bold] of $$ a very long name": {"cycle": numbers}},
@@ -47,7 +47,7 @@ def _snapshot(agents: int, **changes: object) -> Snapshot:
     return Snapshot(**(values | changes))  # type: ignore[arg-type]
 
 
-def _lines(snapshot: Snapshot, experiment: Experiment, width: int, height: int) -> list[str]:
+def _lines(snapshot: Snapshot, experiment: ValidExperiment, width: int, height: int) -> list[str]:
     console = Console(file=io.StringIO(), width=width, height=height, force_terminal=True, color_system=None)
     console.print(panel_of(snapshot, experiment, width=width, height=height))
     assert isinstance(console.file, io.StringIO)
@@ -70,7 +70,7 @@ def test_says_how_it_stands() -> None:
         "step 4000 of 8000  50 %  500 steps/s  1:02 left",
         "graph a ring [bold] of $$",
         "for 0.5 units of time, steps 3990 to 4011, after 41 jumps",
-        "system error 1.45 ± 0.059 (95 %), predicted 1.41, z +1.33",
+        "system error 1.45 ± 0.059 (95 %), predicted 1.41, z = +1.33",
     ):
         assert words in text
     assert re.search(r"\b5 +4004 +504 +1\.08 +0\.098 +1 +\+1\.6", text)

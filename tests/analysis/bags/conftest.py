@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 
@@ -19,7 +19,7 @@ def make_run() -> Callable[..., Trajectory]:
 
     def make(agents: int = 3, steps: int = 40, replicas: int = 2, seed: int = 0, name: str = "small") -> Trajectory:
         everybody = list(range(1, agents + 1))
-        experiment = Experiment.parse(
+        experiment = ValidExperiment.parse(
             {
                 "name": name,
                 "problem": "consensus",

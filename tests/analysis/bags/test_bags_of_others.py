@@ -20,7 +20,7 @@ from msg_analysis.bags.salvage import salvage
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.errors import BagError
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.report.documents.info import describe_bag
 from msg_analysis.twin.simulate import simulate
@@ -40,7 +40,7 @@ def run() -> Trajectory:
         "noise": {"broadcast": 0.3},
         "run": {"dt": 0.05, "duration": 15, "replicas": 2, "seed": 5},
     }
-    return simulate(Experiment.parse(experiment))
+    return simulate(ValidExperiment.parse(experiment))
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from msg_analysis.bags.format.storage_options import COMPRESSIONS, Compression, 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.simulate import simulate
 
@@ -41,7 +41,7 @@ def run(request: pytest.FixtureRequest) -> Trajectory:
         "noise": NOISE[request.param],
         "run": {"dt": 0.05, "duration": STEPS * 0.05, "replicas": REPLICAS, "seed": 5, "start": "zero"},
     }
-    return simulate(Experiment.parse(experiment))
+    return simulate(ValidExperiment.parse(experiment))
 
 
 @pytest.mark.parametrize("split", [None, 3])

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.simulate import simulate
@@ -29,7 +29,7 @@ Message = tuple[str, MessageType, bytes]
 def run() -> Trajectory:
     """A run of the twin; its states, losses and modes are replaced by what the tests write."""
     return simulate(
-        Experiment.parse(
+        ValidExperiment.parse(
             {
                 "name": "air",
                 "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 1}}},

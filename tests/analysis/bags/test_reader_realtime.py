@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.wire.messages import ActiveGraph, AgentState, encode_string
@@ -28,7 +28,7 @@ Message = tuple[str, MessageType, bytes]
 @pytest.fixture(scope="module")
 def run() -> Trajectory:
     """Random states of random age, late by up to four steps; agents notice a new graph late; no theory in it."""
-    experiment = Experiment.parse(
+    experiment = ValidExperiment.parse(
         {
             "name": "real",
             "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 1}}},

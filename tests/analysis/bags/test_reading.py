@@ -29,7 +29,7 @@ from msg_analysis.bags.format import mcap_chunks
 from msg_analysis.bags.format.mcap_chunks import DamageError, locate, unpack
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.wire.cdr_fields import CdrError
@@ -58,7 +58,7 @@ def _record(kind: str) -> RunRecord:
         document["noise"] = {"loss": 0.3}
     if kind == "realtime":
         document["run"]["pace"] = "realtime"
-    return RunRecord(uuid.UUID(int=7), Experiment.parse(document), np.zeros((AGENTS, WIDTH)))
+    return RunRecord(uuid.UUID(int=7), ValidExperiment.parse(document), np.zeros((AGENTS, WIDTH)))
 
 
 RECORDS = {kind: _record(kind) for kind in KINDS}

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
 
 PROGRAM = Path(sys.executable).with_name("msg-analysis")
@@ -131,7 +131,7 @@ def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path) -> Non
     for row in document["points"][::4]:
         switching = EXPERIMENT["switching"] | {"scale": row["switching.scale"]}
         run = experiment["run"] | {"seed": row["seed"]}
-        measured = compare(simulate(Experiment.parse(experiment | {"switching": switching, "run": run})))
+        measured = compare(simulate(ValidExperiment.parse(experiment | {"switching": switching, "run": run})))
         assert row["system_error.measured"] == measured.system_error.measured
 
 

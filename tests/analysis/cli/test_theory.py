@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from msg_analysis.cli import main as cli
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 
 GOLDEN = Path(__file__).parents[2] / "data/golden"
@@ -35,7 +35,7 @@ def from_zero(tmp_path):
 
 
 def test_transient_tends_to_the_prediction(from_zero):
-    prediction = predict(Experiment.load(from_zero))
+    prediction = predict(ValidExperiment.load(from_zero))
     for law, moments in {"emulated": prediction.emulated, "continuous": prediction.continuous}.items():
         document = document_of("transient", from_zero, "--times", "0:50:0.5", "--law", law)
         assert document["law"] == law
@@ -132,7 +132,7 @@ def test_facts(name):
     document = document_of("facts", GOLDEN / f"{name}.yaml")
     assert all(fact["holds"] for fact in document["facts"])
     assert set(document) == {"modes", "facts", "bounds", "graphs", "two_topology", "notes"}
-    prediction = predict(Experiment.load(GOLDEN / f"{name}.yaml"))
+    prediction = predict(ValidExperiment.load(GOLDEN / f"{name}.yaml"))
     if name in ("line_ring", "discrete"):
         law = "emulated" if name == "line_ring" else "discrete"
         form = document["two_topology"][law]

@@ -9,7 +9,7 @@ from scipy import optimize, stats
 from msg_analysis.inference.blame.switching_rates import find_rates
 from msg_analysis.inference.statistics.forward_selection import Candidate, select
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.network.markov_chain import MarkovChain
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.twin.simulate import new_record, simulate
@@ -41,7 +41,7 @@ AIR = BASE | {"noise": {"process": 1.0, "loss": 0.1, "broadcast": 0.2}}
 
 def run(truth, claimed):
     """A run of one law that claims to be of another; losses that the claim does not know are not logged."""
-    true, claim = Experiment.parse(truth), Experiment.parse(claimed)
+    true, claim = ValidExperiment.parse(truth), ValidExperiment.parse(claimed)
     record = new_record(claim)
     trajectory = simulate(true, record=RunRecord(record.run, true, record.start))
     lost = trajectory.lost if claim.noise.loss else None

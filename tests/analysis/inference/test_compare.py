@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.theory.prediction import predict
@@ -21,11 +21,11 @@ SEEDS = range(100, 140)
 
 
 def golden(name, **run):
-    return Experiment.load(GOLDEN / f"{name}.yaml").with_run(**run)
+    return ValidExperiment.load(GOLDEN / f"{name}.yaml").with_run(**run)
 
 
 def changed(experiment, **changes):
-    return Experiment.parse(experiment.to_document() | changes)
+    return ValidExperiment.parse(experiment.to_document() | changes)
 
 
 def claimed(trajectory, experiment):

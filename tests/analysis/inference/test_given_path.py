@@ -9,7 +9,7 @@ from msg_analysis.inference.errors import given_path as module
 from msg_analysis.inference.errors.given_path import given_path
 from msg_analysis.inference.errors.time_means import time_means
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -30,7 +30,7 @@ CASES = {
 
 
 def observe(document):
-    trajectory = simulate(Experiment.parse(document))
+    trajectory = simulate(ValidExperiment.parse(document))
     return Observation.of(trajectory, predict(trajectory.record.experiment))
 
 

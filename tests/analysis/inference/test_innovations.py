@@ -9,7 +9,7 @@ from msg_analysis.inference.hypothesis_tests import innovations as module
 from msg_analysis.inference.hypothesis_tests.gain_regression import regressors
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations, quadratic_form
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -26,7 +26,7 @@ def observe(**changes):
         "leaders": {"agents": [1], "gain": 1.5, "reference": 2.0},
         "run": {"dt": 0.1, "duration": 6.0, "replicas": 3, "seed": 5},
     }
-    trajectory = simulate(Experiment.parse(document | changes))
+    trajectory = simulate(ValidExperiment.parse(document | changes))
     return Observation.of(trajectory, predict(trajectory.record.experiment))
 
 

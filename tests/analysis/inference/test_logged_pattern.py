@@ -11,7 +11,7 @@ from msg_analysis.inference.realtime import logged_pattern as module
 from msg_analysis.inference.realtime.event_order import newest_steps, order_events, sampled
 from msg_analysis.inference.realtime.logged_pattern import PatternUnavailableError, pattern_means
 from msg_analysis.inference.realtime.pattern_events import Periods
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -26,7 +26,7 @@ def experiment(run=None, **changes):
         "switching": {"generator": [[-3.0, 3.0], [2.0, -2.0]]},
         "run": {"dt": 0.1, "duration": STEPS / 10, "replicas": 2, "seed": 3, "pace": "realtime"} | (run or {}),
     }
-    return Experiment.parse(document | changes)
+    return ValidExperiment.parse(document | changes)
 
 
 TRACKING = {"problem": "tracking", "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0}}

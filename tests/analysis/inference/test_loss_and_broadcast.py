@@ -13,7 +13,7 @@ from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import Broadcast
 from msg_analysis.inference.observed.heard_values import HeardValues
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
@@ -32,7 +32,7 @@ def experiment(noise=AIR, **changes):
         "noise": noise,
         "run": run,
     }
-    return Experiment.parse(document | changes)
+    return ValidExperiment.parse(document | changes)
 
 
 TRACKING = {"problem": "tracking", "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0}}

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
 
 SEEDS = range(40)
@@ -18,7 +18,7 @@ SHARED = [[1.0, 0.5, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.0]]
 
 
 def experiment(line, ring, **run):
-    return Experiment.parse(
+    return ValidExperiment.parse(
         {
             "name": "loud",
             "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},

@@ -17,7 +17,7 @@ from msg_analysis.inference.realtime.event_order import order_events
 from msg_analysis.inference.realtime.timing import measure_timing
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Completeness
 from msg_analysis.model.step.phases import phases
 from msg_analysis.theory.prediction import predict
@@ -33,7 +33,7 @@ def experiment(run=None, **changes):
         "switching": {"generator": [[-1.0, 1.0], [2.0, -2.0]]},
         "run": {"dt": 0.1, "duration": 40, "replicas": 2, "seed": 3, "pace": "realtime"} | (run or {}),
     }
-    return Experiment.parse(document | changes)
+    return ValidExperiment.parse(document | changes)
 
 
 TRACKING = {"problem": "tracking", "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0}}

@@ -15,7 +15,7 @@ from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.online.running_errors import LiveEstimate, RunningErrors
 from msg_analysis.inference.online.step_collector import StepCollector
 from msg_analysis.model.arithmetic.payload import to_payload
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
@@ -23,7 +23,7 @@ from msg_analysis.twin.simulate import simulate
 GRAPHS = {"a": {"path": [1, 2, 3, 4]}, "b": {"cycle": [1, 2, 3, 4]}}
 
 
-def experiment(**changes: Any) -> Experiment:
+def experiment(**changes: Any) -> ValidExperiment:
     run = {"dt": 0.1, "duration": 30, "replicas": 2, "seed": 5} | changes.pop("run", {})
     document = {
         "name": "small",
@@ -34,7 +34,7 @@ def experiment(**changes: Any) -> Experiment:
         **changes,
         "run": run,
     }
-    return Experiment.parse(document)
+    return ValidExperiment.parse(document)
 
 
 def messages(trajectory: Trajectory) -> list[tuple[int, int, int, bytes]]:
@@ -47,7 +47,7 @@ def messages(trajectory: Trajectory) -> list[tuple[int, int, int, bytes]]:
     ]
 
 
-def errors_from_zero(experiment: Experiment, steps: int) -> list[float]:
+def errors_from_zero(experiment: ValidExperiment, steps: int) -> list[float]:
     """Expected system error of every step, by the recursion of the second moments of the states themselves."""
     step = predict(experiment).step
     centre = np.eye(step.agents) - 1.0 / step.agents

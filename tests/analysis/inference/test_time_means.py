@@ -7,13 +7,13 @@ import pytest
 
 from msg_analysis.inference.errors.time_means import expected_mean, time_means
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
 
 def experiment(start="stationary", **run):
-    return Experiment.parse(
+    return ValidExperiment.parse(
         {
             "name": "tiny",
             "problem": "tracking",

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from msg_analysis.model.experiment import memory
-from msg_analysis.model.experiment.experiment import Experiment, ExperimentError
+from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
 
 GOOD: dict[str, Any] = {
     "name": "good",
@@ -43,7 +43,7 @@ def changed(changes: dict[str, Any]) -> dict[str, Any]:
 
 def problems_of(changes: dict[str, Any]) -> list[str]:
     with pytest.raises(ExperimentError) as caught:
-        Experiment.parse(changed(changes))
+        ValidExperiment.parse(changed(changes))
     return caught.value.problems
 
 
@@ -305,7 +305,7 @@ def test_mistake(changes: dict[str, Any], fragments: list[str]) -> None:
 
 
 def test_the_good_document_is_good() -> None:
-    assert Experiment.parse(GOOD).agents == 5
+    assert ValidExperiment.parse(GOOD).agents == 5
 
 
 def test_a_chain_of_three_has_its_period_named() -> None:
@@ -340,24 +340,24 @@ def test_all_mistakes_come_together() -> None:
 
 def test_text_names_the_source_and_lists_the_problems() -> None:
     with pytest.raises(ExperimentError) as caught:
-        Experiment.parse(changed({"foo": 1, "bar": 2}), source="file.yaml")
+        ValidExperiment.parse(changed({"foo": 1, "bar": 2}), source="file.yaml")
     lines = str(caught.value).splitlines()
     assert lines[0] == "file.yaml: 2 problems"
     assert [line.split(":")[0] for line in lines[1:]] == ["  foo", "  bar"]
     with pytest.raises(ExperimentError, match=r"^file\.yaml: foo: unknown key"):
-        Experiment.parse(changed({"foo": 1}), source="file.yaml")
+        ValidExperiment.parse(changed({"foo": 1}), source="file.yaml")
 
 
 def test_keys_that_are_no_text() -> None:
     with pytest.raises(ExperimentError, match="experiment: key 1: expected a text"):
-        Experiment.parse({**GOOD, 1: 2})
+        ValidExperiment.parse({**GOOD, 1: 2})
 
 
 @pytest.mark.parametrize("content", ["not xml", "<xml/>", "<graphml><graph/></graphml>", ""])
 def test_graphml_that_is_none(tmp_path: Path, content: str) -> None:
     (tmp_path / "net.graphml").write_text(content)
     with pytest.raises(ExperimentError, match=r"graphs\.ring\.graphml: .*net\.graphml"):
-        Experiment.parse(changed({"graphs.ring": {"graphml": "net.graphml"}}), directory=tmp_path)
+        ValidExperiment.parse(changed({"graphs.ring": {"graphml": "net.graphml"}}), directory=tmp_path)
 
 
 def test_graphml_weights_must_be_positive(tmp_path: Path) -> None:
@@ -367,13 +367,13 @@ def test_graphml_weights_must_be_positive(tmp_path: Path) -> None:
     graph.add_edge(1, 2, weight=-1.0)
     nx.write_graphml(graph, tmp_path / "net.graphml")
     with pytest.raises(ExperimentError, match=r"weight -1\.0 of 1 - 2: expected a weight > 0"):
-        Experiment.parse(changed({"graphs.ring": {"graphml": "net.graphml"}}), directory=tmp_path)
+        ValidExperiment.parse(changed({"graphs.ring": {"graphml": "net.graphml"}}), directory=tmp_path)
 
 
 def test_memory_is_compared_with_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
     needed = sum(memory.memory_needed(agents=5, modes=2, steps=8000, replicas=1))
     monkeypatch.setattr(memory, "available_memory", lambda: needed)
-    Experiment.parse(GOOD)
+    ValidExperiment.parse(GOOD)
     monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
     assert "need 320 kB: expected at most 323 kB, the memory available" in problems_of({})[0]
 

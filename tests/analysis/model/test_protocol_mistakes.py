@@ -14,7 +14,7 @@ from euler import DIRECTED, Euler, EulerSteps, document, experiment
 
 from msg_analysis.cli.main import main
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment, ExperimentError
+from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
 from msg_analysis.protocol import Heard, LinearProtocol, Parameters, Protocol
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
@@ -74,7 +74,7 @@ MISTAKES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
 @pytest.mark.parametrize(("protocol", "changes", "expected"), MISTAKES, ids=str)
 def test_mistakes_in_the_file(protocol: Any, changes: dict[str, Any], expected: list[str]) -> None:
     with pytest.raises(ExperimentError) as caught:
-        Experiment.parse(document(protocol, **changes))
+        ValidExperiment.parse(document(protocol, **changes))
     assert len(caught.value.problems) == len(expected)
     for text in expected:
         assert any(text in line for line in caught.value.problems), caught.value.problems
@@ -193,4 +193,4 @@ def test_no_prediction_is_refused_clearly(command: list[str], tmp_path: Path) ->
     assert outcome.stderr.startswith(f'error: {file}: protocol.name: "saturated": expected a linear protocol, but')
     assert "without a prediction: use `simulate` or `msg-agents run`" in outcome.stderr
     with pytest.raises(InputError, match="is not linear"):
-        predict(Experiment.load(file))
+        predict(ValidExperiment.load(file))

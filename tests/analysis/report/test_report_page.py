@@ -20,7 +20,7 @@ from msg_analysis.inference.hypothesis_tests.switching import SwitchingTest
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.inference.verdict.comparison import Comparison
 from msg_analysis.inference.verdict.comparison import Test as FamilyTest
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.report.html.report_page import write_report
@@ -63,7 +63,7 @@ class Page(HTMLParser):
 
 def _trajectory(agents: int, steps: int, **names: str) -> Trajectory:
     everybody = list(range(1, agents + 1))
-    experiment = Experiment.parse(
+    experiment = ValidExperiment.parse(
         {
             "name": "small",
             "problem": "consensus",
@@ -206,7 +206,7 @@ def in_real_time(late: int) -> Comparison:
         "switching": {"generator": [[-1, 1], [1, -1]]},
         "run": {"dt": 0.1, "duration": 20, "replicas": 2, "pace": "realtime", "speed": 10},
     }
-    trajectory = simulate(Experiment.parse(document))
+    trajectory = simulate(ValidExperiment.parse(document))
     assert trajectory.made is not None
     made = trajectory.made.copy()
     made[1:] += late

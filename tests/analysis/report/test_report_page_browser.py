@@ -14,7 +14,7 @@ from browser import Log, chromium
 
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.inference.verdict.pool import compare_pooled
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.report.html.report_page import write_report
 from msg_analysis.twin.simulate import simulate
@@ -37,7 +37,7 @@ def _document(agents: int, **run: Any) -> dict[str, Any]:
 
 
 def _trajectory(agents: int, **run: Any) -> Trajectory:
-    return simulate(Experiment.parse(_document(agents, **run)))
+    return simulate(ValidExperiment.parse(_document(agents, **run)))
 
 
 def _open(browser: Any, path: Path) -> tuple[Any, Log]:
@@ -130,7 +130,7 @@ def _in_real_time() -> tuple[Any, Trajectory]:
 def _disagreeing() -> tuple[Any, Trajectory]:
     document = _document(4)
     wrong = document | {"graphs": document["graphs"] | {"ring $$x$$": {"edges": [[1, 2], [2, 3], [3, 4], [1, 4, 0.3]]}}}
-    said, did = Experiment.parse(document), simulate(Experiment.parse(wrong).with_run(duration=100))
+    said, did = ValidExperiment.parse(document), simulate(ValidExperiment.parse(wrong).with_run(duration=100))
     said = said.with_run(duration=100)
     trajectory = dataclasses.replace(did, record=dataclasses.replace(did.record, experiment=said))
     return compare(trajectory), trajectory
@@ -161,7 +161,7 @@ def _tracking() -> tuple[Any, Trajectory]:
         "noise": {"process": 0.5, "loss": 0.1},
         "run": {"duration": 300},
     }
-    trajectory = simulate(Experiment.parse(document))
+    trajectory = simulate(ValidExperiment.parse(document))
     return compare(trajectory), trajectory
 
 

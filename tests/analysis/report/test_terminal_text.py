@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.report.documents.info import describe_experiment
 from msg_analysis.report.terminal import bag_text, comparison_text, experiment_text, theory_text
 from msg_analysis.theory.graph_indices import algebraic_connectivity
@@ -143,7 +143,7 @@ DOCUMENT: dict[str, Any] = {
 
 
 def test_experiment_explained() -> None:
-    document = describe_experiment(Experiment.parse(DOCUMENT))
+    document = describe_experiment(ValidExperiment.parse(DOCUMENT))
     line, arcs, ring = document["graphs"]
     assert (document["agents"], document["run"]["steps"], document["unavailable"]) == (4, 1000, [])
     assert [tuple(edge) for edge in line["edges"]] == [(1, 2, 1.0), (2, 3, 1.0), (3, 4, 1.0)]
@@ -167,7 +167,7 @@ def test_experiment_explained() -> None:
 
 
 def test_experiment_that_cannot_be_run_yet() -> None:
-    document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"delay": 1}}))
+    document = describe_experiment(ValidExperiment.parse(DOCUMENT | {"noise": {"delay": 1}}))
     assert document["predicted_system_error"] > 0
     assert "noise.delay: 1: not available in runs yet" in shown(experiment_text.print_experiment, document)
 
@@ -175,7 +175,7 @@ def test_experiment_that_cannot_be_run_yet() -> None:
 def test_noise_by_graph_and_delay_explained() -> None:
     """Limits of the graphs alone would say nothing about steps with a delay."""
     gains = {"line": 1.0, "ring": [0.5, 1.0, 1.0, 2.0], "arcs": [[1.0, 0.0, 0.0, 0.5]] * 4}
-    document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"process": gains, "delay": 2}}))
+    document = describe_experiment(ValidExperiment.parse(DOCUMENT | {"noise": {"process": gains, "delay": 2}}))
     assert document["stability_limit"] is None
     assert document["predicted_system_error"] > 0
     output = " ".join(shown(experiment_text.print_experiment, document).split())
@@ -185,7 +185,7 @@ def test_noise_by_graph_and_delay_explained() -> None:
 
 def test_one_graph_that_is_never_left() -> None:
     plain = {"name": "one", "graphs": {"line": {"path": [1, 2]}}}
-    (graph,) = describe_experiment(Experiment.parse(plain))["graphs"]
+    (graph,) = describe_experiment(ValidExperiment.parse(plain))["graphs"]
     assert graph["mean_holding_time"] is None
     assert graph["stationary"] == 1.0
 
@@ -195,7 +195,7 @@ def test_algebraic_connectivity_against_networkx() -> None:
 
     network = nx.connected_watts_strogatz_graph(12, 4, 0.3, seed=1)
     links = [[i + 1, j + 1] for i, j in network.edges]
-    experiment = Experiment.parse({"name": "net", "graphs": {"net": {"edges": links}}})
+    experiment = ValidExperiment.parse({"name": "net", "graphs": {"net": {"edges": links}}})
     expected = nx.algebraic_connectivity(network, method="lanczos", seed=1)
     assert algebraic_connectivity(experiment.graph_list[0]) == pytest.approx(expected, rel=1e-6)
 

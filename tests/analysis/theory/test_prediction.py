@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict, stationary_start_factor
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
@@ -24,7 +24,7 @@ def experiment(**changes):
         "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
         "run": {"dt": 0.05, "duration": 10},
     }
-    return Experiment.parse(document | changes)
+    return ValidExperiment.parse(document | changes)
 
 
 def one_graph(graph, **changes):
@@ -45,19 +45,19 @@ def assert_contains(document, golden, path=""):
 
 @pytest.mark.parametrize("name", ["line_ring", "tracking", "discrete", "air"])
 def test_golden(name):
-    document = predict(Experiment.load(GOLDEN / f"{name}.yaml")).to_json()
+    document = predict(ValidExperiment.load(GOLDEN / f"{name}.yaml")).to_json()
     assert_contains(document, json.loads((GOLDEN / f"{name}.predict.json").read_text()))
     json.dumps(document, allow_nan=False)
 
 
 def test_noise_on_the_air_belongs_to_steps_only():
-    document = predict(Experiment.load(GOLDEN / "air.yaml")).to_json()
+    document = predict(ValidExperiment.load(GOLDEN / "air.yaml")).to_json()
     assert document["continuous"] is None
     assert document["static"] is None
 
 
 def test_discrete_time_has_no_other_laws():
-    document = predict(Experiment.load(GOLDEN / "discrete.yaml")).to_json()
+    document = predict(ValidExperiment.load(GOLDEN / "discrete.yaml")).to_json()
     assert "continuous" not in document
     assert "emulated" not in document
 
@@ -170,7 +170,7 @@ def test_without_noise_certainty_is_undefined():
 
 
 def test_start_factor_is_the_symmetric_root_of_the_conditional_covariance():
-    e = Experiment.load(GOLDEN / "tracking.yaml")
+    e = ValidExperiment.load(GOLDEN / "tracking.yaml")
     golden = json.loads((GOLDEN / "tracking.predict.json").read_text())
     for mode in range(3):
         factor = stationary_start_factor(e, mode)

@@ -11,7 +11,7 @@ import pytest
 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
@@ -20,7 +20,7 @@ from msg_analysis.types import FloatArray, IntArray
 
 @pytest.fixture(scope="module")
 def twin() -> Trajectory:
-    experiment = Experiment.parse(
+    experiment = ValidExperiment.parse(
         {
             "name": "checked",
             "problem": "consensus",

@@ -10,7 +10,7 @@ import pytest
 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
@@ -19,7 +19,7 @@ from msg_analysis.twin.simulate import simulate
 @pytest.fixture(scope="module")
 def twin() -> Trajectory:
     return simulate(
-        Experiment.parse(
+        ValidExperiment.parse(
             {
                 "name": "checked",
                 "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},

@@ -12,7 +12,7 @@ import pytest
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.model.step.phases import phases
@@ -25,7 +25,7 @@ from msg_analysis.types import FloatArray
 DT = 50_000_000  # ns
 
 
-def emulate(experiment: Experiment, seed: int) -> Trajectory:
+def emulate(experiment: ValidExperiment, seed: int) -> Trajectory:
     """Agents step late by chance, hear late by chance, learn of the graph late by chance."""
     record, model = new_record(experiment), build_step_model(experiment)
     modes = mode_path(experiment, model.initial)
@@ -68,7 +68,7 @@ def emulate(experiment: Experiment, seed: int) -> Trajectory:
 
 @pytest.fixture(scope="module")
 def run() -> Trajectory:
-    experiment = Experiment.parse(
+    experiment = ValidExperiment.parse(
         {
             "name": "checked",
             "problem": "tracking",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.agent_law import agent_law
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.air import LOST
@@ -46,13 +46,15 @@ LAWS: dict[str, dict[str, Any]] = {
 }
 
 
-def experiment(law: str, air: str, **run: Any) -> Experiment:
+def experiment(law: str, air: str, **run: Any) -> ValidExperiment:
     document: dict[str, Any] = {"name": "air", "agents": 4, **LAWS[law]}
     discrete = document.get("time") == "discrete"
     chain = {"transition": [[0.9, 0.1], [0.3, 0.7]]} if discrete else {"generator": [[-1.0, 1.0], [2.0, -2.0]]}
     dt, steps = (1.0, 300) if discrete else (0.1, 300)
     times = {"dt": dt, "duration": steps * dt, "replicas": 2, "seed": SEED}
-    return Experiment.parse(document | {"switching": chain, "noise": {"process": 0.5, **AIRS[air]}, "run": times | run})
+    return ValidExperiment.parse(
+        document | {"switching": chain, "noise": {"process": 0.5, **AIRS[air]}, "run": times | run}
+    )
 
 
 def philox(stream: int, number: int, block: int) -> np.random.Generator:
@@ -153,16 +155,16 @@ def test_the_air_depends_on_nothing_else() -> None:
     base = {"name": "base", "graphs": {"a": {"path": [1, 2, 3]}, "b": {"path": [1, 2, 3]}}}
     base |= {"switching": {"generator": [[-1.0, 1.0], [1.0, -1.0]]}, "noise": AIRS["all"]}
     base["run"] = {"duration": 20, "seed": SEED, "start": "zero"}
-    one = simulate(Experiment.parse(base))
+    one = simulate(ValidExperiment.parse(base))
     heavy = {"a": {"edges": [[1, 2, 2.0], [2, 3]]}, "b": {"edges": [[1, 2], [2, 3, 3.0]]}}
     four = {"a": {"path": [1, 2, 3, 4]}, "b": {"path": [1, 2, 3, 4]}}
     for changes in ({"graphs": heavy}, {"noise": AIRS["all"] | {"process": 0.1}}, {"graphs": four}):
-        other = simulate(Experiment.parse(base | changes))
+        other = simulate(ValidExperiment.parse(base | changes))
         same_air(one, other, 3)
         assert one.lost is not None
         assert other.lost is not None
         assert np.array_equal(one.lost[:, :2], other.lost[:, :2])
-    many = simulate(Experiment.parse(base | {"run": base["run"] | {"replicas": 7}}))
+    many = simulate(ValidExperiment.parse(base | {"run": base["run"] | {"replicas": 7}}))
     assert many.lost is not None
     assert np.array_equal(one.lost, many.lost)
 

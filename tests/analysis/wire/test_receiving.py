@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import new_record
 from msg_analysis.wire.messages import AgentState, Progress
 from msg_analysis.wire.receiving import decode_of_run, state_frame, state_receiver
 from msg_analysis.wire.refusals import Refusal
 
 RECORD = new_record(
-    Experiment.parse(
+    ValidExperiment.parse(
         {
             "name": "pair",
             "graphs": {"line": {"path": [1, 2]}},

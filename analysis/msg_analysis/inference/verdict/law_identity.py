@@ -7,13 +7,13 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 
 # Keys of an experiment that do not change its law
 MAY_DIFFER = {"name", "run.seed", "run.duration", "run.processes", "run.speed"}
 
 
-def law_keys(experiment: Experiment) -> dict[str, Any]:
+def law_keys(experiment: ValidExperiment) -> dict[str, Any]:
     """Every key (nested ones with dots) that defines the law of a run, and its value."""
     found = _flat(experiment.to_document())
     # The order of the graphs is that of the modes.
@@ -23,13 +23,13 @@ def law_keys(experiment: Experiment) -> dict[str, Any]:
     return {key: value for key, value in found.items() if key not in MAY_DIFFER}
 
 
-def law_identity(experiment: Experiment) -> str:
+def law_identity(experiment: ValidExperiment) -> str:
     """A text of 16 hexadecimal digits, the same for runs of the same law."""
     text = json.dumps(law_keys(experiment), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def first_difference(one: Experiment, other: Experiment) -> tuple[str, Any, Any] | None:
+def first_difference(one: ValidExperiment, other: ValidExperiment) -> tuple[str, Any, Any] | None:
     """Key and both values of the first difference, by name; None where the law is the same."""
     a, b = law_keys(one), law_keys(other)
     for key in sorted(a.keys() | b.keys()):

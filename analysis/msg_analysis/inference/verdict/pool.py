@@ -16,7 +16,7 @@ from msg_analysis.inference.verdict import compare
 from msg_analysis.inference.verdict.comparison import Comparison, Member, Pool
 from msg_analysis.inference.verdict.evidence import Evidence
 from msg_analysis.inference.verdict.law_identity import first_difference
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
@@ -77,7 +77,7 @@ def _examine(name: str, run: Trajectory, prediction: Prediction, level: float) -
     return Member(name, run.record, evidence.steps, run.completeness, alone.system_error, alone.verdict), evidence
 
 
-def _require_prediction(name: str, experiment: Experiment) -> None:
+def _require_prediction(name: str, experiment: ValidExperiment) -> None:
     reason = experiment.protocol.unpredictable() if experiment.protocol else None
     if reason:
         raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")

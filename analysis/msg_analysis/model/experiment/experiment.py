@@ -30,14 +30,14 @@ from msg_analysis.model.network.markov_chain import MarkovChain, Time
 from msg_analysis.protocol import Network
 from msg_analysis.types import FloatArray
 
-__all__ = ["Experiment", "ExperimentError", "json_schema"]
+__all__ = ["ExperimentError", "ValidExperiment", "json_schema"]
 
 SHOWN_GRAPHS = 4
 """Largest number of graphs named in a ``repr``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Experiment:
+class ValidExperiment:
     """A valid experiment. Two are equal if their documents are, the order of the graphs included.
 
     Attributes
@@ -65,7 +65,7 @@ class Experiment:
 
     def __eq__(self, other: object) -> bool:
         return (
-            isinstance(other, Experiment)
+            isinstance(other, ValidExperiment)
             and self.spec == other.spec
             and list(self.spec.graphs) == list(other.spec.graphs)
         )

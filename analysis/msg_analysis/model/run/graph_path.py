@@ -14,7 +14,7 @@ from msg_analysis.model.network.markov_chain import MarkovChain
 from msg_analysis.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class Sojourn:
     last_step: int
 
 
-def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
+def sojourns(experiment: ValidExperiment, initial: FloatArray) -> Iterator[Sojourn]:
     """The graph path of a run of N steps, drawn from the experiment's seed; ``initial`` (n,) is the law of g(0).
 
     Step k uses the graph of the chain at time k dt, so successive graphs are a Markov chain with P = expm(Gamma dt),
@@ -55,12 +55,12 @@ def _sampled(
             return
 
 
-def mode_path(experiment: Experiment, initial: FloatArray) -> IntArray:
+def mode_path(experiment: ValidExperiment, initial: FloatArray) -> IntArray:
     """(N,) index of the graph of each step k -> k+1; ``initial`` (n,) is the law of g(0)."""
     return _modes(sojourns(experiment, initial), experiment.steps)
 
 
-def past_modes(experiment: Experiment, first_mode: int, steps: int) -> IntArray:
+def past_modes(experiment: ValidExperiment, first_mode: int, steps: int) -> IntArray:
     """(steps,) g(-steps), ..., g(-1): the graphs before a run, given that it begins with g(0) = ``first_mode``.
 
     Drawn backwards by the reversed chain, so that the graphs before and after time 0 are one stationary path. A longer

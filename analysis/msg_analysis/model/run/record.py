@@ -17,7 +17,7 @@ import numpy as np
 
 from msg_analysis.common.version import __version__
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.protocol_binding import info_of
 from msg_analysis.model.step.step_model import (
     StepMatrices,
@@ -69,7 +69,7 @@ class RunRecord:
     """
 
     run: uuid.UUID
-    experiment: Experiment
+    experiment: ValidExperiment
     start: FloatArray
     versions: dict[str, str] = field(default_factory=software_versions)
     matrices: StepMatrices | None = None
@@ -130,7 +130,7 @@ class RunRecord:
                     f"{source}: run record of format {document['format']}, expected {FORMAT}: "
                     "read it with the version of msg_analysis that wrote it"
                 )
-            experiment = Experiment.parse(document["experiment"], source=source, recorded=info_of(document))
+            experiment = ValidExperiment.parse(document["experiment"], source=source, recorded=info_of(document))
             start = np.array(document["start"], dtype=float)
             step = document.get("step")
             matrices = _without_matrices(experiment) if step is None else _matrices(step, experiment, source)
@@ -150,7 +150,7 @@ def _entries(matrix: FloatArray) -> list[list[float]]:
     return [[int(i) + 1, int(j) + 1, float(matrix[i, j])] for i, j in np.argwhere(matrix)]
 
 
-def _matrices(document: Any, experiment: Experiment, source: str) -> StepMatrices:
+def _matrices(document: Any, experiment: ValidExperiment, source: str) -> StepMatrices:
     stacks = {"noise_gain": experiment.step_noise_gain}
     for key in ("weights", "noise_gain")[: 2 if experiment.protocol else 1]:
         stack = np.zeros((len(experiment.graph_list), experiment.agents, experiment.agents))
@@ -167,7 +167,7 @@ def _matrices(document: Any, experiment: Experiment, source: str) -> StepMatrice
     return StepMatrices(**stacks)
 
 
-def _without_matrices(experiment: Experiment) -> StepMatrices | None:
+def _without_matrices(experiment: ValidExperiment) -> StepMatrices | None:
     """For records of the first edition, which carry no matrices: in discrete time they used scipy's exponential."""
     if experiment.time == "continuous" or experiment.protocol:
         return None

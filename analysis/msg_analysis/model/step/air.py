@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, generator, link_number, normals
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.types import BoolArray, FloatArray
 
 LOST = 2**64 - 1
@@ -26,7 +26,7 @@ class Air:
     They do not depend on the graph: they are drawn for a link and a step whether that step uses the link or not.
     """
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: ValidExperiment) -> None:
         noise = experiment.noise
         self.broadcast, self.link, self.loss = noise.broadcast, noise.link, noise.loss
         self._seed = experiment.run.seed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.step.air import Air
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.step_model import StepModel
@@ -26,7 +26,7 @@ def padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
 class AirReception:
     """The values that go into ``law.step``, step after step; with ``logged_steps`` (N), also what is logged of them."""
 
-    def __init__(self, experiment: Experiment, model: StepModel, logged_steps: int | None = None) -> None:
+    def __init__(self, experiment: ValidExperiment, model: StepModel, logged_steps: int | None = None) -> None:
         self._air = Air(experiment)
         self._model = model
         self._replicas = experiment.run.replicas

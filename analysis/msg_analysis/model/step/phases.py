@@ -15,10 +15,10 @@ from msg_analysis.model.arithmetic.random_streams import Stream, generator
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
-def phases(experiment: Experiment) -> FloatArray:
+def phases(experiment: ValidExperiment) -> FloatArray:
     """(m,) phi_i = (rank_i + 1/2) / m, a part of a step; the ranks are a permutation drawn from the seed."""
     ranks = generator(experiment.run.seed, Stream.PHASE).permutation(experiment.agents)
     return np.asarray((ranks + 0.5) / experiment.agents)

@@ -20,17 +20,17 @@ from msg_analysis.model.step.step_model import StepModel, build_step_model
 from msg_analysis.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 StepLaw = Literal["synchronous", "sequential"]
 
 
-def step_law(experiment: Experiment) -> StepLaw:
+def step_law(experiment: ValidExperiment) -> StepLaw:
     """Whether the agents of a run step all at once (lockstep) or one after the other (real time)."""
     return "sequential" if experiment.run.pace == "realtime" else "synchronous"
 
 
-def build_run_model(experiment: Experiment, step: StepModel | None = None) -> StepModel:
+def build_run_model(experiment: ValidExperiment, step: StepModel | None = None) -> StepModel:
     """What a step of all agents of a run with a linear law does to x(k), as one jump linear system.
 
     In real time the law is sequential: noise of an agent reaches those that are due later in the same period. ``step``

@@ -15,7 +15,7 @@ from msg_analysis.model.network.markov_chain import MarkovChain
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +119,7 @@ def _transition(chain: MarkovChain, dt: float) -> FloatArray:
     return transition
 
 
-def build_model(experiment: Experiment, matrices: StepMatrices | None = None) -> Wiring:
+def build_model(experiment: ValidExperiment, matrices: StepMatrices | None = None) -> Wiring:
     """A ``StepModel`` where the law is linear, else the wiring alone; ``matrices`` are those of the run record."""
     if experiment.protocol is None or experiment.protocol.linear:
         return build_step_model(experiment, matrices)
@@ -132,7 +132,7 @@ def build_model(experiment: Experiment, matrices: StepMatrices | None = None) ->
     )
 
 
-def step_matrices(experiment: Experiment, expm: Callable[[FloatArray], FloatArray] = exponential) -> StepMatrices:
+def step_matrices(experiment: ValidExperiment, expm: Callable[[FloatArray], FloatArray] = exponential) -> StepMatrices:
     """Compute the matrices of a step; ``expm`` is the exponential of a matrix (m, m).
 
     InputError: the experiment has a protocol that is not linear, is not available, or fails.
@@ -150,7 +150,7 @@ def step_matrices(experiment: Experiment, expm: Callable[[FloatArray], FloatArra
     return StepMatrices(weights, gain)
 
 
-def build_step_model(experiment: Experiment, matrices: StepMatrices | None = None) -> StepModel:
+def build_step_model(experiment: ValidExperiment, matrices: StepMatrices | None = None) -> StepModel:
     """What one step of an experiment does; ``matrices`` are those of the run record, computed if not given.
 
     InputError: as of ``step_matrices``.
@@ -192,7 +192,7 @@ def build_step_model(experiment: Experiment, matrices: StepMatrices | None = Non
     )
 
 
-def _built_in(experiment: Experiment, expm: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def _built_in(experiment: ValidExperiment, expm: Callable[[FloatArray], FloatArray]) -> FloatArray:
     """(n, m, m): W_g of the law that the agents have by themselves, with its leaders."""
     gains, agents = experiment.leader_gains, experiment.agents
     grounded = np.isinf(gains)
@@ -210,7 +210,7 @@ def _built_in(experiment: Experiment, expm: Callable[[FloatArray], FloatArray]) 
     return weights
 
 
-def first_graph(experiment: Experiment) -> FloatArray:
+def first_graph(experiment: ValidExperiment) -> FloatArray:
     """(n,): the law of g(0)."""
     first = experiment.switching.initial
     if first == "stationary":
@@ -218,6 +218,6 @@ def first_graph(experiment: Experiment) -> FloatArray:
     return np.array([float(graph.name == first) for graph in experiment.graph_list])
 
 
-def _arcs(experiment: Experiment) -> BoolArray:
+def _arcs(experiment: ValidExperiment) -> BoolArray:
     """(n, m, m): whether agent i hears agent j, as the graphs say."""
     return np.array([graph.adjacency != 0.0 for graph in experiment.graph_list])

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.problems import show
 from msg_analysis.theory.graph_indices import algebraic_connectivity
 
 
-def explain(experiment: Experiment) -> list[str]:
+def explain(experiment: ValidExperiment) -> list[str]:
     """What the agents do, what switches, what is random, and what was run: a short paragraph each."""
     return [_task(experiment), _switching(experiment), _noise(experiment), _run(experiment)]
 
 
-def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
+def graph_facts(experiment: ValidExperiment) -> list[dict[str, Any]]:
     """Of every graph: ``name``, ``links``, ``directed``, ``connectivity``, ``share`` (predicted, of time), ``held``.
 
     ``held`` is the mean holding time [units of simulated time]; None for a graph that is never left.
@@ -34,7 +34,7 @@ def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
     ]
 
 
-def _task(experiment: Experiment) -> str:
+def _task(experiment: ValidExperiment) -> str:
     agents, leaders = experiment.agents, experiment.leaders
     if experiment.protocol:
         info = experiment.protocol.info
@@ -55,7 +55,7 @@ def _task(experiment: Experiment) -> str:
     )
 
 
-def _switching(experiment: Experiment) -> str:
+def _switching(experiment: ValidExperiment) -> str:
     modes, chain = len(experiment.graph_list), experiment.chain
     if modes == 1:
         return f"The graph is always {experiment.graph_list[0].name}."
@@ -75,7 +75,7 @@ def _switching(experiment: Experiment) -> str:
     )
 
 
-def _noise(experiment: Experiment) -> str:
+def _noise(experiment: ValidExperiment) -> str:
     noise = experiment.noise
     process = noise.process
     size = f"gain {process:g}" if isinstance(process, float | int) else "a gain matrix"
@@ -95,7 +95,7 @@ def _noise(experiment: Experiment) -> str:
     return "; ".join(parts) + "."
 
 
-def _run(experiment: Experiment) -> str:
+def _run(experiment: ValidExperiment) -> str:
     run = experiment.run
     replicas = "1 replica" if run.replicas == 1 else f"{run.replicas} independent replicas on the same graph path"
     start = {"stationary": "the steady state", "zero": "0"}

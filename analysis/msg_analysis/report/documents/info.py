@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment import memory, validation
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.theory.graph_indices import algebraic_connectivity
 from msg_analysis.theory.prediction import predict
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from msg_analysis.bags.salvage import SalvageReport
 
 
-def describe_experiment(experiment: Experiment) -> dict[str, Any]:
+def describe_experiment(experiment: ValidExperiment) -> dict[str, Any]:
     """The document of ``msg-analysis info EXPERIMENT --json``; the experiment need not be one that can be run.
 
     None: infinite or not computable; a stability limit with a delay or a protocol is not known. Memory in bytes.
@@ -147,7 +147,7 @@ def describe_salvage(out: Path, report: SalvageReport) -> dict[str, Any]:
     return {"bag": str(out), **dataclasses.asdict(report), **_describe_run(out, Inventory())}
 
 
-def _protocol(experiment: Experiment) -> dict[str, Any] | None:
+def _protocol(experiment: ValidExperiment) -> dict[str, Any] | None:
     """The protocol of the agents; None for the built-in law."""
     protocol = experiment.protocol
     if protocol is None:
@@ -159,14 +159,14 @@ def _protocol(experiment: Experiment) -> dict[str, Any] | None:
     }
 
 
-def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
+def _stability_limit(experiment: ValidExperiment, graph: Graph) -> float | None:
     if experiment.time == "discrete" or experiment.noise.delay or experiment.protocol:
         return None
     limit = validation.stability_limit(graph, experiment.leader_gains)
     return limit if math.isfinite(limit) else None
 
 
-def _predicted_system_error(experiment: Experiment) -> float | None:
+def _predicted_system_error(experiment: ValidExperiment) -> float | None:
     try:
         experiment.require_available("predict")
         return predict(experiment).emulated.system_error

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.facts import check_facts
 from msg_analysis.theory.graph_indices import error_bounds, graph_indices
 from msg_analysis.theory.prediction import predict
@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 
 def describe_transient(
-    experiment: Experiment,
+    experiment: ValidExperiment,
     times: FloatArray,  # (T,) ascending [units of simulated time]
     *,
     law: TransientLaw = "emulated",
@@ -59,7 +59,7 @@ def describe_transient(
 
 
 def _settling(
-    experiment: Experiment, system: JumpSystem, steady: FloatArray, unit: float, fraction: float
+    experiment: ValidExperiment, system: JumpSystem, steady: FloatArray, unit: float, fraction: float
 ) -> dict[str, Any]:
     """Keys ``steady_system_error``, ``settling`` [units of simulated time] and ``rates`` [1 / unit]."""
     error = float(np.trace(system.lifted(steady.sum(axis=0))))
@@ -86,7 +86,7 @@ def _settling(
     }
 
 
-def describe_facts(experiment: Experiment) -> dict[str, Any]:
+def describe_facts(experiment: ValidExperiment) -> dict[str, Any]:
     """The document of ``msg-analysis facts``: lemmas, bounds, indices of the graphs, two graphs in closed form.
 
     None: a graph that is directed or disconnected; the closed form unless two graphs can each be held fixed; what the

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from markupsafe import Markup, escape
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.report.figures.agent_places import LABELLED, line_width, places
 from msg_analysis.report.figures.palette import GREY, INK, mode_colour, shorten
@@ -22,7 +22,7 @@ _SIDE = 200.0
 _WEIGHTS = 5  # different line widths
 
 
-def graph_drawings(experiment: Experiment) -> list[Markup]:
+def graph_drawings(experiment: ValidExperiment) -> list[Markup]:
     """The first ``MOST_GRAPHS`` graphs, each agent at the same place in all of them; leaders are squares."""
     where = _scaled(places(experiment.graph_list), experiment.agents)
     leaders = set(experiment.leaders.agents) if experiment.leaders else set()
@@ -101,7 +101,7 @@ def _at(point: FloatArray) -> str:
     return f"{point[0]:.1f} {point[1]:.1f}"
 
 
-def chain_drawing(experiment: Experiment) -> Markup | None:
+def chain_drawing(experiment: ValidExperiment) -> Markup | None:
     """The chain: a circle per graph, an arrow per rate (or probability) from one to another.
 
     None for a single graph, and for more than ``MOST_MODES``.

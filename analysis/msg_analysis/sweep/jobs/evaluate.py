@@ -44,13 +44,13 @@ def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
 
 
 def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
     if job.kind == "network":
         from msg_analysis.sweep.jobs.network_run import run_network
 
         return of_comparison(run_network(job, stopping))
-    experiment = Experiment.parse(json.loads(job.document), source="experiment")
+    experiment = ValidExperiment.parse(json.loads(job.document), source="experiment")
     if job.kind == "predict":
         from msg_analysis.theory.prediction import predict
 

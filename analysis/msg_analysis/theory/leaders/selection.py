@@ -17,7 +17,7 @@ import scipy.sparse.csgraph
 from msg_analysis.common.markdown import markdown_table
 from msg_analysis.common.number_words import number_text
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.spec import LeadersSpec
 from msg_analysis.model.step.sequential_law import build_run_model
 from msg_analysis.theory.leaders.search import Leaders, LeaderSearch, SearchProgress, ignore
@@ -37,7 +37,7 @@ MOST_SETS = 1_000_000  # number of sets beyond which enumeration is refused
 class LeaderProblem:
     """System error as a function of the set of leaders of an experiment, whose own leaders are ignored."""
 
-    experiment: Experiment
+    experiment: ValidExperiment
     law: SelectionLaw  # "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
     gain: float = math.inf  # kappa of the leaders [1 / unit of time]; inf holds them at the reference
 
@@ -172,7 +172,7 @@ class Selection:
         }
 
 
-def resolve_law(experiment: Experiment, law: SelectionLaw | None = None) -> SelectionLaw:
+def resolve_law(experiment: ValidExperiment, law: SelectionLaw | None = None) -> SelectionLaw:
     """``law`` if the experiment has it, else InputError; None stands for the paper's law, or else that of the steps."""
     if experiment.time == "discrete":
         possible: list[SelectionLaw] = ["discrete"]
@@ -191,7 +191,7 @@ def resolve_law(experiment: Experiment, law: SelectionLaw | None = None) -> Sele
 
 
 def system_error(
-    experiment: Experiment, agents: list[int], *, law: SelectionLaw | None = None, gain: float = math.inf
+    experiment: ValidExperiment, agents: list[int], *, law: SelectionLaw | None = None, gain: float = math.inf
 ) -> float:
     """E(S) with the given agents as leaders; inf where S does not reach all agents.
 
@@ -214,7 +214,9 @@ def system_error(
     return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(frozenset(agents))
 
 
-def joint_robustness_centrality(experiment: Experiment, agents: list[int], *, law: SelectionLaw | None = None) -> float:
+def joint_robustness_centrality(
+    experiment: ValidExperiment, agents: list[int], *, law: SelectionLaw | None = None
+) -> float:
     """1/E(S) in the exact limit of infinite gain (the paper's definition, Section 4); inf where E(S) is 0.
 
     Parameters
@@ -227,7 +229,7 @@ def joint_robustness_centrality(experiment: Experiment, agents: list[int], *, la
 
 
 def select_leaders(
-    experiment: Experiment,
+    experiment: ValidExperiment,
     count: int,
     *,
     method: SearchMethod = "auto",

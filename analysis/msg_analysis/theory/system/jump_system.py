@@ -16,7 +16,7 @@ from msg_analysis.model.network.markov_chain import Time
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import Experiment
+    from msg_analysis.model.experiment.experiment import ValidExperiment
     from msg_analysis.model.step.step_model import StepModel
 
 
@@ -124,7 +124,7 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
     )
 
 
-def continuous(experiment: Experiment) -> JumpSystem:
+def continuous(experiment: ValidExperiment) -> JumpSystem:
     """The paper's continuous-time system (Sections 3.1 and 3.2), without noise on the air, loss, delay or protocol.
 
     Leaders of infinite gain are the exact limit: their rows and columns are deleted, ``lift`` puts the zeros back.

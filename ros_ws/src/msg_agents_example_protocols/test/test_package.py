@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from ament_index_python.packages import get_package_share_directory
 
-from msg_analysis.model.experiment.experiment import Experiment
+from msg_analysis.model.experiment.experiment import ValidExperiment
 
 EXPERIMENTS = Path(get_package_share_directory("msg_agents_example_protocols")) / "experiments"
 
@@ -16,4 +16,4 @@ EXPERIMENTS = Path(get_package_share_directory("msg_agents_example_protocols")) 
 @pytest.mark.parametrize("name", ["metropolis", "saturated", "integral_action"])
 def test_protocol(name: str) -> None:
     assert name in entry_points(group="msg_agents.protocols").names
-    Experiment.load(EXPERIMENTS / f"{name}.yaml").require_available()
+    ValidExperiment.load(EXPERIMENTS / f"{name}.yaml").require_available()
