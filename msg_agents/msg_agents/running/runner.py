@@ -223,6 +223,8 @@ def _watch(
         began = began or now
         if reached < steps or not result.wall_time:
             result.wall_time = now - began
+    supervisor.read_status()  # what was reported between the last look and the end
+    view.look(supervisor.steps)
     if result.wall_time:
         result.rate = min(supervisor.steps, default=0) / result.wall_time
 

@@ -57,7 +57,7 @@ from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
 for file in map(Path, sys.argv[1:]):
-    write_trajectory(simulate(Experiment.load(file)), file.with_suffix(""))
+    write_trajectory(simulate(ValidExperiment.load(file)), file.with_suffix(""))
 """
 
 
