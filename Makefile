@@ -36,19 +36,17 @@ $(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
 	$(BIN)/msg-agents run $(EXPERIMENTS)/line_ring.yaml --out $(RUNS)
 
-# Networks wait a good part of their time, for discovery for example: more workers than cores, each network in a domain
-# of its own. Each worker gets neighbours in the list, so that most fixtures of a module are made once.
-CORES := $(shell getconf _NPROCESSORS_ONLN)
-AT_ONCE = --numprocesses $(shell echo $$(($(CORES) < 6 ? $(CORES) + 2 : 8))) --dist worksteal
+# Networks wait a good part of their time, for discovery for example: three at once, each in a domain of its own. Each
+# worker gets neighbours in the list, so that most fixtures of a module are made once.
+SEVERAL_AT_ONCE := --numprocesses 3 --dist worksteal
 
 # More options of pytest.
 TEST_OPTIONS ?=
 SKIPPED := build/skipped
 TEST := $(BIN)/python -m pytest --skipped-to $(SKIPPED) $(TEST_OPTIONS)
 
-test: setup ## Run all tests
-	@rm -f $(SKIPPED)
-	OPENBLAS_NUM_THREADS=1 $(TEST) $(AT_ONCE)
+test: test-fast ## Run all tests
+	$(TEST) $(SEVERAL_AT_ONCE) -m integration
 	@test ! -s $(SKIPPED) || { echo "Not tested:"; cat $(SKIPPED); } >&2
 
 test-fast: setup ## Run the tests that start no network
@@ -58,7 +56,7 @@ test-fast: setup ## Run the tests that start no network
 STRESS ?= 20
 
 stress: setup ## Repeat every random fault 20 times (STRESS=N: N times): half an hour or more
-	STRESS=$(STRESS) $(BIN)/python -m pytest --numprocesses 3 --dist worksteal --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py realtime.py hosts.py)
+	STRESS=$(STRESS) $(BIN)/python -m pytest $(SEVERAL_AT_ONCE) --verbose -k repetition_ $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py realtime.py hosts.py)
 
 fuzz: setup ## Damage 20,000 bags and 20,000 experiment files: only clean errors
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py

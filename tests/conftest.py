@@ -28,25 +28,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mix modules of tests that start networks, which wait a good part of their time, with those that compute."""
-    modules: dict[Path, list[pytest.Item]] = {}
-    for item in items:
-        modules.setdefault(item.path, []).append(item)
-    networks = {
-        path for path, tests in modules.items() if all(test.get_closest_marker("integration") for test in tests)
-    }
-    total = Counter(path in networks for path, tests in modules.items() for _ in tests)
-    before: Counter[bool] = Counter()
-    place = {}
-    for path, tests in modules.items():
-        kind = path in networks
-        place[path] = (before[kind] + len(tests) / 2) / total[kind]
-        before[kind] += len(tests)
-    items[:] = [item for path in sorted(modules, key=place.__getitem__) for item in modules[path]]
-
-
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """On the process that reports: with xdist, not on the workers."""
     config = session.config
