@@ -137,3 +137,9 @@ def test_wrong_matrices(change: dict[str, Any], complaint: str) -> None:
     text = json.loads(new_record(ValidExperiment.parse(document(CASES["discrete"]))).to_json()) | {"step": change}
     with pytest.raises(InputError, match=complaint):
         RunRecord.from_json(json.dumps(text), "here")
+
+
+def test_a_grounded_leader_starts_on_the_reference() -> None:
+    record = new_record(ValidExperiment.parse(document(CASES["grounded"])))
+    assert (record.start[2] == 2.0).all()
+    assert len(np.unique(record.start)) == 1 + 5 * 2

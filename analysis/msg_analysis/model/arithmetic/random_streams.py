@@ -2,7 +2,7 @@
 
 Every number of a run is a function of (seed, stream, agent, block of steps): the key of a counter-based Philox
 generator comes from the seed, its counter from the rest. So any process can compute any agent's noise at any step, a
-restarted agent draws the same numbers again, and another agent more changes nobody else's stream.
+restarted agent draws the same numbers again, and one more agent does not change the streams of the others.
 """
 
 from __future__ import annotations
