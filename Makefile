@@ -43,7 +43,8 @@ SEVERAL_AT_ONCE := --numprocesses 3 --dist worksteal
 # More options of pytest.
 TEST_OPTIONS ?=
 SKIPPED := build/skipped
-TEST := $(BIN)/python -m pytest --skipped-to $(SKIPPED) $(TEST_OPTIONS)
+# With "=": without, pytest takes an existing FILE for a path to test, before tests/conftest.py has defined the option.
+TEST := $(BIN)/python -m pytest --skipped-to=$(SKIPPED) $(TEST_OPTIONS)
 
 test: test-fast ## Run all tests
 	$(TEST) $(SEVERAL_AT_ONCE) -m integration
