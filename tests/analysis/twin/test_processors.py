@@ -126,6 +126,7 @@ def test_what_follows_from_the_experiment_is_not_in_the_record() -> None:
     ("change", "complaint"),
     [
         ({"weights": [[[1, 2, 0.5]]]}, "step.weights has 1 graphs, expected 2"),
+        ({"weights": [[], [], [[1, 2, 0.5]]]}, "step.weights has 3 graphs, expected 2"),
         ({"weights": [[[1, 7, 0.5]], []]}, "graph 1: expected entries"),
         ({"weights": [[], [[0, 1, 0.5]]]}, "graph 2: expected entries"),
         ({"weights": [[[1, 2, float("nan")]], []]}, "graph 1: expected entries"),

@@ -154,6 +154,8 @@ def _matrices(document: Any, experiment: ValidExperiment, source: str) -> StepMa
     stacks = {"noise_gain": experiment.step_noise_gain}
     for key in ("weights", "noise_gain")[: 2 if experiment.protocol else 1]:
         stack = np.zeros((len(experiment.graph_list), experiment.agents, experiment.agents))
+        if len(document[key]) != len(stack):
+            raise InputError(f"{source}: step.{key} has {len(document[key])} graphs, expected {len(stack)}")
         for mode, listed in enumerate(document[key]):
             entries = np.array(listed, dtype=float).reshape(-1, 3)
             agents = entries[:, :2].astype(np.int64) - 1
@@ -161,8 +163,6 @@ def _matrices(document: Any, experiment: ValidExperiment, source: str) -> StepMa
                 wanted = f"[agent, agent, finite number], agents from 1 to {experiment.agents}"
                 raise InputError(f"{source}: step.{key} of graph {mode + 1}: expected entries {wanted}")
             stack[mode, agents[:, 0], agents[:, 1]] = entries[:, 2]
-        if len(document[key]) != len(stack):
-            raise InputError(f"{source}: step.{key} has {len(document[key])} graphs, expected {len(stack)}")
         stacks[key] = stack
     return StepMatrices(**stacks)
 
