@@ -19,7 +19,7 @@ setup(
     ],
     zip_safe=False,
     # rclpy, std_msgs and the interfaces come with ROS 2, as system packages or as wheels: see package.xml.
-    install_requires=["click", "msg_analysis", "numpy", "rich", "threadpoolctl"],
+    install_requires=["click", "msg_analysis", "numpy", "rich", "setproctitle", "threadpoolctl"],
     extras_require={"test": ["pytest"]},  # by which colcon knows how to test it
     # What `ros2 run msg_agents` can run: the command line, and each node by itself.
     entry_points={

@@ -80,7 +80,7 @@ class Process:
     @property
     def kind(self) -> str:
         """Command of msg-agents that it runs: agent, switcher, recorder, run, ..."""
-        for program in ("msg_agents", str(PROGRAM)):
+        for program in ("msg_agents", "msg-agents", str(PROGRAM)):
             if program in self.command:
                 return self.command[self.command.index(program) + 1]
         return self.command[0] if self.command else ""
@@ -134,7 +134,7 @@ class Network:
             try:
                 if wanted not in (entry / "environ").read_bytes().split(b"\0"):
                     continue
-                command = (entry / "cmdline").read_bytes().decode().rstrip("\0").split("\0")
+                command = re.split("[\0 ]", (entry / "cmdline").read_bytes().decode().rstrip("\0 "))
             except OSError:
                 continue
             born = _born(int(entry.name))

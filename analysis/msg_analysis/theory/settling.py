@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
 import scipy.sparse.linalg
 
 from msg_analysis.errors import InputError
@@ -138,11 +137,12 @@ def _searched(flow: Flow, judge: _Judge, start: FloatArray, time: Time) -> float
             y, ticks = ahead, ticks + (1 << k)
     if time == "discrete":
         return float(ticks + 1)
+    from scipy.optimize import brentq  # here, since it takes long to import
 
     def excess(rest: float) -> float:
         return judge.excess(flow.restored(flow.over(rest)(y)))
 
-    return ticks * tick + float(scipy.optimize.brentq(excess, 0.0, tick, xtol=1e-9 * tick))
+    return ticks * tick + float(brentq(excess, 0.0, tick, xtol=1e-9 * tick))
 
 
 def _stepped(system: JumpSystem, judge: _Judge, away: Snapshot) -> float:

@@ -6,14 +6,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from msg_analysis.model.arithmetic.many_steps import ManySteps, Round
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.arithmetic.update_law import step
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.step.air_reception import AirReception, padded_inputs
+from msg_analysis.model.step.phases import phases
 from msg_analysis.model.step.process_noise import ProcessNoise
 from msg_analysis.model.step.step_model import StepModel
-from msg_analysis.twin.ideal_timers import IdealTimers
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
 def states(
@@ -24,54 +25,70 @@ def states(
     first: int = 0,
     reception: AirReception | None = None,
 ) -> Iterator[FloatArray]:
-    """x(first + 1), x(first + 2), ..., each (m, R), from x(first) under the graphs ``modes`` from there on.
+    """x(first + 1), x(first + 2), ..., from x(first) under the graphs ``modes`` from there on, in blocks (k, m, R).
 
     ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``reception``: one that keeps a log.
     """
-    drives = _drives(experiment, model, modes, first)
-    if experiment.run.pace == "realtime":
-        return IdealTimers(experiment, model).states(modes, start, drives)
-    if experiment.noise.on_air and reception is None:
-        reception = AirReception(experiment, model)
-    return _synchronous(model, modes, start, drives, reception, first)
+    blocks = _blocks(experiment, model, modes, first)
+    if experiment.noise.on_air:
+        return _heard(model, start, blocks, reception or AirReception(experiment, model))
+    phase = phases(experiment) if experiment.run.pace == "realtime" else np.zeros(model.agents)
+    return _undisturbed(ManySteps([_rounds(model, mode, phase) for mode in range(model.modes)]), start, blocks)
 
 
-def _drives(experiment: ValidExperiment, model: StepModel, modes: IntArray, first: int) -> Iterator[FloatArray]:
-    """For every step of a path of graphs, (m, R): the noise of all agents, plus what the reference adds."""
+Block = tuple[int, IntArray, FloatArray]
+"""First step, graphs (k,), and for every step (k, m, R) the noise of all agents plus what the reference adds."""
+
+
+def _blocks(experiment: ValidExperiment, model: StepModel, modes: IntArray, first: int) -> Iterator[Block]:
+    """A path of graphs in blocks of STEPS_PER_BLOCK steps, the last one shorter."""
     noise = ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas)
-    offsets = [offset[:, None] for offset in model.offsets]
-    for k, mode in enumerate(modes, start=first):
-        within = k % STEPS_PER_BLOCK
-        if within == 0:
-            noises = [noise.block(i, k // STEPS_PER_BLOCK) for i in range(model.agents)]
-            drives: dict[int, FloatArray] = {}
-        if mode not in drives:
-            drives[mode] = np.stack([of_agent[mode] for of_agent in noises], axis=1) + offsets[mode]
-        yield drives[mode][within]
+    for begin in range(0, len(modes), STEPS_PER_BLOCK):
+        now, number = modes[begin : begin + STEPS_PER_BLOCK], (first + begin) // STEPS_PER_BLOCK
+        of_agents = [noise.block(i, number) for i in range(model.agents)]
+        drives = np.empty((len(now), model.agents, experiment.run.replicas))
+        for mode in np.unique(now):
+            steps = np.flatnonzero(now == mode)
+            for i, of_agent in enumerate(of_agents):
+                drives[steps, i] = of_agent[mode][steps] + model.offsets[mode][i]
+        yield first + begin, now, drives
 
 
-def _synchronous(
-    model: StepModel,
-    modes: IntArray,
-    start: FloatArray,
-    drives: Iterator[FloatArray],
-    reception: AirReception | None,
-    first: int,
-) -> Iterator[FloatArray]:
-    rows = [_padded_rows(model, mode) for mode in range(model.modes)]
+def _undisturbed(law: ManySteps, start: FloatArray, blocks: Iterator[Block]) -> Iterator[FloatArray]:
     state = start
-    for k, (mode, drive) in enumerate(zip(modes, drives, strict=True), start=first):
-        weights, inputs = rows[mode]
-        values = reception.values(k, mode, state) if reception else [state[j] for j in inputs]
-        state = step(weights, values, drive)
-        yield state
+    for _, modes, drives in blocks:
+        made = law.advance(modes, state, drives)
+        yield made
+        state = made[-1]
 
 
-def _padded_rows(model: StepModel, mode: int) -> tuple[list[FloatArray], list[IntArray]]:
-    """All rows of W_mode at once: its d-th entries list holds every agent's d-th input, ascending, padded with zeros.
+def _heard(
+    model: StepModel, start: FloatArray, blocks: Iterator[Block], reception: AirReception
+) -> Iterator[FloatArray]:
+    weights = [list(_padded(model, mode)[2][:, :, None]) for mode in range(model.modes)]
+    state = start
+    for first, modes, drives in blocks:
+        made = np.empty_like(drives)
+        for k, mode in enumerate(modes):
+            state = step(weights[mode], reception.values(first + k, mode, state), drives[k])
+            made[k] = state
+        yield made
 
-    Adding 0 * x at the end of a row changes nothing, so every row comes out as the agent computes it alone.
-    """
+
+def _padded(model: StepModel, mode: int) -> tuple[IntArray, BoolArray, FloatArray]:
+    """``padded_inputs``, and the weight of each; 0 for padding, which changes no sum."""
     columns, there = padded_inputs(model, mode)
-    weights = np.where(there, model.nominal[mode, np.arange(model.agents), columns], 0.0)
-    return list(weights[:, :, None]), list(columns)
+    return columns, there, np.where(there, model.nominal[mode, np.arange(model.agents), columns], 0.0)
+
+
+def _rounds(model: StepModel, mode: int, phase: FloatArray) -> list[Round]:
+    """The agents in rounds: each in the first one after those of the neighbours that are due before it."""
+    m = model.agents
+    columns, there, weights = _padded(model, mode)
+    earlier = there & (phase[columns] < phase)
+    number = np.zeros(m, dtype=np.int64)
+    for i in np.argsort(phase).tolist():
+        number[i] = 1 + max(number[columns[earlier[:, i], i]], default=-1)
+    rows = columns + m * earlier
+    chosen = [np.flatnonzero(number == one) for one in range(int(number.max()) + 1)]
+    return [Round(agents, rows[:, agents], there[:, agents], weights[:, agents]) for agents in chosen]

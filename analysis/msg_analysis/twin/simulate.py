@@ -16,7 +16,7 @@ from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.model.step.air import LOST
 from msg_analysis.model.step.air_reception import AirReception
 from msg_analysis.model.step.step_model import StepMatrices, StepModel, build_model
-from msg_analysis.twin.ideal_timers import IdealTimers
+from msg_analysis.twin.ideal_timers import ideal_log
 from msg_analysis.twin.network_steps import states as states_of_all
 from msg_analysis.twin.start import draw_start
 from msg_analysis.types import BoolArray
@@ -50,10 +50,12 @@ def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) ->
     states = np.empty((experiment.steps + 1, *record.start.shape))
     states[0] = record.start
     reception = AirReception(experiment, model, experiment.steps) if experiment.noise.on_air else None
-    for k, state in enumerate(states_of_all(experiment, model, modes, record.start, reception=reception), start=1):
-        states[k] = state
+    known = 1
+    for block in states_of_all(experiment, model, modes, record.start, reception=reception):
+        states[known : known + len(block)] = block
+        known += len(block)
     if experiment.run.pace == "realtime":
-        agent_modes, used, made = IdealTimers(experiment, model).log(modes)
+        agent_modes, used, made = ideal_log(experiment, model, modes)
         whole = Completeness(states.shape[0] * states.shape[1], states.shape[0] * states.shape[1], 0)
         return Trajectory(record, states, modes, whole, agent_modes, used=used, made=made)
     published, lost = reception.log(states[-1], modes) if reception else (None, None)

@@ -62,8 +62,8 @@ def _end_of_the_past(
     In consensus only differences between agents are stationary: their average is put to 0.
     """
     state = np.full((experiment.agents, experiment.run.replicas), model.reference)
-    for state in states(experiment, model, past_modes(experiment, first_mode, steps), state, -steps):  # noqa: B007, B020
-        pass
+    for block in states(experiment, model, past_modes(experiment, first_mode, steps), state, -steps):
+        state = block[-1]
     rounding = 2.0**-40 * float(np.abs(state).max())
     if experiment.problem == "consensus":
         state = state - weighted_sum([1.0 / len(state)] * len(state), list(state))

@@ -103,6 +103,11 @@ def main() -> None:
     default=True,
     help="Pin each process to one core if there are more processes than cores: faster (lockstep).",
 )
+@click.option(
+    "--fork/--no-fork",
+    default=True,
+    help="Fork the processes from one that has imported everything: faster to start (Linux).",
+)
 @storage_options
 @web_options
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
@@ -121,6 +126,7 @@ def run(
     domain: int | None,
     use_sim_time: bool,
     pin: bool,
+    fork: bool,
     compression: Compression,
     split_size: float | None,
     web: int | None,
@@ -150,6 +156,7 @@ def run(
                 use_sim_time=use_sim_time,
                 storage=storage(compression, split_size),
                 pin=pin,
+                fork=fork,
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
             )

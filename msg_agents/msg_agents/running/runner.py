@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from msg_agents.processes.core_pinning import available_cores, place
 from msg_agents.processes.environment import RESTARTS, node_environment
+from msg_agents.processes.fork_server import ForkServer
 from msg_agents.processes.process_plan import Share, count_processes, plan_network
 from msg_agents.processes.ros_domain import free_domain
 from msg_agents.recovery.checkpoint import room_for
@@ -98,6 +99,7 @@ def run_network(
     use_sim_time: bool = False,
     storage: Storage = DEFAULT_STORAGE,
     pin: bool = True,
+    fork: bool = True,
     on_progress: Callable[[int], None] = lambda _: None,
     on_note: Callable[[str], None] = lambda _: None,
     view: View | None = None,
@@ -126,6 +128,9 @@ def run_network(
         compression and file size of the bag
     pin
         whether each process of a run in lockstep keeps to one core, if there are more processes than cores
+    fork
+        whether processes are forked from one that has imported everything (Linux), and so start in a fraction of the
+        time; False: each starts on its own, as a tracer such as LTTng needs
     on_progress
         called about 20 times a second, once all agents have started, with the step that every agent has reached
     on_note
@@ -159,34 +164,35 @@ def run_network(
     bag = directory if share is None or share.home else None
     result = RunResult(bag)
     try:
-        record = record or new_record(experiment)
-        longest = state_frame(record, whole=True).size
-        keeping = workshop(experiment.agents * room_for(longest)) if restarts else nullcontext()
-        with workshop() as folder, keeping as checkpoints:
-            run_file = folder / "run.json"
-            run_file.write_text(record.to_json(), encoding="utf-8")
-            with (
-                free_domain() if domain is None else nullcontext(domain) as chosen,
-                Interruption() as interruption,
-                Supervisor(folder, node_environment(chosen) | dict(environment or {})) as supervisor,
-            ):
-                plans = plan_network(
-                    experiment,
-                    run_file,
-                    bag,
-                    checkpoints=checkpoints,
-                    use_sim_time=use_sim_time,
-                    storage=storage,
-                    share=share,
-                )
-                if pin and experiment.run.pace == "lockstep":
-                    supervisor.cores = place(plans, available_cores(), first=chosen)
-                supervisor.start(plans)
-                view.begin(record, checkpoints if share is None else None)
-                _watch(supervisor, experiment.steps, result, restarts, interruption, view)
-                view.end()
-                # Before the supervisor ends the rest: what ends because we end it has not failed.
-                _collect_failures(supervisor, result, interruption, restarts)
+        with workshop() as folder, free_domain() if domain is None else nullcontext(domain) as chosen:
+            variables = node_environment(chosen) | dict(environment or {})
+            with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
+                record = record or new_record(experiment)
+                run_file = folder / "run.json"
+                run_file.write_text(record.to_json(), encoding="utf-8")
+                longest = state_frame(record, whole=True).size
+                with (
+                    workshop(experiment.agents * room_for(longest)) if restarts else nullcontext() as checkpoints,
+                    Interruption() as interruption,
+                    Supervisor(folder, variables, fork_server=fork_server) as supervisor,
+                ):
+                    plans = plan_network(
+                        experiment,
+                        run_file,
+                        bag,
+                        checkpoints=checkpoints,
+                        use_sim_time=use_sim_time,
+                        storage=storage,
+                        share=share,
+                    )
+                    if pin and experiment.run.pace == "lockstep":
+                        supervisor.cores = place(plans, available_cores(), first=chosen)
+                    supervisor.start(plans)
+                    view.begin(record, checkpoints if share is None else None)
+                    _watch(supervisor, experiment.steps, result, restarts, interruption, view)
+                    view.end()
+                    # Before the supervisor ends the rest: what ends because we end it has not failed.
+                    _collect_failures(supervisor, result, interruption, restarts)
             result.strangers = supervisor.account().strangers()
             if bag is not None:
                 _settle(bag, result)
@@ -248,7 +254,7 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
             return False
         step = min((supervisor.steps[i] for i in child.plan.agents), default=-1) if supervisor.steps else -1
         after = f" after step {step}" if step >= 0 else ""
-        words = f" ({child.last_words()})" if child.process.returncode == CRASHED else ""
+        words = f" ({child.last_words()})" if child.process.poll() == CRASHED else ""
         result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
         view.note(result.restarts[-1])
         supervisor.restart(child)

@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Self
 
 from msg_agents.processes.core_pinning import keep_to
+from msg_agents.processes.fork_server import ForkServer, ForkServerError, Process
 from msg_agents.processes.process_plan import RECORDER, SWITCHER, ProcessPlan
 from msg_agents.processes.status_file import Account, read_accounts
 
@@ -42,7 +43,7 @@ class Child:
     """A process of the network."""
 
     plan: ProcessPlan
-    process: subprocess.Popen[bytes]
+    process: Process
     log: Path  # file of what it printed
     number: int = 1  # of this start; 2: restarted once
 
@@ -103,6 +104,7 @@ class Supervisor:
     children: list[Child] = field(default_factory=list)  # as started; a restarted one keeps its place
     steps: list[int] = field(default_factory=list)  # newest step of every agent, as reported
     cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
+    fork_server: ForkServer | None = None  # without one, or when it has ended, every child starts on its own
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _status: tuple[int, int] = field(default=(-1, -1), init=False)
     _pending: bytes = field(default=b"", init=False)
@@ -124,24 +126,33 @@ class Supervisor:
         account = self.logs / ACCOUNTS / f"{plan.name}.{number}.json"
         account.parent.mkdir(exist_ok=True)
         self._accounts.append(account)
-        options = ["--lifeline", str(self._lifeline[0]), "--account", str(account)]
-        descriptors = [self._lifeline[0]]
+        arguments = [*plan.arguments, "--account", str(account)]
+        descriptors = {"--lifeline": self._lifeline[0]}
         if plan.name == SWITCHER:
-            options += ["--status", str(self._status[1])]
-            descriptors.append(self._status[1])
+            descriptors["--status"] = self._status[1]
         with log.open("ab") as output:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "msg_agents", *plan.arguments, *options],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=dict(self.environment),
-                pass_fds=descriptors,
-                start_new_session=True,
-            )
-        if plan.name in self.cores:
-            keep_to(process.pid, self.cores[plan.name])
+            process = self._launch(arguments, descriptors, output.fileno(), self.cores.get(plan.name))
         return Child(plan, process, log, number)
+
+    def _launch(
+        self, arguments: Sequence[str], descriptors: Mapping[str, int], output: int, core: int | None
+    ) -> Process:
+        if self.fork_server is not None:
+            with contextlib.suppress(ForkServerError):
+                return self.fork_server.fork(arguments, descriptors, output, core)
+        options = [word for option, number in descriptors.items() for word in (option, str(number))]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "msg_agents", *arguments, *options],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=dict(self.environment),
+            pass_fds=list(descriptors.values()),
+            start_new_session=True,
+        )
+        if core is not None:
+            keep_to(process.pid, core)
+        return process
 
     def read_status(self) -> None:
         """Read what the switcher has reported since the last call; does not block."""

@@ -8,13 +8,14 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("rclpy")
+
+from waiting import gone, participants, wait_for
 
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.process_plan import ProcessPlan
@@ -75,28 +76,6 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = [(number, 0.3 if number != signal.SIGKILL else 5.0) for number, _ in module.ESCALATION]
     assert [number for number, _ in stages] == [signal.SIGINT, signal.SIGTERM, signal.SIGKILL]
     monkeypatch.setattr(module, "ESCALATION", stages)
-
-
-def wait_for(condition: Callable[[], object], seconds: float = 30.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
-
-
-def gone(pid: int) -> bool:
-    """No such process, or only what is left of it in its parent's books."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return True
-
-
-def participants(domain: int) -> int:
-    """Number of processes of this machine in a ROS domain: each has a port of its own (RTPS, 9.6.1.1)."""
-    lines = Path("/proc/net/udp").read_text().splitlines()[1:]
-    ports = {int(line.split()[1].rpartition(":")[2], 16) for line in lines}
-    return sum(7400 + 250 * domain + 10 + 2 * number in ports for number in range(119))
 
 
 @pytest.mark.usefixtures("impatient")

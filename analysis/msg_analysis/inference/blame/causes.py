@@ -14,14 +14,15 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
 
+from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.common.number_words import percent
 from msg_analysis.inference.blame import suspects
 from msg_analysis.inference.blame.switching_rates import find_rates
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
 from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import BroadcastSums, LossTally
 from msg_analysis.inference.hypothesis_tests.switching import Transitions
+from msg_analysis.inference.statistics.distributions import binomial_interval, log_normal_tail
 from msg_analysis.inference.statistics.forward_selection import Selected, select
 from msg_analysis.model.network.markov_chain import MarkovChain
 
@@ -129,7 +130,7 @@ def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list
 
 def _frozen_words(agent: int, still: int, steps: int) -> Cause:
     share = still / steps
-    low, high = _share_interval(still, steps)
+    low, high = binomial_interval(still, steps)
     when = "in any of its steps" if still == steps else f"in {percent(share)} of its steps"
     words = f"agent {agent + 1} does not move {when}, although it has noise"
     return Cause("frozen", words, agent=agent + 1, estimate=share, interval=(low, high), expected=0.0, p=0.0)
@@ -216,9 +217,9 @@ def _correlations(sums: InnovationSums, pardoned: Sequence[int], families: int, 
         if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
             continue
         z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
-        log_p = math.log(2.0 * len(pairs) * families) + float(stats.norm.logsf(abs(z)))
+        log_p = math.log(2.0 * len(pairs) * families) + float(log_normal_tail(abs(z)))
         if log_p < math.log(level):
-            half = float(stats.norm.ppf(0.975)) / math.sqrt(samples - 3)
+            half = HALF_WIDTH_95 / math.sqrt(samples - 3)
             interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
             words = (
                 f"the noise of agents {j + 1} and {i + 1} has correlation {_numbers(seen, interval)}, "
@@ -274,7 +275,7 @@ def _loss_words(one: Selected, tally: LossTally) -> Cause:
         chosen = (receiver if part == "receiver" else sender) == what
         agent, whose = what + 1, f"the messages {'to' if part == 'receiver' else 'of'} agent {what + 1}"
     lost, messages = int(tally.lost[chosen].sum()), int(tally.messages[chosen].sum())
-    share, interval = lost / messages, _share_interval(lost, messages)
+    share, interval = lost / messages, binomial_interval(lost, messages)
     words = (
         f"{percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %) of {whose} are lost, "
         f"not {percent(tally.probability)}"
@@ -304,9 +305,3 @@ def _unknown(rejected: Sequence[str]) -> Cause:
 
 def _numbers(value: float, interval: tuple[float, float]) -> str:
     return f"{value:#.3g} ({interval[0]:#.3g} to {interval[1]:#.3g})"
-
-
-def _share_interval(count: int, total: int) -> tuple[float, float]:
-    """95 %, exact (Clopper and Pearson 1934)."""
-    low = float(stats.beta.ppf(0.025, count, total - count + 1)) if count else 0.0
-    return low, float(stats.beta.ppf(0.975, count + 1, total - count)) if count < total else 1.0

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize, stats
 
+from msg_analysis.inference.statistics.distributions import chi2_quantile
 from msg_analysis.inference.statistics.forward_selection import Candidate, select
 from msg_analysis.model.network.markov_chain import MarkovChain
 from msg_analysis.types import BoolArray, FloatArray, IntArray
@@ -78,6 +78,8 @@ def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, l
 
 def _likeliest(counts: IntArray, chain: MarkovChain, dt: float, chosen: BoolArray) -> tuple[float, tuple[float, float]]:
     """Logarithm of the factor of the chosen jumps, and the interval in which 2 log L falls by less than 3.84."""
+    from scipy import optimize  # here, since few comparisons come this far
+
     highest = WIDEST
     if chain.time == "discrete":  # the diagonal must not become negative
         given = (chain.matrix * chosen).sum(axis=1)
@@ -93,7 +95,7 @@ def _likeliest(counts: IntArray, chain: MarkovChain, dt: float, chosen: BoolArra
 
     bounds = (-WIDEST, highest)
     theta = float(optimize.minimize_scalar(less, bounds=bounds, method="bounded", options={"xatol": 1e-7}).x)
-    allowed = less(theta) + float(stats.chi2.ppf(0.95, 1)) / 2.0
+    allowed = less(theta) + float(chi2_quantile(0.05, 1)) / 2.0
     ends = []
     for bound in bounds:
         inside = less(bound) <= allowed

@@ -6,10 +6,11 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
+from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.inference.errors.time_means import TimeMeans
 from msg_analysis.inference.hypothesis_tests.innovations import quadratic_form
+from msg_analysis.inference.statistics.distributions import chi2_tail, fisher_tail, two_sided
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
@@ -45,7 +46,7 @@ class Estimate:
         """95 % confidence interval around the measured error."""
         if self.measured is None or self.standard_error is None:
             return None, None
-        half = float(stats.norm.ppf(0.975)) * self.standard_error
+        half = HALF_WIDTH_95 * self.standard_error
         return self.measured - half, self.measured + half
 
     def to_json(self) -> dict[str, Any]:
@@ -98,7 +99,7 @@ def estimate(measured: float, predicted: float, error: float, scale: float) -> E
     if error <= 1e-12 * scale or error == 0.0:  # without noise: rounding only
         return Estimate(float(measured), float(predicted), float(error))
     z = float((measured - predicted) / error)
-    return Estimate(float(measured), float(predicted), float(error), z, float(2 * stats.norm.sf(abs(z))))
+    return Estimate(float(measured), float(predicted), float(error), z, float(two_sided(z)))
 
 
 def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
@@ -129,10 +130,10 @@ def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
     chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
     p: float | None = None
     if dof and not means.squares:
-        p = float(stats.chi2.sf(chi2, dof))
+        p = float(chi2_tail(chi2, dof))
     elif dof and means.squares > dof:
         # The covariance is itself estimated, from this many squares. Chi-square would reject too often; Hotelling's
         # law, which assumes that all of it is estimated, rejects slightly too seldom.
         rest = means.squares - dof
-        p = float(stats.f.sf(chi2 * rest / (dof * (means.squares - 1)), dof, rest))
+        p = float(fisher_tail(chi2 * rest / (dof * (means.squares - 1)), dof, rest))
     return CovarianceTest(measured, predicted, chi2, dof, p)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from msg_analysis.inference.errors.time_means import TimeMeans
+from msg_analysis.inference.statistics.distributions import two_sided
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.types import FloatArray, IntArray
 
@@ -110,7 +110,7 @@ def rank_estimates(
     if not usable.any():
         return None
     first, second, difference, error = first[usable], second[usable], difference[usable], np.sqrt(variance[usable])
-    adjusted = holm(2.0 * stats.norm.sf(np.abs(difference / error)))
+    adjusted = holm(two_sided(difference / error))
     apart = np.flatnonzero(adjusted < level)
     found = [
         _distinction(*_sorted(first[a], second[a], difference[a]), abs(difference[a]), error[a], adjusted[a], predicted)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from msg_analysis.inference.hypothesis_tests.gain_regression import MAX_REGRESSORS, StateRegression
 from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
@@ -21,7 +20,8 @@ from msg_analysis.inference.observed.heard_values import (
     full_reception_noise,
 )
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.statistics.covariance_test import covariance_statistic
+from msg_analysis.inference.statistics.distributions import chi2_tail, two_sided
+from msg_analysis.inference.statistics.normal_covariance import covariance_statistic
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.types import FloatArray, IntArray
 
@@ -114,7 +114,7 @@ class InnovationSums:
         if self.quiet > max(QUIET_ROUNDING * self.largest, hidden):
             p_covariance = 0.0
         chi2, dof = quadratic_form(self.score, self.covariance)
-        p_gain = float(stats.chi2.sf(chi2, dof)) if dof else None
+        p_gain = float(chi2_tail(chi2, dof)) if dof else None
         p_common_gain = self._common_gain_p() if dof else None
         return InnovationTests(p_covariance, p_whiteness, p_gain, p_common_gain, ratios, int(self.samples.sum()))
 
@@ -136,7 +136,7 @@ class InnovationSums:
         variance = float(weights @ self.covariance @ weights)
         if variance <= 0.0:
             return None
-        return float(2.0 * stats.norm.sf(abs(float(weights @ self.score)) / np.sqrt(variance)))
+        return float(two_sided(float(weights @ self.score) / np.sqrt(variance)))
 
     def _add(self, observation: Observation, regression: StateRegression | HeardRegression) -> None:
         """One pass over the run."""
@@ -181,7 +181,7 @@ class InnovationSums:
                 scatter = whitener @ self.scatter[group].sum(axis=0) @ whitener.T
                 part = covariance_statistic(scatter, samples)
                 statistic, dof = statistic + part[0], dof + part[1]
-        return float(stats.chi2.sf(statistic, dof)) if dof else None
+        return float(chi2_tail(statistic, dof)) if dof else None
 
 
 def innovations(observation: Observation, first: int, last: int, reception: HeardValues | None = None) -> FloatArray:
@@ -267,7 +267,7 @@ class Whiteness:
             pairs = self._steps * self._replicas * (self._replicas - 1) / 2
             chi2 += float((self._pairs**2 / size**2).sum() / pairs)
             dof += self.rank
-        return float(stats.chi2.sf(chi2, dof))
+        return float(chi2_tail(chi2, dof))
 
 
 def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, int]:

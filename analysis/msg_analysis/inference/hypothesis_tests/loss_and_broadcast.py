@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from msg_analysis.inference.observed.heard_values import mode_links
 from msg_analysis.inference.observed.measurement import Measurement
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.statistics.covariance_test import covariance_statistic
+from msg_analysis.inference.statistics.distributions import chi2_quantile, chi2_tail
+from msg_analysis.inference.statistics.normal_covariance import covariance_statistic
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 MIN_EXPECTED_LOSSES = 25.0  # smallest expected count for which a chi-square law is used
@@ -83,12 +83,14 @@ class LossTally:
         dof = int(often.sum())
         rest, rest_lost = int(messages[~often].sum()), int(lost[~often].sum())
         if rest:
-            p = float(stats.binomtest(rest_lost, rest, probability).pvalue)
-            chi2, dof = chi2 + float(stats.chi2.isf(p, 1)), dof + 1
+            from scipy.stats import binomtest  # here, since it takes longer to import than all the rest
+
+            p = float(binomtest(rest_lost, rest, probability).pvalue)
+            chi2, dof = chi2 + float(chi2_quantile(p, 1)), dof + 1
         for product, pairs in ((self.successive, self.successive_pairs), (self.same_step, self.same_step_pairs)):
             if pairs * rarer**2 >= MIN_EXPECTED_LOSSES:
                 chi2, dof = chi2 + product**2 / (variance**2 * pairs), dof + 1
-        p = float(stats.chi2.sf(chi2, dof))
+        p = float(chi2_tail(chi2, dof))
         return LossTest(int(lost.sum()), float(probability * messages.sum()), p)
 
     def _add(
@@ -153,4 +155,4 @@ class BroadcastSums:
     def p_value(self) -> float:
         """p-value of published - state being N(0, s^2 I), s = ``noise.broadcast``."""
         statistic, dof = covariance_statistic(self.scatter, self.samples)
-        return float(stats.chi2.sf(statistic, dof))
+        return float(chi2_tail(statistic, dof))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy import stats
 
+from msg_analysis.inference.statistics.distributions import chi2_tail, gamma_tail
 from msg_analysis.model.network.markov_chain import stationary_law
 from msg_analysis.types import FloatArray, IntArray
 
@@ -58,25 +60,21 @@ class Transitions:
         usual = counts.sum() * stationary_law(transition)[:, None] * transition
         if usual[transition > 0.0].min() >= MIN_EXPECTED_TRANSITIONS:
             chi2 = float(likelihood_ratio(counts, transition))
-            return SwitchingTest(counts, expected, float(stats.chi2.sf(chi2, dof)))
+            return SwitchingTest(counts, expected, float(chi2_tail(chi2, dof)))
         return SwitchingTest(counts, expected, self._simulated_p(transition))
 
     def _simulated_p(self, transition: FloatArray) -> float:
         counts = self.counts
         jumps = max(1.0, float(counts.sum(axis=1) @ (1.0 - np.diag(transition))))
         number = int(np.clip(MAX_JUMPS / jumps, 199, PATHS))
-        random = np.random.default_rng(SEED)
-        total = np.zeros((number, *counts.shape), dtype=np.int64)
-        for first, transitions in self.paths:
-            total += simulate_counts(transition, first, transitions, number, random)
-        drawn = likelihood_ratio(total, transition)
+        drawn = _drawn(transition.tobytes(), self.paths, number)
         observed = float(likelihood_ratio(counts, transition))
         # Ties (with few jumps there are few possible values) count as at least as extreme.
         above = int((drawn >= observed * (1 - 1e-12)).sum())
         if above or drawn.std() == 0.0:
             return (above + 1) / (number + 1)
         shape = (drawn.mean() / drawn.std()) ** 2
-        return float(min(1 / (number + 1), stats.gamma.sf(observed, shape, scale=drawn.mean() / shape)))
+        return float(min(1 / (number + 1), gamma_tail(observed, shape, drawn.mean() / shape)))
 
 
 def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
@@ -115,6 +113,17 @@ def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = counts * np.log(counts / (counts.sum(axis=-1, keepdims=True) * transition))
     return np.asarray(2.0 * np.where(counts > 0, terms, 0.0).sum(axis=(-2, -1)))
+
+
+@lru_cache(maxsize=8)  # the runs of a sweep with one experiment and several seeds draw the same paths
+def _drawn(law: bytes, paths: tuple[tuple[int, int], ...], number: int) -> FloatArray:
+    """(number,) statistics of simulated paths, each from its first graph with so many transitions; n x n ``law``."""
+    transition = np.frombuffer(law).reshape(math.isqrt(len(law) // 8), -1)
+    random = np.random.default_rng(SEED)
+    total = np.zeros((number, *transition.shape), dtype=np.int64)
+    for first, transitions in paths:
+        total += simulate_counts(transition, first, transitions, number, random)
+    return likelihood_ratio(total, transition)
 
 
 def simulate_counts(

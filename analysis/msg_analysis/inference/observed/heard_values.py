@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import stats
 
 from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.statistics.distributions import chi2_below, chi2_tail
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.step_model import StepModel, Wiring
 from msg_analysis.types import FloatArray, IntArray
@@ -181,8 +181,7 @@ class Equalizer:
         """Two-sided p-value of the total size of all innovations; None without noise."""
         if not self.dof:
             return None
-        law = stats.chi2(self.dof)
-        return float(min(1.0, 2.0 * min(law.sf(self.chi2), law.cdf(self.chi2))))
+        return float(min(1.0, 2.0 * min(chi2_tail(self.chi2, self.dof), chi2_below(self.chi2, self.dof))))
 
 
 def _root(matrix: FloatArray, power: float) -> tuple[FloatArray, int]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
 
 from msg_analysis.common.number_words import percent
 from msg_analysis.inference.errors.estimates import Estimate, covariance_test, estimates
@@ -15,6 +14,7 @@ from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.realtime.event_order import EventOrder, sampled
 from msg_analysis.inference.realtime.logged_pattern import PatternUnavailableError, pattern_means, timing_effect
 from msg_analysis.inference.realtime.timing import Timing
+from msg_analysis.inference.statistics.distributions import two_sided
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.theory.prediction import LAW_NAMES
 
@@ -153,7 +153,7 @@ def _continuous(observation: Observation, sequential: Estimate, level: float, la
         why = "only its steady state is predicted, and the run did not start there"
         return Law(Estimate(sequential.measured, predicted), None, why)
     z = (sequential.measured - predicted) / sequential.standard_error
-    p = float(2.0 * stats.norm.sf(abs(z)))
+    p = float(two_sided(z))
     error = Estimate(sequential.measured, predicted, sequential.standard_error, z, p)
     effect = observation.prediction.emulated.system_error / predicted - 1.0
     why = (

@@ -22,7 +22,7 @@ from msg_analysis.inference.observed.observation import Observation, Timers
 from msg_analysis.inference.realtime.event_order import EventOrder, order_events, sampled
 from msg_analysis.inference.realtime.pattern_events import Periods
 from msg_analysis.theory.system import packed_symmetric
-from msg_analysis.twin.ideal_timers import IdealTimers
+from msg_analysis.twin.ideal_timers import ideal_log
 from msg_analysis.types import FloatArray
 
 MAX_WORK = 6e10  # multiplications, at most (about a minute); the joint test is left out first, then the node errors
@@ -52,7 +52,7 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
         None where the expected error is 0
     """
     experiment = observation.prediction.experiment
-    graphs, used, made = IdealTimers(experiment, observation.step).log(observation.modes)
+    graphs, used, made = ideal_log(experiment, observation.step, observation.modes)
     ideal = replace(observation, timers=Timers(graphs[1:], used, made))
     total = _forward(Periods(ideal, order_events(ideal).position), _start(observation))[0]
     lift = observation.prediction.system.lift

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
 
+from msg_analysis.inference.statistics.distributions import student_quantile
 from msg_analysis.types import FloatArray
 
 BATCHES = 20
@@ -33,5 +33,5 @@ def batch_interval(series: FloatArray, level: float = 0.95) -> tuple[float, floa
         return None
     # The remainder is dropped at the beginning, where the start may still have an effect.
     means = series[len(series) - length * BATCHES :].reshape(BATCHES, length).mean(axis=1)
-    half = stats.t.ppf(0.5 + level / 2, BATCHES - 1) * means.std(ddof=1) / np.sqrt(BATCHES)
+    half = student_quantile(0.5 + level / 2, BATCHES - 1) * means.std(ddof=1) / np.sqrt(BATCHES)
     return float(means.mean() - half), float(means.mean() + half)

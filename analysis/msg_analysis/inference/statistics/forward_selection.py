@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
+from msg_analysis.common.intervals import HALF_WIDTH_95
+from msg_analysis.inference.statistics.distributions import log_normal_tail
 from msg_analysis.types import BoolArray, FloatArray
 
 MOST = 6  # causes searched for in one group
@@ -38,7 +39,7 @@ class Selected:
     @property
     def interval(self) -> tuple[float, float]:
         """95 %."""
-        half = float(stats.norm.ppf(0.975)) * self.standard_error
+        half = HALF_WIDTH_95 * self.standard_error
         return self.estimate - half, self.estimate + half
 
 
@@ -111,7 +112,7 @@ def _log_p(scores: FloatArray, full: FloatArray, chosen: list[int]) -> FloatArra
     possible: BoolArray = left > SAME * np.maximum(own, own.max(initial=0.0) * SAME)
     z = np.zeros(len(scores))
     z[possible] = rest[possible] / np.sqrt(left[possible])
-    return np.where(possible, math.log(2.0) + stats.norm.logsf(np.abs(z)), 0.0)
+    return np.where(possible, math.log(2.0) + log_normal_tail(np.abs(z)), 0.0)
 
 
 def _distinct(classes: Sequence[Sequence[Candidate]], families: int) -> tuple[list[Candidate], FloatArray]:

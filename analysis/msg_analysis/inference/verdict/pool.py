@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from msg_analysis.errors import InputError
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.statistics.distributions import chi2_tail
 from msg_analysis.inference.verdict import compare
 from msg_analysis.inference.verdict.comparison import Comparison, Member, Pool
 from msg_analysis.inference.verdict.evidence import Evidence
@@ -152,4 +152,4 @@ def _pool(members: list[Member]) -> Pool:
     deviation, precision = np.array(z) * np.array(errors), 1.0 / np.array(errors) ** 2
     mean = float(precision @ deviation / precision.sum())
     chi2 = float(precision @ (deviation - mean) ** 2)
-    return Pool(tuple(members), chi2, len(z) - 1, float(stats.chi2.sf(chi2, len(z) - 1)))
+    return Pool(tuple(members), chi2, len(z) - 1, float(chi2_tail(chi2, len(z) - 1)))

@@ -1,4 +1,18 @@
 from collections.abc import Sequence
 
+from msg_analysis.types import FloatArray, IntArray
+
 def combine(weights: Sequence[float], payloads: Sequence[bytes], drive: bytes, /) -> bytes: ...
 def all_finite(payload: bytes, /) -> bool: ...
+def advance(
+    order: IntArray,
+    offsets: IntArray,
+    columns: IntArray,
+    weights: FloatArray,
+    modes: IntArray,
+    drives: FloatArray,
+    states: FloatArray,
+    agents: int,
+    replicas: int,
+    /,
+) -> None: ...

@@ -8,8 +8,10 @@ restarted agent draws the same numbers again, and one more agent does not change
 from __future__ import annotations
 
 from enum import IntEnum
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from msg_analysis.types import FloatArray
 
@@ -36,9 +38,14 @@ def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.r
     ``agent`` counts from 0 (0 where the stream belongs to no agent), or is a ``link_number``. ``block`` is the step //
     STEPS_PER_BLOCK, negative for the steps before the start.
     """
-    key = np.random.SeedSequence(seed).generate_state(2, np.uint64)
     counter = np.array([0, block % 2**64, agent, int(stream)], dtype=np.uint64)
-    return np.random.Generator(np.random.Philox(key=key, counter=counter))
+    return np.random.Generator(np.random.Philox(key=_key(seed), counter=counter))
+
+
+@lru_cache(maxsize=16)
+def _key(seed: int) -> NDArray[np.uint64]:
+    key: NDArray[np.uint64] = np.random.SeedSequence(seed).generate_state(2, np.uint64).astype(np.uint64, copy=False)
+    return key
 
 
 def link_number(receiver: int, sender: int) -> int:

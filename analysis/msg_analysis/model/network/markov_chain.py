@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -117,8 +118,9 @@ class MarkovChain:
             the stream to draw from; equal streams give equal paths
         """
         off_diagonal = self.matrix - np.diag(np.diag(self.matrix))
-        leaving = off_diagonal.sum(axis=1)
-        mode = _draw(initial, random)
+        leaving = off_diagonal.sum(axis=1).tolist()
+        jumps = [_cumulative(law / rate) if rate > 0.0 else [] for law, rate in zip(off_diagonal, leaving, strict=True)]
+        mode = _draw(_cumulative(initial), random)
         while True:
             if leaving[mode] == 0.0:
                 yield mode, np.inf
@@ -128,10 +130,14 @@ class MarkovChain:
             else:
                 held = float(random.geometric(min(leaving[mode], 1.0)))
             yield mode, held
-            mode = _draw(off_diagonal[mode] / leaving[mode], random)
+            mode = _draw(jumps[mode], random)
 
 
-def _draw(law: FloatArray, random: np.random.Generator) -> int:
+def _cumulative(law: FloatArray) -> list[float]:
+    sums: list[float] = np.cumsum(law).tolist()
+    return sums
+
+
+def _draw(cumulative: list[float], random: np.random.Generator) -> int:
     """Index drawn by inversion from one uniform number."""
-    cumulative = np.cumsum(law)
-    return int(np.searchsorted(cumulative, random.random() * cumulative[-1], side="right"))
+    return bisect_right(cumulative, random.random() * cumulative[-1])

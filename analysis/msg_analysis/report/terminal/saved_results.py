@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.text import Text
-from scipy import stats
 
 from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.common.markdown import markdown_table
@@ -22,6 +21,7 @@ from msg_analysis.common.number_words import half_width_text, measured_text, num
 from msg_analysis.errors import InputError
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.errors.ranking import Ranking, rank_estimates
+from msg_analysis.inference.statistics.distributions import two_sided
 from msg_analysis.report.documents.comparison_words import order_statements
 from msg_analysis.report.terminal.tables import number_table
 
@@ -140,7 +140,7 @@ def merge_results(rows: Sequence[Result]) -> list[Merged]:
         error = float(np.linalg.norm(share * [row.standard_error for row in group]))
         z = (measured - predicted) / error
         files = tuple(row.file for row in group)
-        p = float(2.0 * stats.norm.sf(abs(z)))
+        p = float(two_sided(z))
         found.append(Merged(group[0].experiment, files, float(time.sum()), measured, error, predicted, z, p))
     return found
 

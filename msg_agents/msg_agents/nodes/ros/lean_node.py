@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
@@ -14,6 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.type_support import check_for_type_support
 
 from msg_agents.nodes.ros.node_parameters import PROCESS
 from msg_agents.nodes.ros.qos import ros_profile
@@ -29,6 +30,12 @@ def message_class(type_name: str) -> Any:
     """Class of a type such as std_msgs/msg/String; ImportError, AttributeError or ValueError without one."""
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
+
+
+def load_type_support(topics: Iterable[Topic]) -> None:
+    """Load what rclpy loads when a topic of this type is first used."""
+    for topic in topics:
+        check_for_type_support(message_class(topic.type.full_name))
 
 
 class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow

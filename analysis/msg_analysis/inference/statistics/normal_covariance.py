@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
 
+from msg_analysis.inference.statistics.distributions import chi2_quantile, chi2_tail
 from msg_analysis.types import FloatArray
 
 
@@ -25,8 +25,8 @@ def covariance_statistic(scatter: FloatArray, samples: int) -> tuple[float, floa
     rank = len(scatter)
     if samples < 10 * rank:
         # Converted to a chi-square of 1 degree of freedom, so that sums of statistics have a chi-square law.
-        p = stats.chi2.sf(np.trace(scatter), samples * rank)
-        return float(stats.chi2.isf(min(2 * min(p, 1 - p), 1.0), 1)), 1.0
+        p = chi2_tail(np.trace(scatter), samples * rank)
+        return float(chi2_quantile(min(2 * min(p, 1 - p), 1.0), 1)), 1.0
     dof = rank * (rank + 1) / 2
     covariance = scatter / samples
     sign, logdet = np.linalg.slogdet(covariance)

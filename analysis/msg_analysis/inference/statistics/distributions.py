@@ -1,0 +1,58 @@
+"""Probabilities and quantiles; ``scipy.stats`` has them too, but its import takes longer than a comparison."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from scipy import special
+
+
+def normal_tail(z: Any) -> Any:
+    """P(Z > z) of a standard normal Z."""
+    return special.ndtr(-z)
+
+
+def log_normal_tail(z: Any) -> Any:
+    """Logarithm of P(Z > z) of a standard normal Z."""
+    return special.log_ndtr(-z)
+
+
+def two_sided(z: Any) -> Any:
+    """P(abs(Z) > abs(z)) of a standard normal Z."""
+    return 2.0 * special.ndtr(-abs(z))
+
+
+def chi2_tail(x: Any, dof: Any) -> Any:
+    """P(X > x) of a chi-square variable with ``dof`` degrees of freedom."""
+    return special.chdtrc(dof, x)
+
+
+def chi2_below(x: Any, dof: Any) -> Any:
+    """P(X <= x) of a chi-square variable with ``dof`` degrees of freedom."""
+    return special.chdtr(dof, x)
+
+
+def chi2_quantile(tail: Any, dof: Any) -> Any:
+    """The x with P(X > x) = ``tail`` for a chi-square variable with ``dof`` degrees of freedom."""
+    return special.chdtri(dof, tail)
+
+
+def student_quantile(below: Any, dof: Any) -> Any:
+    """The t with P(T <= t) = ``below`` for a variable of Student's law with ``dof`` degrees of freedom."""
+    return special.stdtrit(dof, below)
+
+
+def fisher_tail(x: Any, dof: Any, dof_below: Any) -> Any:
+    """P(F > x) of a ratio of mean squares with ``dof`` and ``dof_below`` degrees of freedom."""
+    return special.fdtrc(dof, dof_below, x)
+
+
+def gamma_tail(x: Any, shape: Any, scale: Any) -> Any:
+    """P(X > x) of a gamma variable."""
+    return special.gammaincc(shape, x / scale)
+
+
+def binomial_interval(count: int, total: int) -> tuple[float, float]:
+    """The exact 95 % interval of a probability: ``count`` of ``total`` (Clopper and Pearson, 1934)."""
+    low = float(special.betaincinv(count, total - count + 1, 0.025)) if count else 0.0
+    return low, float(special.betaincinv(count + 1, total - count, 0.975)) if count < total else 1.0

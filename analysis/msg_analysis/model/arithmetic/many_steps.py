@@ -1,0 +1,68 @@
+"""Many steps of a whole network: the sums of the single agents, to the last bit, by the kernel or by numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.model.arithmetic.update_law import step
+from msg_analysis.types import BoolArray, FloatArray, IntArray
+
+try:
+    from msg_analysis.model.arithmetic import _kernel
+except ImportError:  # there was no compiler when this was installed
+    COMPILED = False
+else:
+    COMPILED = True
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Agents that can step at once, under one graph, because none uses what another of them makes."""
+
+    agents: IntArray  # (a,) from 0
+    rows: IntArray  # (d, a) the d-th value that each of them uses, a row of [x(k); x(k+1)]; the order of the sum
+    there: BoolArray  # (d, a) whether it is no padding
+    weights: FloatArray  # (d, a), 0 for padding, which changes no sum
+
+
+class ManySteps:
+    """The steps of m agents, under each graph in one or several rounds."""
+
+    def __init__(self, rounds: Sequence[Sequence[Round]]) -> None:
+        """``rounds[mode]`` are the rounds of a graph, in order; each agent is in one of them."""
+        self._rounds = rounds
+        self._agents = sum(len(one.agents) for one in rounds[0])
+        together = [one for of_graph in rounds for one in of_graph]
+        terms = np.concatenate([one.there.sum(axis=0) for one in together])
+        # Row after row: the agent that it is for, where its terms begin, and its terms.
+        self._order = np.concatenate([one.agents for one in together], dtype=np.int64)
+        self._offsets = np.concatenate([[0], np.cumsum(terms)], dtype=np.int64)
+        self._columns = np.concatenate([one.rows.T[one.there.T] for one in together], dtype=np.int64)
+        self._weights = np.concatenate([one.weights.T[one.there.T] for one in together])
+
+    def advance(self, modes: IntArray, start: FloatArray, drives: FloatArray) -> FloatArray:
+        """(K, m, R): x(1) to x(K) from x(0) = ``start``, under the graphs ``modes`` (K,).
+
+        ``drives`` (K, m, R) has the noise of each step and what the reference adds.
+        """
+        if not COMPILED:
+            return self._with_numpy(modes, start, drives)
+        states = np.empty((len(modes) + 1, *start.shape))
+        states[0] = start
+        arrays = self._order, self._offsets, self._columns, self._weights, np.ascontiguousarray(modes)
+        _kernel.advance(*arrays, np.ascontiguousarray(drives), states, *start.shape)
+        return states[1:]
+
+    def _with_numpy(self, modes: IntArray, start: FloatArray, drives: FloatArray) -> FloatArray:
+        states = np.empty((len(modes), *start.shape))
+        both = np.concatenate([start, start])  # x(k) above x(k+1)
+        sums = [[(one.agents, list(one.weights[:, :, None]), list(one.rows)) for one in each] for each in self._rounds]
+        for k, mode in enumerate(modes):
+            both[: self._agents] = both[self._agents :]
+            for agents, weights, rows in sums[mode]:
+                both[self._agents + agents] = step(weights, [both[row] for row in rows], drives[k, agents])
+            states[k] = both[self._agents :]
+        return states

@@ -1,0 +1,47 @@
+"""``python -m msg_agents.cli.node_server SOCKET``: imports all that nodes need and forks their processes."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import socket
+import sys
+
+MODULES = (
+    "msg_agents.nodes.agents.agent_group",
+    "msg_agents.nodes.node_process",
+    "msg_agents.nodes.recorder",
+    "msg_agents.nodes.switcher",
+    "numpy.random",
+    "rclpy.experimental.events_executor",
+)
+"""What the processes of nodes import, at the latest when they need it."""
+
+
+def main() -> None:
+    """Serve; in a forked process, run its command."""
+    os.environ["SPT_NOENV"] = "1"  # titles must leave the environment readable: by it, processes of a run are found
+    from setproctitle import setproctitle
+
+    from msg_agents.cli.main import main as run
+    from msg_agents.processes.fork_server import serve
+
+    _import_all()
+    arguments = serve(socket.socket(fileno=int(sys.argv[1])))
+    setproctitle(f"msg-agents {' '.join(arguments)}")
+    sys.modules["numpy"].random.seed()  # laws of agents may draw from it: not the same numbers in every process
+    sys.argv = ["msg-agents", *arguments]
+    run(arguments, prog_name="msg-agents")
+
+
+def _import_all() -> None:
+    for name in MODULES:
+        importlib.import_module(name)
+    from msg_agents.nodes.ros.lean_node import load_type_support
+    from msg_analysis.wire.topics import DIAGNOSTICS, EXPERIMENT, GRAPH, PROGRESS, STATE
+
+    load_type_support((DIAGNOSTICS, EXPERIMENT, GRAPH, PROGRESS, STATE))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,157 @@
+"""Processes forked from one that has imported everything: real ones, with the commands of the command line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+from waiting import gone, participants, wait_for
+
+from msg_agents.processes.core_pinning import available_cores
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.fork_server import ForkedProcess, ForkServer, ForkServerError
+from msg_agents.processes.ros_domain import free_domain
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.twin.simulate import new_record
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="this machine: not Linux")
+
+
+@pytest.fixture(scope="module")
+def domain() -> Iterator[int]:
+    with free_domain() as number:
+        yield number
+
+
+@pytest.fixture
+def server(tmp_path: Path, domain: int) -> Iterator[ForkServer]:
+    with ForkServer(node_environment(domain), tmp_path / "server.log") as server:
+        yield server
+    assert not (tmp_path / "server.log").exists()  # it had nothing to say
+
+
+@pytest.fixture
+def waiting(tmp_path: Path) -> list[str]:
+    """Arguments of an agent that waits for the other one until it is told to end."""
+    experiment = ValidExperiment.parse(
+        {
+            "name": "waiting",
+            "problem": "consensus",
+            "time": "continuous",
+            "graphs": {"line": {"path": [1, 2]}},
+            "switching": {"generator": [[0]]},
+            "run": {"dt": 0.05, "duration": 1, "start": "zero"},
+        }
+    )
+    file = tmp_path / "run.json"
+    file.write_text(new_record(experiment).to_json())
+    return ["agent", str(file), "--agent", "1"]
+
+
+def start(server: ForkServer, log: Path, *arguments: str, core: int | None = None, **descriptors: int) -> ForkedProcess:
+    with log.open("ab") as output:
+        options = {f"--{name}": number for name, number in descriptors.items()}
+        return server.fork(arguments, options, output.fileno(), core)
+
+
+def title(process: ForkedProcess) -> Sequence[str]:
+    """What ``ps`` shows of a process."""
+    return Path(f"/proc/{process.pid}/cmdline").read_text().rstrip("\0 ").split()
+
+
+def status(process: ForkedProcess, key: str) -> str:
+    lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
+    return next(line.split(":")[1].strip() for line in lines if line.startswith(f"{key}:"))
+
+
+def test_what_a_command_prints_and_how_it_ends(server: ForkServer, tmp_path: Path) -> None:
+    """Two exit codes at the same time, each from the right process."""
+    good, bad = tmp_path / "good.log", tmp_path / "bad.log"
+    processes = start(server, good, "agent", "--help"), start(server, bad, "agent", "nothing", "--agent", "1")
+    assert [process.wait() for process in processes] == [0, 2]
+    assert [process.poll() for process in processes] == [0, 2]
+    assert good.read_text().startswith("Usage: msg-agents agent [OPTIONS] RUN_RECORD")
+    assert bad.read_text().startswith("error: nothing: cannot be read")
+    processes[0].send_signal(signal.SIGKILL)  # has ended: nothing happens
+
+
+def test_a_forked_process_is_like_any_child(
+    server: ForkServer, tmp_path: Path, waiting: list[str], domain: int
+) -> None:
+    core = available_cores()[-1]
+    process = start(server, tmp_path / "log", *waiting, core=core)
+    wait_for(lambda: participants(domain))  # its node is up
+    assert title(process) == ["msg-agents", *waiting]
+    assert f"ROS_DOMAIN_ID={domain}".encode() in Path(f"/proc/{process.pid}/environ").read_bytes().split(b"\0")
+    assert status(process, "PPid") == str(os.getpid())
+    assert status(process, "Cpus_allowed_list") == str(core)
+    assert os.getsid(process.pid) == process.pid  # Ctrl-C on our terminal does not reach it
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    assert process.wait() == 3
+    assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+def test_it_ends_when_its_lifeline_closes(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
+    reading, writing = os.pipe()
+    process = start(server, tmp_path / "log", *waiting, lifeline=reading)
+    os.close(reading)
+    wait_for(lambda: participants(domain))
+    assert process.poll() is None
+    os.close(writing)
+    assert process.wait() == 3
+
+
+def test_processes_outlive_a_killed_fork_server(
+    server: ForkServer, tmp_path: Path, waiting: list[str], domain: int
+) -> None:
+    """How they end is known all the same; no more can be forked."""
+    process = start(server, tmp_path / "log", *waiting)
+    wait_for(lambda: participants(domain))
+    assert server.pid is not None
+    os.kill(server.pid, signal.SIGKILL)
+    with pytest.raises(ForkServerError):
+        start(server, tmp_path / "log", "agent", "--help")
+    with pytest.raises(ForkServerError):
+        start(server, tmp_path / "log", "agent", "--help")
+    assert process.poll() is None
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+
+
+def test_a_fork_server_that_cannot_import(tmp_path: Path) -> None:
+    (tmp_path / "msg_agents.py").write_text("raise ImportError('broken')")
+    log = tmp_path / "server.log"
+    with ForkServer(os.environ | {"PYTHONPATH": str(tmp_path)}, log) as server, pytest.raises(ForkServerError):
+        start(server, tmp_path / "log", "agent", "--help")
+    assert "broken" in log.read_text()
+
+
+PARENT = """
+import sys, time
+from pathlib import Path
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.fork_server import ForkServer
+log = Path(sys.argv[1])
+with ForkServer(node_environment(0), log / "server.log") as server, (log / "log").open("w") as output:
+    server.fork(["agent", "--help"], {}, output.fileno(), None).wait()
+    print(server.pid, flush=True)
+    time.sleep(600)
+"""
+
+
+def test_it_ends_when_its_user_is_killed(tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", PARENT, str(tmp_path)], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        server = Path("/proc") / parent.stdout.readline().strip()
+        assert server.exists()
+        parent.kill()
+    wait_for(lambda: gone(int(server.name)))
