@@ -147,8 +147,8 @@ def _metadata(bag: Path) -> None:
 def test_compressed_and_split(network: Any) -> None:
     """What is asked for on the command line is what is recorded; nothing is lost at the seams."""
     file = network.file(run={"processes": 2, "replicas": 32})
-    options = ("--compression", "lz4", "--split-size", "0.1", "--out", network.directory / "runs", "--json")
-    bag = Path(network.completed(network.start("run", file, *options))["bag"])
+    run = network.record(file, "--compression", "lz4", "--split-size", "0.1", "--json")
+    bag = Path(network.completed(run)["bag"])
     files = sorted(bag.glob("*.mcap"))
     assert [path.name for path in files] == [f"{bag.name}_{i}.mcap" for i in range(len(files))]
     assert len(files) > 1
@@ -167,8 +167,7 @@ def test_compressed_and_split(network: Any) -> None:
 def test_recorder_killed_between_two_files(network: Any) -> None:
     """The files that were finished stay as they are, the last one is salvaged, and what was run says so."""
     file = network.file(run={"processes": 2, "replicas": 64, "duration": 5000})
-    options = ("--split-size", "0.2", "--out", network.directory / "runs")
-    run = network.start("run", file, *options)
+    run = network.record(file, "--split-size", "0.2")
 
     def files() -> list[Path]:
         found = (network.directory / "runs").glob("*/*.mcap")

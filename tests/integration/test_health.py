@@ -42,7 +42,7 @@ def test_a_stopped_agent_is_named(network: Any) -> None:
     heard = network.directory / "heard"
     with free_domain() as domain, heard.open("w") as output:
         file = network.file(run={"duration": 300, "processes": "one_per_agent"})
-        run = network.start("run", file, "--out", network.directory / "runs", "--domain", str(domain), "--json")
+        run = network.record(file, "--domain", str(domain), "--json")
         monitor = subprocess.Popen([sys.executable, "-P", "-c", MONITOR], env=node_environment(domain), stdout=output)
         try:
             network.wait_until_moving()

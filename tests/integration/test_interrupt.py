@@ -46,7 +46,7 @@ def test_in_the_middle(network: Any, repetition: int, rng: random.Random) -> Non
 
 def test_before_anything_has_begun(network: Any, repetition: int, rng: random.Random) -> None:
     """While the processes start and look for each other."""
-    run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs")
+    run = network.record(network.file(run=LONG))
     network.wait_for(network.nodes, 60, "a child")
     time.sleep(rng.uniform(0.0, 1.5) if repetition else 0.0)
     number = signal.SIGINT if repetition % 2 else signal.SIGTERM
@@ -59,7 +59,7 @@ def test_before_anything_has_begun(network: Any, repetition: int, rng: random.Ra
 
 
 def test_a_killed_runner_takes_everybody_along(network: Any) -> None:
-    run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs")
+    run = network.record(network.file(run=LONG))
     network.wait_until_moving()
     assert {process.kind for process in network.nodes()} == {"agent", "switcher", "recorder"}
     run.kill()

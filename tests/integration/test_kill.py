@@ -20,14 +20,14 @@ LONG = {"duration": 10_000, "replicas": 1, "processes": 2}
 
 @pytest.mark.parametrize("kind", ["agent", "switcher"])
 def test_killed_child_that_may_not_come_back(network: Any, kind: str, rng: random.Random) -> None:
-    run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs", "--restarts", "0")
+    run = network.record(network.file(run=LONG), "--restarts", "0")
     network.wait_until_moving()
     kill_and_see(network, run, rng.choice(network.processes(kind)))
 
 
 def test_killed_recorder(network: Any, repetition: int, rng: random.Random) -> None:
     """Every other time between its birth and, likely, the first state; else while states are recorded."""
-    run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs")
+    run = network.record(network.file(run=LONG))
     network.wait_for(lambda: len(network.nodes()) == 4, 60, "four children")
     early = repetition % 2 == 1
     if not early:

@@ -74,7 +74,7 @@ def test_equals_the_twin(network: Any, case: str, processes: Any) -> None:
 def test_a_network_on_another_processor(network: Any) -> None:
     """What it records is what the twin of this processor gives, from the experiment alone."""
     file = network.file(**CASES["discrete"])
-    result = network.completed(network.start("run", file, "--out", network.directory, "--json", **another_processor()))
+    result = network.completed(network.record(file, "--json", **another_processor()))
     states = read_bag(result["bag"]).states
     assert np.array_equal(simulate(network.experiment(**CASES["discrete"])).states, states)
 
@@ -118,7 +118,7 @@ def _imported(log: str) -> set[str]:
 def test_two_runs_at_the_same_time(network: Any) -> None:
     """Of one experiment, into one directory, in the same second: they neither hear nor overwrite each other."""
     file, out = network.file(run={"processes": 1}), network.directory / "runs"
-    runs = [network.start("run", file, "--out", out, "--seed", seed) for seed in ("1", "2")]
+    runs = [network.record(file, "--seed", seed) for seed in ("1", "2")]
     for run in runs:
         stdout, stderr = run.communicate(timeout=100)
         assert run.returncode == 0, stdout + stderr

@@ -53,13 +53,13 @@ def test_noise_and_loss_and_killed_agents(network: Any) -> None:
     document["noise"] |= {"broadcast": 0.2, "link": 0.1, "loss": 0.2}
     document["run"] |= {"duration": 120, "replicas": 32, "processes": 3}
     file = network.file(**document)
-    process = network.start("run", file, "--out", network.directory / "runs", "--restarts", "3", "--json")
+    process = network.record(file, "--restarts", "3", "--json")
     network.wait_until_moving()
     for _ in range(2):
         victims = network.wait_for(lambda: network.processes("agent"), 30, "a living agent")
         random.Random(1).choice(victims).kill(signal.SIGKILL)
     stdout, stderr = process.communicate(timeout=120)
-    assert process.returncode in (0, 1), stderr  # by chance one run in a hundred fails the tests of graphs and losses
+    assert process.returncode == 0, stderr
     result = json.loads(stdout)
     assert len(result["restarts"]) >= 1
     trajectory = read_bag(result["bag"])

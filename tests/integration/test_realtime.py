@@ -172,11 +172,11 @@ def test_killed_and_back(network: Any, repetition: int) -> None:
 
 
 def test_two_runs_at_the_same_time(network: Any) -> None:
-    """They neither hear nor overwrite each other, whatever their verdicts."""
+    """They neither hear nor overwrite each other."""
     file, out = network.file(run={**REALTIME, "processes": 1}), network.directory / "runs"
-    runs = [network.start("run", file, "--out", out, "--seed", seed) for seed in ("1", "2")]
+    runs = [network.record(file, "--seed", seed) for seed in ("1", "2")]
     errors = [run.communicate(timeout=100)[1] for run in runs]
-    assert {run.returncode for run in runs} <= {0, 1}  # by chance one run in a hundred disagrees
+    assert [run.returncode for run in runs] == [0, 0]
     assert not any("Traceback" in text or "failed" in text for text in errors), errors
     bags = sorted(Path(directory) for directory in out.iterdir())
     trajectories = [read_bag(bag) for bag in bags]

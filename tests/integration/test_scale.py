@@ -37,7 +37,7 @@ def test_complete_and_equal_to_the_twin(network: Any, rows: int, columns: int, p
 def test_a_killed_process_of_many_agents_comes_back(network: Any) -> None:
     """What its agents had told each other directly has gone with it."""
     file = network.file(**grid(6, 5), run={"duration": 100, "start": "zero", "processes": 2, "replicas": 16})
-    run = network.start("run", file, "--out", network.directory / "runs", "--restarts", "1", "--json")
+    run = network.record(file, "--restarts", "1", "--json")
     network.wait_until_moving()
     network.processes("agent")[0].kill()
     stdout, stderr = run.communicate(timeout=110)
@@ -61,7 +61,7 @@ def test_processes_keep_to_one_core_each(network: Any, pin: bool) -> None:
     if not 2 <= len(cores) <= 5:
         pytest.skip(f"this machine: {len(cores)} cores: nothing to pin 6 processes to")
     file = network.file(run={"duration": 500})
-    run = network.start("run", file, "--out", network.directory / "runs", "--json", *([] if pin else ["--no-pin"]))
+    run = network.record(file, *([] if pin else ["--no-pin"]))
     network.wait_until_moving()
     kept = {process.agent: cores_of(process.pid) for process in network.processes("agent")}
     if pin:

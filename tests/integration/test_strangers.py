@@ -6,6 +6,7 @@ import dataclasses
 import html
 import random
 import re
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -362,11 +363,13 @@ def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Ra
 def test_second_processes_of_agents(network: Any) -> None:
     """Of the same run and of another one: they find their names taken and leave; the run says who was there."""
     other = network.directory / "other.json"
-    other.write_text(new_record(network.experiment(run={"duration": 900, "seed": 8})).to_json())
+    other.write_text(new_record(network.experiment(run={"duration": 100, "seed": 8})).to_json())
     with free_domain() as domain:
-        file = network.file(run={"duration": 1300, "processes": 3})
-        run = network.start("run", file, "--out", network.directory / "runs", "--domain", str(domain), "--json")
+        file = network.file(run={"duration": 100, "processes": 3})
+        run = network.record(file, "--domain", str(domain), "--json")
         network.wait_until_moving()
+        (first, *_) = network.processes("agent")
+        first.kill(signal.SIGSTOP)  # the network stands still until they have left
         environment = node_environment(domain)
         doubles = {
             agent: network.start("agent", record, "--agent", agent, "--discovery-timeout", "6", **environment)
@@ -376,6 +379,7 @@ def test_second_processes_of_agents(network: Any) -> None:
             _, stderr = double.communicate(timeout=60)
             assert double.returncode == 2, stderr
             assert re.search(rf"more than one node was still called .*agent_{agent}.* in ROS_DOMAIN_ID", stderr), stderr
+        first.kill(signal.SIGCONT)
         result = network.completed(run)
     for agent in doubles:
         entry = {"node": "switcher", "topic": f"agent_{agent}", "reason": "duplicate node name", "count": 1}

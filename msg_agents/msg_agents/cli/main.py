@@ -46,6 +46,11 @@ def main() -> None:
     """Networks of agents under Markov-switching graphs, as ROS 2 processes."""
 
 
+_no_analyse = click.option(
+    "--no-analyse", is_flag=True, help="Do not compare the bag with the prediction: no verdict, no report."
+)
+
+
 @main.command(
     cls=WebCommand,
     epilog=examples(
@@ -63,6 +68,7 @@ def main() -> None:
     help="Directory in which the bag's directory <name>_<time> is created.",
 )
 @click.option("--no-record", is_flag=True, help="Do not record: no bag, no verdict.")
+@_no_analyse
 @seed_option
 @duration_option
 @click.option(
@@ -104,9 +110,7 @@ def main() -> None:
     help="Pin each process to one core if there are more processes than cores: faster (lockstep).",
 )
 @click.option(
-    "--fork/--no-fork",
-    default=True,
-    help="Fork the processes from one that has imported everything: faster to start (Linux).",
+    "--no-fork", is_flag=True, help="Start every process on its own, not forked from one that has imported everything."
 )
 @storage_options
 @web_options
@@ -117,6 +121,7 @@ def run(
     *,
     out: Path,
     no_record: bool,
+    no_analyse: bool,
     seed: int | None,
     duration: float | None,
     pace: str | None,
@@ -126,7 +131,7 @@ def run(
     domain: int | None,
     use_sim_time: bool,
     pin: bool,
-    fork: bool,
+    no_fork: bool,
     compression: Compression,
     split_size: float | None,
     web: int | None,
@@ -156,26 +161,34 @@ def run(
                 use_sim_time=use_sim_time,
                 storage=storage(compression, split_size),
                 pin=pin,
-                fork=fork,
+                fork=not no_fork,
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
             )
-        _end(result, as_json, view.display.end)
+        _end(result, as_json, view.display.end, analyse=not no_analyse)
 
 
-def _end(result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
+def _end(
+    result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None] = lambda _: None, *, analyse: bool = True
+) -> None:
     """Print the failures, judge what was recorded, show the result, and exit with its code."""
     from msg_agents.running.runner import conclude
 
     for line in result.failures:
         complain(line, "failed:")
-    conclude(result)
+    if analyse:
+        conclude(result)
     say(_ending(result))
     _show(result, as_json)
-    if result.failures or (result.bag is not None and result.comparison is None):
+    if _incomplete(result) or (analyse and result.bag is not None and result.comparison is None):
         sys.exit(ExitCode.INCOMPLETE)
     if result.comparison is not None:
         sys.exit(result.comparison.exit_code)
+
+
+def _incomplete(result: RunResult) -> bool:
+    """Whether a process failed, or states are missing."""
+    return bool(result.failures) or (result.trajectory is not None and not result.trajectory.completeness.complete)
 
 
 def _ending(result: RunResult) -> dict[str, Any]:
@@ -194,7 +207,7 @@ def _show(result: RunResult, as_json: bool) -> None:
     """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
     from msg_agents.running.runner import REPORT_FILE
 
-    document: dict[str, Any] = {"verdict": "incomplete" if result.failures else None}  # None: nothing to judge
+    document: dict[str, Any] = {"verdict": "incomplete" if _incomplete(result) else None}  # None: nothing to judge
     if result.comparison is not None:
         document = dict(result.comparison.to_json())
     document |= {
@@ -216,6 +229,8 @@ def _show(result: RunResult, as_json: bool) -> None:
 
         print_comparison(document, result_console())
         click.echo(f"bag:    {document['bag']}\nreport: {document['report']}")
+    elif document["bag"]:
+        click.echo(f"bag: {document['bag']}")
     if result.rate:
         click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
 
@@ -300,6 +315,7 @@ def prepare(experiment: Path) -> None:
     default=RESTARTS,
     help="How often, in total, killed processes of this host are restarted.",
 )
+@_no_analyse
 @click.option(
     "--profile", "only_profile", is_flag=True, help="Only print the discovery profile, for other ROS 2 tools."
 )
@@ -314,6 +330,7 @@ def host(
     discovery_timeout: float,
     patience: float,
     restarts: int,
+    no_analyse: bool,
     only_profile: bool,
     compression: Compression,
     split_size: float | None,
@@ -352,7 +369,7 @@ def host(
             record=record,
             share=share,
         )
-    _end(result, as_json)
+    _end(result, as_json, analyse=not no_analyse)
     if not share.home and not as_json:
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
 
