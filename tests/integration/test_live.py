@@ -76,18 +76,18 @@ def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> N
     """From the first step that it gets whole, it misses none: its number is that of the bag, to every printed digit."""
     live = network.start("live", "--reliable")
     assert "waiting for one" in live.stderr.readline()
-    result = network.run(network.experiment(run={"processes": 2, "duration": 500}), domain=domain)
+    result = network.run(network.experiment(run={"processes": 2, "duration": 250}), domain=domain)
     assert result.failures == []
     assert result.trajectory.completeness.complete
     last = ended(live)[0].splitlines()[-1]
     found = re.fullmatch(
-        r"step 10000 of 10000, system error ([\d.]+) .*, (\d+) steps(?: since step (\d+))?, 0 missing, \d+ steps/s",
+        r"step 5000 of 5000, system error ([\d.]+) .*, (\d+) steps(?: since step (\d+))?, 0 missing, \d+ steps/s",
         last,
     )
     assert found, last
     first = int(found[3] or 0)
-    assert first + int(found[2]) == 10000
-    states = result.trajectory.states[first:10000]  # (steps, agents, replicas)
+    assert first + int(found[2]) == 5000
+    states = result.trajectory.states[first:5000]  # (steps, agents, replicas)
     error = ((states - states.mean(axis=1, keepdims=True)) ** 2).sum(axis=1).mean()
     assert found[1] == f"{error:.6g}"
 

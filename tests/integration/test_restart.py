@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-RUN = {"duration": 400, "replicas": 16, "processes": 3}  # long enough to be killed in the middle
+RUN = {"duration": 200, "replicas": 16, "processes": 3}  # long enough to be killed in the middle
 KILLED = r"(agents?_\w+|switcher): killed by SIGKILL.*, started again$"
 
 
@@ -24,7 +24,7 @@ def test_killed_and_back(network: Any, kinds: list[str], repetition: int, rng: r
     early, again = repetition > 0 and rng.random() < 0.3, rng.random() < 0.5
     if not early:
         network.wait_until_moving()
-    time.sleep(rng.uniform(0.0, 1.0))
+    time.sleep(rng.uniform(0.0, 0.3))
     for kind in kinds:
         victim = rng.choice(network.wait_for(lambda kind=kind: network.processes(kind), 30, f"a living {kind}"))
         print("killed", "early" if early else "in the middle", victim.command[2:])
