@@ -40,6 +40,23 @@ def test_killed_and_back(network: Any, kinds: list[str], repetition: int, rng: r
         assert all(line in report for line in result["restarts"])
 
 
+def test_a_killed_fork_server(network: Any) -> None:
+    """What it has forked goes on; killed agents are started without it."""
+    run = network.record(network.file(run=RUN), "--json")
+    network.wait_until_moving()
+    (server,) = network.processes("node_server")
+    server.kill()
+    victim = network.processes("agent")[0]
+    victim.kill()
+
+    def back() -> Any:
+        return [p for p in network.processes("agent") if p.agent == victim.agent and p != victim]
+
+    (again,) = network.wait_for(back, 30, "the agent again")
+    assert "msg_agents" in again.command  # python -m msg_agents agent ...
+    assert len(network.completed(run)["restarts"]) == 1
+
+
 def test_budget(network: Any) -> None:
     """One kill more than allowed: a clear end that names who and how often."""
     file = network.file(run={"duration": 10_000, "processes": 2})

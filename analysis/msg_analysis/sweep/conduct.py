@@ -19,7 +19,7 @@ from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.sweep.jobs.evaluate import evaluate
 from msg_analysis.sweep.jobs.job import DONE, FAILED, Job, NetworkOptions, Outcome
 from msg_analysis.sweep.jobs.software import installed_software
-from msg_analysis.sweep.jobs.workers import Lost, Workers
+from msg_analysis.sweep.jobs.workers import Lost, Workers, deferring_interrupts
 from msg_analysis.sweep.outcome_store import OutcomeStore
 
 OtherSoftware = Literal["refuse", "redo", "keep"]
@@ -67,7 +67,8 @@ def conduct(
         with Workers(workers, scheduler) as pool, closing(pool.outcomes(evaluate, items, **patience)) as batches:
             for batch in batches:
                 found = [_lost(job, result) if isinstance(result, Lost) else result for job, result in batch]
-                store.add(found)
+                with deferring_interrupts():  # what is said to be kept is what is on the disk
+                    store.add(found)
                 done += len(found)
                 failed += sum(outcome.status == FAILED for outcome in found)
                 watch(done, total, failed)

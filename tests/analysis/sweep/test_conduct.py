@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import signal
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from msg_analysis.sweep.figure_series import picture
 from msg_analysis.sweep.jobs.evaluate import evaluate
 from msg_analysis.sweep.jobs.job import DONE, FAILED, Job, Outcome
 from msg_analysis.sweep.jobs.workers import Lost, Workers
-from msg_analysis.sweep.outcome_store import OutcomeStore
+from msg_analysis.sweep.outcome_store import JOURNAL, OutcomeStore
 from msg_analysis.sweep.table import arrow_table, rows_of
 from msg_analysis.twin.simulate import simulate
 
@@ -58,6 +60,22 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
 
     monkeypatch.setattr(conducting, "Workers", Here)
     return done
+
+
+def test_ctrl_c_while_an_outcome_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What counts as kept is what is on the disk."""
+    in_this_process(monkeypatch)
+    written = os.write
+
+    def write(descriptor: int, data: bytes) -> int:
+        signal.raise_signal(signal.SIGINT)
+        return written(descriptor, data)
+
+    monkeypatch.setattr("msg_analysis.sweep.outcome_store.os.write", write)
+    with OutcomeStore.open(tmp_path) as store:
+        with pytest.raises(KeyboardInterrupt):
+            conduct([Job.of("predict", document(rate)) for rate in (0.5, 1.0)], store)
+        assert len(store.outcomes) == (tmp_path / JOURNAL).read_bytes().count(b"\n") == 1
 
 
 def test_predictions_are_those_of_the_paper() -> None:

@@ -117,7 +117,7 @@ class Workers:
         method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
         dask.config.set({"distributed.worker.multiprocessing-method": method, **_QUIET})
         try:
-            with _deferring_interrupts():
+            with deferring_interrupts():
                 self._cluster = distributed.LocalCluster(
                     n_workers=self._count,
                     threads_per_worker=1,
@@ -311,7 +311,7 @@ def _ignoring(*numbers: signal.Signals) -> Iterator[None]:
 
 
 @contextmanager
-def _deferring_interrupts() -> Iterator[None]:
+def deferring_interrupts() -> Iterator[None]:
     """Postpone signals that end the program until the block is done; then the first one is raised."""
     if threading.current_thread() is not threading.main_thread():
         yield
