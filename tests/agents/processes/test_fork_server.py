@@ -13,14 +13,12 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from waiting import gone, participants, wait_for
+from waiting import gone, participants, record_of_two, wait_for
 
 from msg_agents.processes.core_pinning import available_cores
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.fork_server import ForkedProcess, ForkServer, ForkServerError
 from msg_agents.processes.ros_domain import free_domain
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.twin.simulate import new_record
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="this machine: not Linux")
 
@@ -41,18 +39,7 @@ def server(tmp_path: Path, domain: int) -> Iterator[ForkServer]:
 @pytest.fixture
 def waiting(tmp_path: Path) -> list[str]:
     """Arguments of an agent that waits for the other one until it is told to end."""
-    experiment = ValidExperiment.parse(
-        {
-            "name": "waiting",
-            "problem": "consensus",
-            "time": "continuous",
-            "graphs": {"line": {"path": [1, 2]}},
-            "switching": {"generator": [[0]]},
-            "run": {"dt": 0.05, "duration": 1, "start": "zero"},
-        }
-    )
-    file = tmp_path / "run.json"
-    file.write_text(new_record(experiment).to_json())
+    file = record_of_two(tmp_path)
     return ["agent", str(file), "--agent", "1"]
 
 

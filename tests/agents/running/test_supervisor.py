@@ -15,15 +15,13 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from waiting import gone, participants, wait_for
+from waiting import gone, participants, record_of_two, wait_for
 
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.process_plan import ProcessPlan
 from msg_agents.processes.ros_domain import free_domain
 from msg_agents.running import supervisor as module
 from msg_agents.running.supervisor import Child, Supervisor
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.twin.simulate import new_record
 
 STUBBORN = """
 import signal, time
@@ -216,19 +214,7 @@ def test_a_status_line_may_come_in_pieces(tmp_path: Path) -> None:
 
 @pytest.fixture
 def run_file(tmp_path: Path) -> Path:
-    experiment = ValidExperiment.parse(
-        {
-            "name": "waiting",
-            "problem": "consensus",
-            "time": "continuous",
-            "graphs": {"line": {"path": [1, 2]}},
-            "switching": {"generator": [[0]]},
-            "run": {"dt": 0.05, "duration": 1, "start": "zero"},
-        }
-    )
-    file = tmp_path / "run.json"
-    file.write_text(new_record(experiment).to_json())
-    return file
+    return record_of_two(tmp_path)
 
 
 PARENT = """
