@@ -18,8 +18,7 @@ KILLED = r"(agents?_\w+|switcher): killed by SIGKILL.*, started again$"
 @pytest.mark.parametrize("kinds", [["agent"], ["agent"] * 3, ["switcher"], ["agent", "switcher"]], ids=" ".join)
 def test_killed_and_back(network: Any, kinds: list[str], repetition: int, rng: random.Random) -> None:
     """At any moment from the birth of the processes on: all at once, or also who has just come back."""
-    options = ["--out", network.directory / "runs", "--json"] + ["--no-analyse"] * (len(kinds) > 1)
-    run = network.start("run", network.file(run=RUN), *options)
+    run = network.start("run", network.file(run=RUN), "--out", network.directory / "runs", "--json")
     network.wait_for(lambda: len(network.nodes()) == RUN["processes"] + 2, 60, "all processes")
     early, again = repetition > 0 and rng.random() < 0.3, rng.random() < 0.5
     if not early:
@@ -35,9 +34,8 @@ def test_killed_and_back(network: Any, kinds: list[str], repetition: int, rng: r
     # Who has done its part when it is killed need not come back.
     assert 1 <= len(result["restarts"]) <= len(kinds)
     assert all(re.match(KILLED, line) for line in result["restarts"])
-    if result["report"]:
-        report = html.unescape(Path(result["report"]).read_text())
-        assert all(line in report for line in result["restarts"])
+    report = html.unescape(Path(result["report"]).read_text())
+    assert all(line in report for line in result["restarts"])
 
 
 def test_a_killed_fork_server(network: Any) -> None:

@@ -21,6 +21,7 @@ MODULES = (
 def main() -> None:
     """Serve; in a forked process, run its command."""
     os.environ["SPT_NOENV"] = "1"  # titles must leave the environment readable: by it, processes of a run are found
+    import numpy as np
     from setproctitle import setproctitle
 
     from msg_agents.cli.main import main as run
@@ -29,7 +30,7 @@ def main() -> None:
     _import_all()
     arguments = serve(socket.socket(fileno=int(sys.argv[1])))
     setproctitle(f"msg-agents {' '.join(arguments)}")
-    sys.modules["numpy"].random.seed()  # laws of agents may draw from it: not the same numbers in every process
+    np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
     sys.argv = ["msg-agents", *arguments]
     run(arguments, prog_name="msg-agents")
 

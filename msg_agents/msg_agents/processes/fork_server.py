@@ -1,4 +1,4 @@
-"""A process that has imported everything and forks the processes of a network: each is there in hundredths of a second.
+"""A process that has imported everything and forks the processes of a network, so that each starts sooner.
 
 Every forked process is a child of the process that asked for it, which waits for it as for any other: the fork server
 may end, or be killed, at any time.

@@ -7,11 +7,6 @@ from typing import Any
 from scipy import special
 
 
-def normal_tail(z: Any) -> Any:
-    """P(Z > z) of a standard normal Z."""
-    return special.ndtr(-z)
-
-
 def log_normal_tail(z: Any) -> Any:
     """Logarithm of P(Z > z) of a standard normal Z."""
     return special.log_ndtr(-z)
