@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import select
+import signal
 import subprocess
 import termios
 import time
@@ -24,6 +25,8 @@ class Terminal:
 
         def own() -> None:
             os.setsid()
+            for number in (signal.SIGINT, signal.SIGHUP):  # the tests may run under nohup or in the background
+                signal.signal(number, signal.SIG_DFL)
             import fcntl
 
             fcntl.ioctl(0, termios.TIOCSCTTY, 0)
