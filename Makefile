@@ -11,6 +11,9 @@ RUNS := runs
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 LOCAL := --no-index --no-deps --no-build-isolation
 
+# Some container images set it. Every process of a network, and every worker of the tests, would compile all modules.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help setup demo test test-fast stress fuzz lint lint-container format bench calibrate docs colcon colcon-test container lock clean
 
 help: ## Say what can be made
