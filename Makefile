@@ -34,6 +34,7 @@ $(VENV)/.interfaces: $(VENV)/.locked $(wildcard $(INTERFACES)/msg/*) $(INTERFACE
 
 $(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_analysis/model/arithmetic/*.c msg_agents/setup.* analysis/package.xml msg_agents/package.xml $(EXAMPLES)/setup.* $(EXAMPLES)/package.xml)
 	$(PIP) install $(LOCAL) --editable analysis --editable msg_agents --editable $(EXAMPLES)
+	$(BIN)/python -m compileall -q analysis/msg_analysis msg_agents/msg_agents
 	@touch $@
 
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
@@ -50,12 +51,12 @@ SKIPPED := build/skipped
 TEST := $(BIN)/python -m pytest --skipped-to=$(SKIPPED) $(TEST_OPTIONS)
 
 test: test-fast ## Run all tests
-	$(TEST) $(SEVERAL_AT_ONCE) -m integration
+	$(TEST) $(SEVERAL_AT_ONCE) tests/integration
 	@test ! -s $(SKIPPED) || { echo "Not tested:"; cat $(SKIPPED); } >&2
 
 test-fast: setup ## Run the tests that start no network
 	@rm -f $(SKIPPED)
-	OPENBLAS_NUM_THREADS=1 $(TEST) --numprocesses auto --dist worksteal -m "not integration"
+	OPENBLAS_NUM_THREADS=1 $(TEST) --numprocesses auto --dist worksteal --ignore tests/integration
 
 STRESS ?= 20
 

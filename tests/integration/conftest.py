@@ -42,12 +42,6 @@ PLAIN_RECORDER = Path(__file__).parents[1] / "support" / "plain_recorder.py"
 LOOK = 0.5  # s between two looks at what the processes of a test have made for themselves
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if Path(__file__).parent in item.path.parents:
-            item.add_marker(pytest.mark.integration)
-
-
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Tests of random faults take a ``repetition``: once by default, as often as ``make stress`` says otherwise."""
     if "repetition" in metafunc.fixturenames:

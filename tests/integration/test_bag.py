@@ -17,6 +17,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.simulate import simulate
 
 STEPS, AGENTS = 300, 5
+SMALL = {"processes": 1, "duration": 5}
 
 
 def test_any_reader_finds_everything(network: Any) -> None:
@@ -190,3 +191,25 @@ def test_recorder_killed_between_two_files(network: Any) -> None:
         states = sum(info.msgcount for topic, info in reader.topics.items() if topic.endswith("state"))
         assert states == trajectory.completeness.received
         assert sum(1 for _ in reader.messages()) == reader.message_count
+
+
+def test_the_result_is_printed_and_kept(network: Any) -> None:
+    run = network.start("run", network.file(run=SMALL), "--out", network.directory / "runs", "--json")
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 0, stderr
+    result = json.loads(stdout)
+    assert stdout.count("\n") == 1
+    assert (result["verdict"], result["failures"]) == ("agrees", [])
+    assert json.loads((Path(result["bag"]) / "result.json").read_text()) == result
+    assert Path(result["report"]).read_text(encoding="utf-8").startswith("<!")
+
+
+def test_nothing_is_left_without_recording(network: Any) -> None:
+    file = network.file(run=SMALL)
+    run = network.start("run", file, "--no-record", "--json", "--out", network.directory / "runs")
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 0, stderr
+    result = json.loads(stdout)
+    assert result["bag"] is None
+    assert result["failures"] == []
+    assert list(network.directory.iterdir()) == [file]

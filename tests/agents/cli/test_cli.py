@@ -261,24 +261,3 @@ def test_help_and_version() -> None:
     assert "Examples:" in execute("run", "--help").stdout
     assert execute("--version").stdout.startswith("msg-agents, version ")
     refused(execute("fly"), "fly")
-
-
-@pytest.mark.integration
-def test_json_is_one_object_and_nothing_else(experiment: Path, tmp_path: Path) -> None:
-    process = execute("run", experiment, "--out", tmp_path / "runs", "--processes", "1", "--json")
-    assert process.returncode == 0, process.stderr
-    result = json.loads(process.stdout)
-    assert process.stdout.count("\n") == 1
-    assert (result["verdict"], result["failures"]) == ("agrees", [])
-    assert json.loads((Path(result["bag"]) / "result.json").read_text()) == result
-    assert Path(result["report"]).read_text(encoding="utf-8").startswith("<!")
-
-
-@pytest.mark.integration
-def test_run_without_recording(experiment: Path, tmp_path: Path) -> None:
-    process = execute("run", experiment, "--no-record", "--processes", "1", "--json", directory=tmp_path)
-    assert process.returncode == 0, process.stderr
-    result = json.loads(process.stdout)
-    assert result["bag"] is None
-    assert result["failures"] == []
-    assert [file.name for file in tmp_path.iterdir()] == ["small.yaml"]
