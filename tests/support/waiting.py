@@ -45,5 +45,5 @@ def record_of_two(directory: Path) -> Path:
         }
     )
     file = directory / "run.json"
-    file.write_text(new_record(experiment).to_json())
+    file.write_text(new_record(experiment).to_json(with_key=True))
     return file

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import uuid
 
 import numpy as np
@@ -21,6 +22,8 @@ from msg_analysis.twin.network_steps import states as states_of_all
 from msg_analysis.twin.start import draw_start
 from msg_analysis.types import BoolArray
 
+KEY_SIZE = 32  # bytes
+
 
 def new_record(experiment: ValidExperiment, run: uuid.UUID | None = None) -> RunRecord:
     """Everything that a new run of an experiment starts from; ``run``: its id, a new random one if not given."""
@@ -32,7 +35,7 @@ def new_record(experiment: ValidExperiment, run: uuid.UUID | None = None) -> Run
     matrices = None
     if isinstance(model, StepModel) and (experiment.time == "discrete" or experiment.protocol):
         matrices = StepMatrices(model.nominal, model.noise_gain)
-    return RunRecord(run or uuid.uuid4(), experiment, start, matrices=matrices)
+    return RunRecord(run or uuid.uuid4(), experiment, start, matrices=matrices, key=secrets.token_bytes(KEY_SIZE))
 
 
 def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) -> Trajectory:

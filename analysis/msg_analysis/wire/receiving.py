@@ -2,16 +2,99 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import fields
 from typing import TypeVar
 
 from msg_analysis.model.arithmetic.payload import all_finite
+from msg_analysis.model.arithmetic.step_clock import StepClock
+from msg_analysis.model.run.graph_path import PathWindow, Sojourn
 from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.step.step_model import first_graph
 from msg_analysis.wire.cdr_fields import CdrError
-from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, StateFrame
+from msg_analysis.wire.messages import (
+    ActiveGraph,
+    AgentState,
+    Progress,
+    StateFrame,
+    decode_string,
+    encode_string,
+)
 from msg_analysis.wire.refusals import Refusal
+from msg_analysis.wire.signatures import genuine
+from msg_analysis.wire.topics import END, EPOCH, Topic
 
 Message = TypeVar("Message", ActiveGraph, Progress)
+
+
+class RunRules:
+    """Which messages belong to a run: the rules of all its nodes, for all topics but those of the states.
+
+    What follows from the run record is compared with it; what does not is signed with its key.
+    """
+
+    def __init__(self, record: RunRecord) -> None:
+        self._record = record
+        self._experiment = encode_string(record.to_json())
+        self._graphs = [(graph.name, tuple(graph.arcs)) for graph in record.experiment.graph_list]
+        self._clock = StepClock(record.experiment.step_length)
+        self._path = PathWindow(record.experiment, first_graph(record.experiment))
+
+    def experiment(self, data: bytes) -> str | None:
+        """The ``Refusal`` of a message on the topic ``experiment``; None: it is the record of this run."""
+        if data.rstrip(b"\0") == self._experiment.rstrip(b"\0"):  # middleware pads messages to a multiple of four
+            return None
+        try:
+            run = json.loads(decode_string(data))["run"]
+        except (ValueError, KeyError, TypeError, RecursionError):  # CdrError and JSON's own among them
+            return Refusal.UNDECODABLE
+        return Refusal.NOT_OF_RECORD if run == str(self._record.run) else Refusal.OTHER_RUN
+
+    def forget(self, step: int) -> None:
+        """From now on, sojourns that end before a step are refused as repeated."""
+        self._path.forget(step)
+
+    def graph(self, data: bytes) -> ActiveGraph | str:
+        """A sojourn of the graph, or a ``Refusal``."""
+        message = decode_of_run(ActiveGraph, data, self._record.run.bytes)
+        if isinstance(message, str):
+            return message
+        if message.sequence < self._path.first:
+            return Refusal.REPEATED
+        if message.sequence > self._path.first + self._path.MOST_AHEAD:
+            return Refusal.TOO_EARLY
+        sojourn = self._path.sojourn(message.sequence)
+        if sojourn is None:
+            return Refusal.GRAPH_OUT_OF_RANGE
+        true = self.sojourn_message(sojourn)
+        same = all(getattr(message, field.name) == getattr(true, field.name) for field in fields(ActiveGraph))
+        return message if same else Refusal.NOT_OF_RECORD
+
+    def sojourn_message(self, sojourn: Sojourn) -> ActiveGraph:
+        """What the switcher publishes of a sojourn."""
+        name, arcs = self._graphs[sojourn.mode]
+        return ActiveGraph(
+            stamp=self._clock.nanoseconds(sojourn.first_step),
+            run=self._record.run.bytes,
+            sequence=sojourn.sequence,
+            mode=sojourn.mode + 1,
+            name=name,
+            first_step=sojourn.first_step,
+            last_step=sojourn.last_step,
+            arcs=arcs,
+        )
+
+    def progress(self, data: bytes, topic: Topic) -> Progress | str:
+        """A message on one of the topics of type Progress, or a ``Refusal``."""
+        message = decode_of_run(Progress, data, self._record.run.bytes)
+        if isinstance(message, str):
+            return message
+        if message.agent > (0 if topic in (END, EPOCH) else self._record.experiment.agents):
+            return Refusal.UNKNOWN_AGENT
+        if message.step > self._record.experiment.steps:
+            return Refusal.OUT_OF_RANGE
+        return message if genuine(message, topic, self._record.key) else Refusal.NOT_SIGNED
 
 
 def decode_of_run(kind: type[Message], data: bytes, run: bytes) -> Message | str:
@@ -46,6 +129,13 @@ def why_refused(data: bytes, record: RunRecord, agent: int, frame: StateFrame) -
     return Refusal.WRONG_LENGTH if len(message.state) != frame.replicas else Refusal.OTHER_LAYOUT
 
 
+def fault_of(step: int, mode: int, state: bytes, graphs: int) -> str | None:
+    """The ``Refusal`` of a state that no agent can have in a run with so many graphs; None: it is possible."""
+    if mode > graphs or (mode == 0) != (step == 0):
+        return Refusal.UNKNOWN_MODE
+    return None if all_finite(state) else Refusal.NOT_FINITE
+
+
 def state_receiver(
     record: RunRecord,
     agent: int,  # index from 0
@@ -53,10 +143,10 @@ def state_receiver(
     take: Callable[[int, int, int, bytes, bytes], str | None],  # of agent, step, mode, state, message; may refuse it
     refuse: Callable[[str], None],
     *,
-    finite: bool = False,  # whether to refuse states that are not finite
+    possible: bool = False,  # whether to refuse states that ``fault_of`` finds impossible
 ) -> Callable[[bytes], None]:
     """The callback for the topic of an agent's states. Hot path."""
-    unwrap, number = frame.unwrap, agent + 1
+    unwrap, number, graphs = frame.unwrap, agent + 1, len(record.experiment.graph_list)
 
     def receive(data: bytes) -> None:
         found = unwrap(data)
@@ -64,7 +154,7 @@ def state_receiver(
             refuse(why_refused(data, record, agent, frame))
             return
         _, step, mode, state = found
-        reason = Refusal.NOT_FINITE if finite and not all_finite(state) else take(agent, step, mode, state, data)
+        reason = (possible and fault_of(step, mode, state, graphs)) or take(agent, step, mode, state, data)
         if reason:
             refuse(reason)
 

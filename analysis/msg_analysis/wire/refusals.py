@@ -15,6 +15,8 @@ class Refusal:
     COMPRESSED = "compressed message"
     REPEATED = "received again"  # harmless: nodes send again what a restarted one may have missed
     CONTRADICTION = "contradicts an earlier copy"
+    NOT_OF_RECORD = "contradicts the run record"
+    NOT_SIGNED = "not signed with the key of the run"
     DUPLICATE_NAME = "duplicate node name"  # not of a message
 
     # States

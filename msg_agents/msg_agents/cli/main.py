@@ -275,7 +275,7 @@ def prepare(experiment: Path) -> None:
 
     what = ValidExperiment.load(experiment)
     what.require_available()
-    click.echo(new_record(what).to_json())
+    click.echo(new_record(what).to_json(with_key=True))
 
 
 @main.command(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -147,22 +147,24 @@ def agent(
 @_await
 @_checkpoint
 @_patience
-@click.option("--status", type=int, hidden=True)
+@click.option("--steps", type=PATH, hidden=True)
 def switcher(
     run_record: Path,
     *,
     readers: tuple[str, ...],
     checkpoint: Path | None,
-    status: int | None,
+    steps: Path | None,
     patience: float | None,
     **options: Any,
 ) -> None:
     """Run the switcher of the run in RUN_RECORD: it publishes the experiment and the active graph."""
     record = load_record(run_record)
 
-    def report(steps: Any) -> None:
-        if status is not None:
-            os.write(status, json.dumps(list(steps)).encode() + b"\n")
+    def report(reached: Sequence[int]) -> None:
+        from msg_agents.processes.status_file import write_steps
+
+        if steps is not None:
+            write_steps(steps, reached)
 
     def nodes() -> list[NetworkNode]:
         from msg_agents.nodes.network_node import ACK_TIMEOUT

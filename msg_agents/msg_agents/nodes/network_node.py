@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import TypeVar
 
 from rclpy.publisher import Publisher
@@ -19,8 +20,9 @@ from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.wire import topics
 from msg_analysis.wire.messages import ActiveGraph, Progress
-from msg_analysis.wire.receiving import decode_of_run
+from msg_analysis.wire.receiving import RunRules
 from msg_analysis.wire.refusals import Refusal
+from msg_analysis.wire.signatures import sign
 from msg_analysis.wire.topics import Topic, agent_name
 
 ACK_TIMEOUT = 4.0  # s for readers to acknowledge the last messages; more than Fast DDS's default heartbeat period, 3 s
@@ -125,25 +127,29 @@ class NetworkNode(LeanNode):
                 if not node.done.done():
                     node.done.set_result(None)
 
-    def decode(self, kind: type[Message], data: bytes, topic: Topic) -> Message | None:
-        """A message of this run; None, and counted, if the bytes are not one."""
-        message = decode_of_run(kind, data, self.run)
-        if isinstance(message, str):
-            self.refuse(message, topic.name)
-            return None
-        return message
+    @cached_property
+    def rules(self) -> RunRules:
+        """Which messages belong to the run."""
+        return RunRules(self.record)
+
+    def decode_graph(self, data: bytes) -> ActiveGraph | None:
+        """A sojourn of the graph of this run; None, and counted, if the bytes are not one."""
+        return self._accepted(self.rules.graph(data), topics.GRAPH)
 
     def decode_progress(self, data: bytes, topic: Topic) -> Progress | None:
-        """The same of Progress, of an agent that exists."""
-        progress = self.decode(Progress, data, topic)
-        if progress and progress.agent > self.record.experiment.agents:
-            self.refuse(Refusal.UNKNOWN_AGENT, topic.name)
-            return None
-        return progress
+        """The same of Progress, on one of its topics."""
+        return self._accepted(self.rules.progress(data, topic), topic)
 
-    def progress(self, agent: int, step: int) -> bytes:
-        """Bytes of a Progress message; ``agent``: number from 1, or NOT_AN_AGENT."""
-        return Progress(self._step_clock.nanoseconds(step), self.run, agent, step).encode()
+    def _accepted(self, found: Message | str, topic: Topic) -> Message | None:
+        if isinstance(found, str):
+            self.refuse(found, topic.name)
+            return None
+        return found
+
+    def progress(self, topic: Topic, agent: int, step: int, stamp: int | None = None) -> bytes:
+        """Bytes of a Progress message; ``agent``: number from 1, or NOT_AN_AGENT; ``stamp`` [ns]: None: of the step."""
+        time = self._step_clock.nanoseconds(step) if stamp is None else stamp
+        return sign(Progress(time, self.run, agent, step), topic, self.record.key).encode()
 
     def has_readers(self, publisher: Publisher, expected: Sequence[str]) -> bool:
         """Whether all the expected nodes read a topic of this node."""

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 from msg_agents.nodes.diagnostics import Health
 from msg_agents.nodes.network_node import NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.ros.timers import every
-from msg_agents.stepping.synchronizer import RESEND_LIMIT
+from msg_agents.stepping.received_steps import ReceivedSteps
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
-from msg_analysis.model.arithmetic.payload import all_finite
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.wire import topics
-from msg_analysis.wire.messages import ActiveGraph, decode_string, stamp_ns
-from msg_analysis.wire.receiving import state_frame, why_refused
+from msg_analysis.wire.messages import stamp_ns
+from msg_analysis.wire.receiving import fault_of, state_frame, why_refused
 from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.topics import Topic, network_topics
 
-RECORDED_FAULTS = {Refusal.WRONG_LENGTH, Refusal.OTHER_LAYOUT}
-"""Faults of states that are recorded nevertheless: they belong to this run, and the reader of the bag reports them."""
 BATCH = 16  # states collected before they are written: cheaper than one by one, and the core is not held for long
 WRITE_PERIOD = 0.1  # s of wall time after which fewer are written, in slow runs and at the end
 FLUSH_PERIOD = 1.0
@@ -41,16 +37,16 @@ class Recorder(NetworkNode):
         # In the bag topics keep their own names, even if they are remapped: readers of bags look for these.
         self._root = self.get_namespace().rstrip("/") + "/"
         recorded = network_topics(experiment.agents, self._root, truth=experiment.truth)
-        self._last = experiment.steps
+        self._last, self._graphs = experiment.steps, len(experiment.graph_list)
         kinds = [(topics.STATE, state_frame(record, whole=False))]
         if experiment.truth:
             kinds.append((topics.TRUTH, state_frame(record, whole=True)))
         self._sources = [  # of states: agent (from 0), topic in the bag, layout of its messages
             (agent, self._root + topic.of(agent), frame) for topic, frame in kinds for agent in range(experiment.agents)
         ]
-        self._known: list[dict[int, int]] = [{} for _ in self._sources]  # step -> hash of what was written
-        self._row = [-1] * len(self._sources)  # newest step up to which none is missing
-        self._seen: set[bytes] = set()  # messages written, except for states
+        self._received = [ReceivedSteps(experiment.steps) for _ in self._sources]
+        self._next_sojourn = 0  # the first one that has not been written
+        self._sojourns: dict[int, int] = {}  # of those written after it: last step by number
         self._pending: list[tuple[int, bytes]] = []  # source and bytes of states not yet written
         # Topics whose last message (last state, last sojourn, experiment) has not arrived.
         self._awaiting = {topic.name for topic in recorded}
@@ -88,68 +84,45 @@ class Recorder(NetworkNode):
 
     def _write_states(self) -> None:
         """Write the collected states, many at once: a fraction of the time of writing each on arrival."""
-        write, last = self.bag.write, self._last
+        write, last, received = self.bag.write, self._last, self._received
         for source, data in self._pending:
             agent, topic, layout = self._sources[source]
             frame = layout.unwrap(data)
             if frame is None or frame[0] != agent + 1:  # not what the agents of this run send: find out why
-                reason = why_refused(data, self.record, agent, layout)
-                self.refuse(reason, topic)
-                if reason not in RECORDED_FAULTS:
-                    continue
-            elif refusal := self._refusal(source, frame[1], data):
-                self.refuse(refusal, topic)
+                self.refuse(why_refused(data, self.record, agent, layout), topic)
                 continue
-            write(topic, data, stamp_ns(data))
-            if frame is not None and frame[1] == last and all_finite(frame[3]):
+            step, mode, state = frame[1:]
+            if refusal := fault_of(step, mode, state, self._graphs) or received[source].take(step, hash(data)):
+                self.refuse(refusal, topic)
+                if refusal != Refusal.CONTRADICTION:  # one of the two is forged: the reader of the bag takes neither
+                    continue
+            write(topic, data, max(0, stamp_ns(data)))
+            if step == last:
                 self._received_last(topic)
         self._pending.clear()
 
-    def _refusal(self, source: int, step: int, data: bytes) -> str | None:
-        """Why a state is not written; None if it is.
-
-        After a restart agents send states again, none older than ``RESEND_LIMIT`` steps. Of two different states of one
-        step, one is forged: both are written, and the reader of the bag takes neither.
-        """
-        known, mark, row = self._known[source], hash(data), self._row[source]
-        before = known.get(step)
-        if before == mark:
-            return Refusal.REPEATED
-        if step > self._last:
-            return Refusal.OUT_OF_RANGE
-        if step < row - RESEND_LIMIT:
-            return Refusal.TOO_OLD
-        if 0 <= row < step - RESEND_LIMIT:
-            return Refusal.TOO_NEW
-        if before is not None:
-            self.refuse(Refusal.CONTRADICTION, self._sources[source][1])
-        if step == row + 1:
-            self._row[source] = step
-        known[step] = mark
-        if len(known) > 2 * RESEND_LIMIT:
-            self._known[source] = {k: v for k, v in known.items() if k > step - RESEND_LIMIT}
-        return None
-
     def _record_graph(self, data: bytes) -> None:
-        graph = self.decode(ActiveGraph, data, topics.GRAPH)
-        if graph:
-            self._write(topics.GRAPH, data, graph.stamp, last=graph.last_step == self._last - 1)
+        graph = self.decode_graph(data)
+        if graph is None:
+            return
+        if graph.sequence in self._sojourns:
+            self.refuse(Refusal.REPEATED, topics.GRAPH.name)
+            return
+        self._sojourns[graph.sequence] = graph.last_step
+        while self._next_sojourn in self._sojourns:
+            self.rules.forget(self._sojourns.pop(self._next_sojourn) + 1)
+            self._next_sojourn += 1
+        self._write(topics.GRAPH, data, graph.stamp, last=graph.last_step == self._last - 1)
 
     def _record_experiment(self, data: bytes) -> None:
-        try:
-            run = json.loads(decode_string(data))["run"]
-        except (ValueError, KeyError, TypeError):  # CdrError and JSON's own among them
-            run = None
-        if run == str(self.record.run):
-            self._write(topics.EXPERIMENT, data, 0, last=True)
+        known = self._root + topics.EXPERIMENT.name not in self._awaiting
+        reason = self.rules.experiment(data) or (Refusal.REPEATED if known else None)
+        if reason:
+            self.refuse(reason, topics.EXPERIMENT.name)
         else:
-            self.refuse(Refusal.OTHER_RUN, topics.EXPERIMENT.name)
+            self._write(topics.EXPERIMENT, data, 0, last=True)
 
     def _write(self, topic: Topic, data: bytes, time: int, *, last: bool) -> None:
-        if data in self._seen:
-            self.refuse(Refusal.REPEATED, topic.name)
-            return
-        self._seen.add(data)
         name = self._root + topic.name
         self._guarded(lambda: self.bag.write(name, data, time))()
         if last:
@@ -168,4 +141,4 @@ class Recorder(NetworkNode):
         if topic in self._awaiting:
             self._awaiting.remove(topic)
             if not self._awaiting:
-                self.publish(self._progress, self.progress(NOT_AN_AGENT, self._last))
+                self.publish(self._progress, self.progress(topics.PROGRESS, NOT_AN_AGENT, self._last))

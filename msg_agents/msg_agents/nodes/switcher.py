@@ -22,7 +22,7 @@ from msg_analysis.model.run.graph_path import Sojourn, sojourns
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.wire import topics
-from msg_analysis.wire.messages import ActiveGraph, Progress, encode_string
+from msg_analysis.wire.messages import encode_string
 from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.topics import agent_name
 
@@ -58,7 +58,6 @@ class Switcher(NetworkNode):
     ) -> None:
         super().__init__("switcher", record=record)
         self._ack_timeout = ack_timeout
-        self._graphs = record.experiment.graph_list
         self._path = sojourns(record.experiment, model.initial)
         self._steps = record.experiment.steps
         self._reached = [-1] * model.agents
@@ -138,7 +137,7 @@ class Switcher(NetworkNode):
             self._moved()
         if self._recorded and slowest >= self._steps and not self.done.done():
             self._report()
-            self.publish(self._end, self.progress(NOT_AN_AGENT, self._steps))
+            self.publish(self._end, self.progress(topics.END, NOT_AN_AGENT, self._steps))
             self.done.set_result(None)
 
     def _report(self) -> None:
@@ -148,22 +147,9 @@ class Switcher(NetworkNode):
 
     def _publish_sojourn(self, sojourn: Sojourn) -> int:
         """Publish a sojourn; the size of its message [bytes]."""
-        message = self._message(sojourn).encode()
+        message = self.rules.sojourn_message(sojourn).encode()
         self.publish(self._graph, message)
         return len(message)
-
-    def _message(self, sojourn: Sojourn) -> ActiveGraph:
-        graph = self._graphs[sojourn.mode]
-        return ActiveGraph(
-            stamp=self._step_clock.nanoseconds(sojourn.first_step),
-            run=self.run,
-            sequence=sojourn.sequence,
-            mode=sojourn.mode + 1,
-            name=graph.name,
-            first_step=sojourn.first_step,
-            last_step=sojourn.last_step,
-            arcs=graph.arcs,
-        )
 
 
 class LockstepSwitcher(Switcher):
@@ -257,7 +243,7 @@ class RealtimeSwitcher(Switcher):
         experiment = self.record.experiment
         self._schedule = Schedule(epoch=epoch, speed=experiment.run.speed, step_length=experiment.step_length)
         publisher = self.publisher_of(topics.EPOCH)
-        self.publish(publisher, Progress(epoch, self.run, NOT_AN_AGENT, 0).encode())
+        self.publish(publisher, self.progress(topics.EPOCH, NOT_AN_AGENT, 0, epoch))
         self._keep_up()
 
     def _keep_up(self) -> None:

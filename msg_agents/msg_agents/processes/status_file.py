@@ -1,4 +1,7 @@
-"""Account files, in which the processes of a run report refused messages and what their nodes wait for."""
+"""Files in which the processes of a run report to the runner: neither side ever waits for the other.
+
+Account files have refused messages and what the nodes wait for; the file of steps, how far every agent is.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +33,27 @@ class Account:
 
 def write_account(path: Path, refused: Sequence[Refused], waiting: Mapping[str, str]) -> None:
     """Replace the account file of one process atomically; an error such as a full disk is ignored."""
+    _replace(path, {"refused": refused, "waiting": waiting})
+
+
+def write_steps(path: Path, steps: Sequence[int]) -> None:
+    """Replace the newest step of every agent; an error such as a full disk is ignored."""
+    _replace(path, list(steps))
+
+
+def read_steps(path: Path) -> list[int]:
+    """The newest step of every agent; empty as long as there is no such file."""
+    with contextlib.suppress(OSError, ValueError):
+        steps: list[int] = json.loads(path.read_text(encoding="utf-8"))
+        return steps
+    return []
+
+
+def _replace(path: Path, document: Any) -> None:
+    """Whole or not at all, whatever ends this process."""
     with contextlib.suppress(OSError):
         temporary = path.with_suffix(".part")
-        temporary.write_text(json.dumps({"refused": refused, "waiting": waiting}), encoding="utf-8")
+        temporary.write_text(json.dumps(document), encoding="utf-8")
         temporary.replace(path)
 
 

@@ -112,7 +112,7 @@ class LaunchedNetwork:
         self._stack = ExitStack()
         folder = self._stack.enter_context(workshop())
         self._run_file = folder / "run.json"
-        self._run_file.write_text(new_record(experiment).to_json(), encoding="utf-8")
+        self._run_file.write_text(new_record(experiment).to_json(with_key=True), encoding="utf-8")
         self.bag: Path | None = None  # directory that the recorder makes
         try:
             plan_network(experiment, self._run_file, None)  # rejects too many processes before anything is made

@@ -19,7 +19,7 @@ from msg_agents.processes.process_plan import Share, count_processes, plan_netwo
 from msg_agents.processes.ros_domain import free_domain
 from msg_agents.recovery.checkpoint import room_for
 from msg_agents.running.run_folder import workshop
-from msg_agents.running.supervisor import ACCOUNTS, CRASHED, Supervisor
+from msg_agents.running.supervisor import ACCOUNTS, CRASHED, STEPS, Supervisor
 from msg_agents.stepping.stall_detection import StallDetector
 from msg_agents.terminal.interruption import Interruption
 from msg_agents.watching.view import View
@@ -169,7 +169,7 @@ def run_network(
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 record = record or new_record(experiment)
                 run_file = folder / "run.json"
-                run_file.write_text(record.to_json(), encoding="utf-8")
+                run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
                 longest = state_frame(record, whole=True).size
                 with (
                     workshop(experiment.agents * room_for(longest)) if restarts else nullcontext() as checkpoints,
@@ -279,7 +279,7 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
 
 def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
     try:
-        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS))
+        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS, STEPS))
     except OSError as error:
         # The argument of shutil.Error is a list of (from, to, reason).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 import signal
@@ -19,7 +18,7 @@ from typing import Self
 from msg_agents.processes.core_pinning import keep_to
 from msg_agents.processes.fork_server import ForkServer, ForkServerError, Process
 from msg_agents.processes.process_plan import RECORDER, SWITCHER, ProcessPlan
-from msg_agents.processes.status_file import Account, read_accounts
+from msg_agents.processes.status_file import Account, read_accounts, read_steps
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
 """Signals and the seconds that a process has to obey each."""
@@ -27,7 +26,7 @@ ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0)
 POLL = 0.02  # s
 SILENCE = 3.0  # s; accounts are written once a second
 CRASHED = 1  # exit code of Python after an uncaught exception
-ACCOUNTS = "accounts"
+ACCOUNTS, STEPS = "accounts", "steps.json"
 
 
 def failure_of(code: int) -> str | None:
@@ -106,15 +105,11 @@ class Supervisor:
     cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
     fork_server: ForkServer | None = None  # without one, or when it has ended, every child starts on its own
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
-    _status: tuple[int, int] = field(default=(-1, -1), init=False)
-    _pending: bytes = field(default=b"", init=False)
     _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
 
     def start(self, plans: Sequence[ProcessPlan]) -> None:
         """Start all processes."""
         self._lifeline = os.pipe()
-        self._status = os.pipe()
-        os.set_blocking(self._status[0], False)
         self.children += [self._start(plan) for plan in plans]
 
     def restart(self, child: Child) -> None:
@@ -127,9 +122,9 @@ class Supervisor:
         account.parent.mkdir(exist_ok=True)
         self._accounts.append(account)
         arguments = [*plan.arguments, "--account", str(account)]
-        descriptors = {"--lifeline": self._lifeline[0]}
         if plan.name == SWITCHER:
-            descriptors["--status"] = self._status[1]
+            arguments += ["--steps", str(self.logs / STEPS)]
+        descriptors = {"--lifeline": self._lifeline[0]}
         with log.open("ab") as output:
             process = self._launch(arguments, descriptors, output.fileno(), self.cores.get(plan.name))
         return Child(plan, process, log, number)
@@ -155,13 +150,8 @@ class Supervisor:
         return process
 
     def read_status(self) -> None:
-        """Read what the switcher has reported since the last call; does not block."""
-        with contextlib.suppress(BlockingIOError):
-            while chunk := os.read(self._status[0], 1 << 16):
-                self._pending += chunk
-        *lines, self._pending = self._pending.split(b"\n")
-        if lines:
-            self.steps = json.loads(lines[-1])
+        """Read what the switcher has reported."""
+        self.steps = read_steps(self.logs / STEPS) or self.steps
 
     @property
     def running(self) -> list[Child]:
@@ -225,6 +215,6 @@ class Supervisor:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
-        for descriptor in (*self._lifeline, *self._status):
+        for descriptor in self._lifeline:
             with contextlib.suppress(OSError):
                 os.close(descriptor)

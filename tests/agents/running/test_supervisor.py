@@ -37,12 +37,14 @@ signal.signal(signal.SIGINT, lambda *_: sys.exit(0))
 print("ready", flush=True)
 signal.pause()
 """
-# Takes the place of msg_agents in ``python -m msg_agents``: writes on the status pipe what it reads from a named pipe.
+# Takes the place of msg_agents in ``python -m msg_agents``: reports the steps that it reads from a file.
 REPORTER = """
 import json, os, sys
-status = int(sys.argv[sys.argv.index("--status") + 1])
+from pathlib import Path
+sys.path.remove(os.environ["PYTHONPATH"])
+from msg_agents.processes.status_file import write_steps
 for line in open(sys.argv[2]):
-    os.write(status, json.loads(line).encode())
+    write_steps(Path(sys.argv[sys.argv.index("--steps") + 1]), json.loads(line))
     print("written", flush=True)
 """
 NAMES = ["agent_1", "agent_2", "recorder", "switcher"]
@@ -182,34 +184,24 @@ def test_who_is_killed_after_the_end_has_not_failed(
     assert [child.plan.name for child in supervisor.failures] == failed
 
 
-def test_a_status_line_may_come_in_pieces(tmp_path: Path) -> None:
-    """From a process that the supervisor has started: part of a line counts once the rest of it has come."""
+def test_steps_that_the_switcher_reports(tmp_path: Path) -> None:
+    """However many reports nobody has read: the newest counts, also when its process has gone."""
     (tmp_path / "msg_agents.py").write_text(REPORTER)
     orders = tmp_path / "orders"
-    os.mkfifo(orders)
     with Supervisor(tmp_path, os.environ | {"PYTHONPATH": str(tmp_path)}) as supervisor:
-        supervisor.start([ProcessPlan("switcher", ("switcher", str(orders)))])
-        (child,) = supervisor.children
         supervisor.read_status()
         assert supervisor.steps == []
-        with orders.open("w") as pieces:
-            for number, (piece, steps) in enumerate(
-                [
-                    ("[1, -", []),
-                    ("1]\n[2", [1, -1]),
-                    (", 0]\n[3, 1]\n", [3, 1]),
-                    ("[4, 2]", [3, 1]),
-                    ("\n", [4, 2]),
-                ],
-                start=1,
-            ):
-                print(json.dumps(piece), file=pieces, flush=True)
-                wait_for(lambda number=number: child.log.read_text().count("written") == number)
-                supervisor.read_status()
-                assert supervisor.steps == steps
+        reports = [[number, -1] * 500 for number in range(2000)]  # more than any pipe holds
+        orders.write_text("".join(f"{json.dumps(steps)}\n" for steps in reports))
+        supervisor.start([ProcessPlan("switcher", ("switcher", str(orders)))])
+        (child,) = supervisor.children
         assert child.process.wait() == 0
-        supervisor.read_status()  # the switcher has gone
-        assert supervisor.steps == [4, 2]
+        assert child.log.read_text().count("written") == len(reports)
+        supervisor.read_status()
+        assert supervisor.steps == reports[-1]
+        (tmp_path / "steps.json").write_text("[1, ")  # no process of ours would leave this
+        supervisor.read_status()
+        assert supervisor.steps == reports[-1]
 
 
 @pytest.fixture

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import uuid
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.graph_path import Sojourn, sojourns
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.step.step_model import first_graph
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.messages import AgentState, Progress
-from msg_analysis.wire.receiving import decode_of_run, state_frame, state_receiver
+from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, encode_string
+from msg_analysis.wire.receiving import RunRules, decode_of_run, state_frame, state_receiver
 from msg_analysis.wire.refusals import Refusal
+from msg_analysis.wire.signatures import sign
+from msg_analysis.wire.topics import END, PROGRESS, RESEND
 
 RECORD = new_record(
     ValidExperiment.parse(
@@ -46,6 +54,9 @@ def state(**changes: Any) -> bytes:
         (state(frame_id="map"), Refusal.OTHER_LAYOUT),
         (state(heard=np.array([2], np.uint64)), Refusal.OTHER_LAYOUT),
         (state(state=np.array([1, np.nan])), Refusal.NOT_FINITE),
+        (state(mode=2), Refusal.UNKNOWN_MODE),
+        (state(mode=0), Refusal.UNKNOWN_MODE),
+        (state(step=0), Refusal.UNKNOWN_MODE),
         (state(step=9), "of the receiver"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -57,7 +68,7 @@ def test_refused_states(data: bytes, reason: str) -> None:
         taken.append((agent, step, mode, payload, message))
         return "of the receiver" if step == 9 else None
 
-    receive = state_receiver(RECORD, 1, state_frame(RECORD, whole=False), take, refused.append, finite=True)
+    receive = state_receiver(RECORD, 1, state_frame(RECORD, whole=False), take, refused.append, possible=True)
     receive(state())
     assert (taken.pop(), refused) == ((1, 3, 1, np.ones(2).tobytes(), state()), [])
     receive(data)
@@ -77,3 +88,106 @@ def test_longest_message(changes: dict[str, Any], listed: int) -> None:
     """Only where messages may be lost, or in real time, does a state list what was heard."""
     record = new_record(RECORD.experiment.parse(RECORD.experiment.to_document() | changes))
     assert state_frame(record, whole=True).size == len(state()) + 8 * listed
+
+
+SWITCHING = new_record(
+    ValidExperiment.parse(
+        {
+            "name": "net",
+            "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
+            "switching": {"generator": [[-1, 1], [1, -1]]},
+            "run": {"dt": 0.05, "duration": 50, "start": "zero"},
+        }
+    )
+)
+PATH = list(sojourns(SWITCHING.experiment, first_graph(SWITCHING.experiment)))
+
+
+def published(sojourn: Sojourn, **changes: Any) -> bytes:
+    graph = SWITCHING.experiment.graph_list[sojourn.mode]
+    fields = {"mode": sojourn.mode + 1, "name": graph.name, "arcs": graph.arcs, "sequence": sojourn.sequence}
+    fields |= {"first_step": sojourn.first_step, "last_step": sojourn.last_step}
+    stamp = sojourn.first_step * 50_000_000
+    return ActiveGraph(**{"stamp": stamp, "run": SWITCHING.run.bytes} | fields | changes).encode()
+
+
+def test_the_graph_is_compared_with_the_record() -> None:
+    """Every sojourn in any order passes; one with any other field, or one that the run does not have, does not."""
+    rules = RunRules(SWITCHING)
+    for sojourn in [*reversed(PATH), *PATH]:
+        assert isinstance(rules.graph(published(sojourn)), ActiveGraph)
+    first = PATH[0]
+    for changes in (
+        {"mode": 0},
+        {"mode": 2 - first.mode},
+        {"mode": 9},
+        {"name": "x"},
+        {"last_step": first.last_step + 1},
+        {"last_step": 10**9},
+        {"first_step": 1},
+        {"arcs": []},
+        {"arcs": [(1, 2, 0.5)]},
+        {"stamp": 7},
+        {"frame_id": "map"},
+        {"sequence": 1},
+    ):
+        assert rules.graph(published(first, **changes)) == Refusal.NOT_OF_RECORD, changes
+    assert rules.graph(published(first, sequence=len(PATH))) == Refusal.GRAPH_OUT_OF_RANGE
+    assert rules.graph(published(first, sequence=2**32 - 1)) == Refusal.TOO_EARLY
+    assert rules.graph(published(first, run=OTHER)) == Refusal.OTHER_RUN
+    assert rules.graph(b"") == Refusal.UNDECODABLE
+
+
+def test_old_sojourns_are_forgotten() -> None:
+    rules = RunRules(SWITCHING)
+    rules.forget(500)
+    for sojourn in PATH:
+        found = rules.graph(published(sojourn))
+        assert (found == Refusal.REPEATED) == (sojourn.last_step < 500)
+    rules.forget(10**6)
+    assert {rules.graph(published(sojourn)) for sojourn in PATH} == {Refusal.REPEATED}
+
+
+def test_the_record_is_compared() -> None:
+    rules, text = RunRules(RECORD), RECORD.to_json()
+    assert "key" not in json.loads(text)
+    assert rules.experiment(encode_string(text)) is None
+    assert rules.experiment(encode_string(text) + b"\0\0") is None  # padding of the middleware
+    read = RunRecord.from_json(RECORD.to_json(with_key=True), "run.json")
+    assert read.key == RECORD.key
+    assert RunRules(read).experiment(encode_string(text)) is None
+    assert rules.experiment(encode_string(text.replace("0.1", "0.2"))) == Refusal.NOT_OF_RECORD
+    assert rules.experiment(encode_string(new_record(RECORD.experiment).to_json())) == Refusal.OTHER_RUN
+    for wrong in (b"", encode_string("["), encode_string("[1]"), encode_string("[" * 10_000)):
+        assert rules.experiment(wrong) == Refusal.UNDECODABLE
+
+
+def test_what_steers_a_run_is_signed() -> None:
+    """The signature is HMAC-SHA256 (RFC 2104) of topic and message, as hashlib has it."""
+    rules, message = RunRules(RECORD), Progress(7, RUN, 2, 3)
+    assert RECORD.key is not None
+    assert rules.progress(message.encode(), PROGRESS) == Refusal.NOT_SIGNED
+    signed = sign(message, PROGRESS, RECORD.key)
+    block = RECORD.key.ljust(64, b"\0")
+    inner = hashlib.sha256(bytes(b ^ 0x36 for b in block) + b"progress\0" + message.encode()).digest()
+    assert signed.frame_id == hashlib.sha256(bytes(b ^ 0x5C for b in block) + inner).hexdigest()[:32]
+    assert rules.progress(signed.encode(), PROGRESS) == signed
+    for topic, changes in (
+        (RESEND, {}),
+        (PROGRESS, {"step": 4}),
+        (PROGRESS, {"agent": 1}),
+        (PROGRESS, {"stamp": 8}),
+        (PROGRESS, {"frame_id": signed.frame_id[:-1] + "\N{SNOWMAN}"}),
+    ):
+        assert rules.progress(replace(signed, **changes).encode(), topic) == Refusal.NOT_SIGNED
+    for topic, changes, reason in (
+        (PROGRESS, {"agent": 3}, Refusal.UNKNOWN_AGENT),
+        (END, {"agent": 2}, Refusal.UNKNOWN_AGENT),
+        (PROGRESS, {"step": 11}, Refusal.OUT_OF_RANGE),
+        (PROGRESS, {"run": OTHER}, Refusal.OTHER_RUN),
+    ):
+        forged = sign(replace(message, **changes), topic, RECORD.key)
+        assert rules.progress(forged.encode(), topic) == reason
+    without = replace(RECORD, key=None)
+    assert RunRules(without).progress(message.encode(), PROGRESS) == message
+    assert sign(message, PROGRESS, None) == message

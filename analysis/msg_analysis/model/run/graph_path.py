@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -53,6 +54,40 @@ def _sampled(
             first = end
         if end >= steps:
             return
+
+
+class PathWindow:
+    """The sojourns of a graph path by number, from a step on, drawn as far as they are asked for."""
+
+    MOST_AHEAD = 10_000  # sojourns beyond the first one that is kept; more are never published ahead
+
+    def __init__(self, experiment: ValidExperiment, initial: FloatArray, step: int = 0) -> None:
+        self._path = sojourns(experiment, initial)
+        self._kept: deque[Sojourn] = deque()
+        self.first = 0  # number of the first sojourn that is kept
+        self.forget(step)
+
+    def forget(self, step: int) -> None:
+        """Keep only the sojourns that end at a step or later."""
+        while (self._kept or self._draw()) and self._kept[0].last_step < step:
+            self._kept.popleft()
+            self.first += 1
+
+    def sojourn(self, number: int) -> Sojourn | None:
+        """A sojourn; None for one that is not there, not kept any more, or too far ahead."""
+        index = number - self.first
+        if not 0 <= index <= self.MOST_AHEAD:
+            return None
+        while len(self._kept) <= index:
+            if not self._draw():
+                return None
+        return self._kept[index]
+
+    def _draw(self) -> bool:
+        sojourn = next(self._path, None)
+        if sojourn is not None:
+            self._kept.append(sojourn)
+        return sojourn is not None
 
 
 def mode_path(experiment: ValidExperiment, initial: FloatArray) -> IntArray:

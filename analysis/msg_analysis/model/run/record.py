@@ -1,7 +1,7 @@
 """The run record: everything that a run was started from, as one JSON document.
 
-It is what every node of a run is given, what the latched ``experiment`` topic carries, and so what any bag of the
-network holds, whoever recorded it.
+It is what every node of a run is given, with a key that only they have, what the latched ``experiment`` topic carries,
+and so what any bag of the network holds, whoever recorded it.
 """
 
 from __future__ import annotations
@@ -66,6 +66,9 @@ class RunRecord:
         versions of the software that started the run, and the machine that it was started on
     matrices
         of a step, in discrete time or of a linear protocol; else None: they follow from the experiment
+    key
+        with which the nodes sign what steers the run: see ``wire.signatures``; None where it is not known, in bags for
+        example, or not used
     """
 
     run: uuid.UUID
@@ -73,6 +76,7 @@ class RunRecord:
     start: FloatArray
     versions: dict[str, str] = field(default_factory=software_versions)
     matrices: StepMatrices | None = None
+    key: bytes | None = field(default=None, repr=False)
 
     @cached_property
     def model(self) -> Wiring:
@@ -90,8 +94,8 @@ class RunRecord:
         """
         return self.model if isinstance(self.model, StepModel) else build_step_model(self.experiment)
 
-    def to_json(self) -> str:
-        """The document; numbers survive the round trip to the last bit."""
+    def to_json(self, *, with_key: bool = False) -> str:
+        """The document, for the nodes of the run with its key; numbers survive the round trip to the last bit."""
         document: dict[str, Any] = {
             "format": FORMAT,
             "run": str(self.run),
@@ -105,6 +109,8 @@ class RunRecord:
             document["step"] = {"weights": [_entries(matrix) for matrix in self.matrices.weights]}
             if self.experiment.protocol:
                 document["step"]["noise_gain"] = [_entries(matrix) for matrix in self.matrices.noise_gain]
+        if with_key and self.key:
+            document["key"] = self.key.hex()
         return json.dumps(document)
 
     @classmethod
@@ -134,7 +140,9 @@ class RunRecord:
             start = np.array(document["start"], dtype=float)
             step = document.get("step")
             matrices = _without_matrices(experiment) if step is None else _matrices(step, experiment, source)
-            record = cls(uuid.UUID(document["run"]), experiment, start, dict(document["versions"]), matrices)
+            run, versions = uuid.UUID(document["run"]), dict(document["versions"])
+            key = bytes.fromhex(document["key"]) if "key" in document else None
+            record = cls(run, experiment, start, versions, matrices, key)
         except InputError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:

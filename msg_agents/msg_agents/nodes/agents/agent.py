@@ -84,6 +84,11 @@ class Agent(NetworkNode):
             self._truth = self.publisher_of(topics.TRUTH, agent)
             self._awaits_truth = [name for name in readers if name == RECORDER]  # others need only what agents hear
 
+    @property
+    def step(self) -> int:
+        """The current step."""
+        return self._law.step
+
     def connect(self, colleagues: Mapping[int, Agent]) -> None:
         """Connect to the peers: agents of this process (by index) by direct calls, the others by topics."""
         self._listeners = [colleagues[j].hear for j in self._near]
@@ -171,7 +176,7 @@ class Agent(NetworkNode):
         """The callback for a peer's states."""
         topic = topics.STATE.of(peer)
         return state_receiver(
-            self.record, peer, self._frame, self.hear, lambda reason: self.refuse(reason, topic), finite=True
+            self.record, peer, self._frame, self.hear, lambda reason: self.refuse(reason, topic), possible=True
         )
 
     def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:

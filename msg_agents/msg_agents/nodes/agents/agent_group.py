@@ -10,13 +10,10 @@ from rclpy.publisher import Publisher
 from msg_agents.nodes.agents.agent import Agent
 from msg_agents.nodes.agents.lockstep_agent import LockstepAgent
 from msg_agents.nodes.agents.realtime_agent import RealtimeAgent
-from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_agents.stepping.turn_queue import TurnQueue
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.wire import topics
-from msg_analysis.wire.messages import ActiveGraph
-from msg_analysis.wire.refusals import Refusal
 
 AGENTS: dict[str, type[Agent]] = {"lockstep": LockstepAgent, "realtime": RealtimeAgent}  # by pace
 PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages of an agent, in a small network
@@ -62,7 +59,6 @@ class AgentGroup:
         self._host.create_shared(self.nodes)
         self._progress = self._host.publisher_of(topics.PROGRESS)
         self._resend: Publisher | None = None
-        self._sojourns: dict[int, tuple[int, int, int]] = {}  # accepted (mode, first, last step) by sequence number
         self._host.subscribe(topics.GRAPH, self._receive_graph)
         self._host.subscribe(topics.RESEND, self._receive_resend)
         self._host.finish_at_end(self.nodes)
@@ -77,13 +73,13 @@ class AgentGroup:
 
     def report(self, agent: int, step: int) -> None:
         """Tell the switcher which step an agent (index from 0) has reached."""
-        self._host.publish(self._progress, self._host.progress(agent + 1, step))
+        self._host.publish(self._progress, self._host.progress(topics.PROGRESS, agent + 1, step))
 
     def ask_again(self, agent: int, step: int) -> None:
         """Ask an agent of another process (index from 0) for its states from a step on."""
         if self._resend is None:  # rarely needed; latched, so a late discovery does no harm
             self._resend = self._host.publisher_of(topics.RESEND)
-        self._host.publish(self._resend, self._host.progress(agent + 1, step))
+        self._host.publish(self._resend, self._host.progress(topics.RESEND, agent + 1, step))
 
     def _receive_resend(self, data: bytes) -> None:
         request = self._host.decode_progress(data, topics.RESEND)
@@ -92,17 +88,11 @@ class AgentGroup:
             agent.send_again(request.step)
 
     def _receive_graph(self, data: bytes) -> None:
-        graph = self._host.decode(ActiveGraph, data, topics.GRAPH)
+        self._host.rules.forget(min(agent.step for agent in self.nodes))
+        graph = self._host.decode_graph(data)
         if graph is None:
             return
         # Agents that take over are at different steps: what is new to one may be known to another.
-        reasons = {agent.learn(graph) for agent in self.nodes}
-        claim = (graph.mode, graph.first_step, graph.last_step)
-        if None in reasons:
-            self._sojourns[graph.sequence] = claim
-            self._sojourns.pop(graph.sequence - RESEND_LIMIT, None)
-        elif self._sojourns.get(graph.sequence, claim) != claim:
-            reasons = {Refusal.CONTRADICTION}
-        for reason in reasons:
+        for reason in {agent.learn(graph) for agent in self.nodes}:
             if reason:
                 self._host.refuse(reason, topics.GRAPH.name)

@@ -8,7 +8,6 @@ from typing import Any
 
 from msg_agents.nodes.agents.agent import Agent
 from msg_agents.nodes.diagnostics import Health
-from msg_agents.nodes.network_node import NOT_AN_AGENT
 from msg_agents.nodes.ros.timers import DueTimer
 from msg_agents.stepping.agent_inputs import NOTHING
 from msg_agents.stepping.newest_values import NewestValues
@@ -62,9 +61,6 @@ class RealtimeAgent(Agent):
         def receive(data: bytes) -> None:
             progress = self.decode_progress(data, topics.EPOCH)
             if progress is None:
-                return
-            if progress.agent != NOT_AN_AGENT:
-                self.refuse(Refusal.OTHER_RUN, topics.EPOCH.name)
                 return
             for agent in agents:
                 assert isinstance(agent, RealtimeAgent)
@@ -137,8 +133,6 @@ class RealtimeAgent(Agent):
 
     def learn(self, graph: ActiveGraph) -> str | None:
         """See Agent."""
-        if not 1 <= graph.mode <= len(self._inputs):
-            return Refusal.OTHER_RUN
         return self._newest.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step)
 
     def health(self) -> Health:

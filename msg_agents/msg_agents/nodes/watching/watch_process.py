@@ -93,6 +93,10 @@ class Watcher(LeanNode):
             self._others.add(str(record.run))
             self._refused[Refusal.OTHER_RUN] += 1
             self._on_note(f"there is a second run, {record.run}: only {self.record.run} is watched")
+        elif record.run == self.record.run and record.to_json() != self.record.to_json():
+            if not self._refused[Refusal.CONTRADICTION]:
+                self._on_note(f"there are two records of run {record.run}, and one is forged: the first is used")
+            self._refused[Refusal.CONTRADICTION] += 1
 
     def _receive_end(self, data: bytes) -> None:
         if self.record is not None and isinstance(decode_of_run(Progress, data, self.record.run.bytes), Progress):

@@ -1,0 +1,62 @@
+"""Which steps of an agent a recorder has received, in bounded memory. No ROS."""
+
+from __future__ import annotations
+
+from array import array
+
+from msg_agents.stepping.synchronizer import RESEND_LIMIT
+from msg_analysis.wire.refusals import Refusal
+
+CONSECUTIVE = 64
+"""Steps in a row after which those before them are taken for lost: the reader came late, for example."""
+
+
+class ReceivedSteps:
+    """The steps 0 to ``last`` of one agent, in any order: after a restart some come again.
+
+    A mark of 4 bytes per step tells whether a repeated one is the same, up to RESEND_LIMIT steps before and after
+    ``row``, the newest step up to which none is to come any more.
+    """
+
+    def __init__(self, last: int) -> None:
+        self.row = -1
+        self._last = last
+        self._chain = (0, 0)  # the step that would continue the newest ones beyond ``row``, and how many these are
+        # 0: not received. Negative: two different ones were.
+        self._marks = array("i", bytes(4 * min(2 * RESEND_LIMIT, last + 1)))
+
+    def take(self, step: int, content: int) -> str | None:
+        """Take a step with a hash of its content; None if it is new, else a ``Refusal``.
+
+        Of two different ones of one step, the second is a contradiction; further ones count as repeated.
+        """
+        if step > self._last:
+            return Refusal.OUT_OF_RANGE
+        if step <= self.row - RESEND_LIMIT:
+            return Refusal.TOO_OLD
+        if step > self.row + 1:
+            following, count = self._chain
+            self._chain = (step + 1, count + 1 if step == following else 1)
+            if self._chain[1] >= CONSECUTIVE:
+                self._move(step - 1)
+        if step > self.row + RESEND_LIMIT:
+            return Refusal.TOO_NEW
+        slot, mark = step % len(self._marks), (content & 0x3FFFFFFF) + 1
+        known = self._marks[slot]
+        if not known:
+            self._marks[slot] = mark
+            while self.row < self._last and self._marks[(self.row + 1) % len(self._marks)]:
+                self._move(self.row + 1)
+            return None
+        if known == mark or known < 0:
+            return Refusal.REPEATED
+        self._marks[slot] = -known
+        return Refusal.CONTRADICTION
+
+    def _move(self, row: int) -> None:
+        """Set ``row``; the steps that are then within reach take the places of old ones."""
+        size = len(self._marks)
+        first = max(self.row, row - size) + RESEND_LIMIT + 1
+        for step in range(first, min(row + RESEND_LIMIT, self._last) + 1):
+            self._marks[step % size] = 0
+        self.row = row

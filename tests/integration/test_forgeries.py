@@ -1,0 +1,155 @@
+"""Messages with the id of the run that are not of the run, before it begins and while it goes on.
+
+Nothing crashes, no trajectory changes, and what was refused is counted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import random
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from stranger import STEPS, Forgery, graph, run_beside
+
+from msg_analysis.model.run.graph_path import sojourns
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.step.step_model import first_graph
+from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import new_record
+from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, encode_string
+
+PACES = {"lockstep": {}, "realtime": {"pace": "realtime", "speed": 5}}
+MANY = 1000  # messages of each kind, before the run and again while it goes on
+
+
+def record_of(network: Any, pace: str) -> RunRecord:
+    return new_record(network.experiment(run={"processes": 2, **PACES[pace]}))
+
+
+def unharmed(record: RunRecord, trajectory: Any) -> None:
+    """All is there, and as the twin says."""
+    assert trajectory.completeness.complete
+    assert trajectory.completeness.missing_modes == 0
+    assert json.loads(trajectory.record.to_json()) == json.loads(record.to_json())
+    outcome = check(trajectory)
+    assert (outcome.difference, outcome.missing) == (None, 0)
+
+
+@pytest.mark.parametrize("pace", PACES)
+def test_steering(network: Any, pace: str) -> None:
+    """A record with other noise, the other graph, the last step of everybody, the end and another epoch."""
+    record = record_of(network, pace)
+    run = record.run.bytes
+    noisy = record.experiment.parse(record.experiment.to_document() | {"noise": {"process": 3.0}})
+    first = next(sojourns(record.experiment, first_graph(record.experiment)))
+    other = graph(run, mode=2 - first.mode, name=["ring", "line"][first.mode], last_step=first.last_step)
+    forged: list[Forgery] = [
+        ("experiment", encode_string(dataclasses.replace(record, experiment=noisy).to_json())),
+        other,
+        graph(run, last_step=10**9),
+        *(("progress", Progress(STEPS * 50_000_000, run, agent, STEPS).encode()) for agent in range(6)),
+        *(("resend", Progress(0, run, agent, 0).encode()) for agent in range(1, 6)),
+        ("end", Progress(STEPS * 50_000_000, run, 0, STEPS).encode()),
+    ]
+    forged += [("epoch", Progress(10**18, run, 0, 0).encode())] if pace == "realtime" else []
+    trajectory, _, refused = run_beside(network, record, forged)
+    unharmed(record, trajectory)
+    assert refused["recorder", "experiment", "contradicts the run record"] == 1
+    for node in ("agent_1", "agent_3", "recorder"):
+        assert refused[node, "graph", "contradicts the run record"] == 2
+        assert refused[node, "end", "not signed with the key of the run"] == 1
+    assert refused["switcher", "progress", "not signed with the key of the run"] == 6
+    for host in ("agent_1", "agent_3"):
+        assert refused[host, "resend", "not signed with the key of the run"] == 5
+        assert refused[host, "epoch", "not signed with the key of the run"] == (pace == "realtime")
+
+
+class Absurd:
+    """Well-formed messages of a run with fields that no message of it has."""
+
+    def __init__(self, record: RunRecord, chance: random.Random) -> None:
+        self._run, self._chance, self._last = record.run.bytes, chance, record.experiment.steps
+        self._steps = [0, 1, self._last - 1, self._last, self._last + 1, 2**31, 2**32, 2**63 - 1, 2**63, 2**64 - 1]
+        self._small = [0, 1, 2, 3, 6, 255, 2**31, 2**32 - 1]
+        self.kinds: dict[str, Callable[[], bytes]] = {
+            "experiment": self._experiment,
+            "graph": self._graph,
+            **dict.fromkeys(("progress", "resend", "end"), self._progress),
+            **{f"agent_{agent}/state": self._state for agent in range(1, 6)},
+        }
+        if record.experiment.run.pace == "realtime":
+            self.kinds["epoch"] = self._progress
+        self._document = json.loads(record.to_json())
+
+    def messages(self, count: int) -> list[Forgery]:
+        """So many of each kind, in any order."""
+        found = [(topic, make()) for topic, make in self.kinds.items() for _ in range(count)]
+        self._chance.shuffle(found)
+        return found
+
+    def _step(self) -> int:
+        return self._chance.choice([*self._steps, self._chance.randrange(self._last)])
+
+    def _stamp(self) -> int:
+        return self._chance.choice([0, 50_000_000, -(10**9), 10**18, self._chance.randrange(10**10)])
+
+    def _text(self) -> str:
+        return self._chance.choice(["", "line", "ring", "\x1b[2J", "x" * 300, "\N{SNOWMAN}"])
+
+    def _experiment(self) -> bytes:
+        document = dict(self._document)
+        key = self._chance.choice([key for key in document if key != "run"])
+        document[key] = self._chance.choice([None, [], {}, "x", -1, 1e300, [[1.0]], {"format": 1}])
+        return encode_string(json.dumps(document))
+
+    def _graph(self) -> bytes:
+        arcs = [(self._chance.choice(self._small), 2, self._chance.choice([0.0, -1.0, np.inf, np.nan, 1.0]))]
+        first, last = self._step(), self._step()
+        sequence, mode = self._chance.choice(self._small), self._chance.choice(self._small)
+        message = ActiveGraph(0, self._run, sequence, mode, self._text(), first, last, arcs * self._chance.randrange(9))
+        return dataclasses.replace(message, stamp=self._stamp(), frame_id=self._text()).encode()
+
+    def _progress(self) -> bytes:
+        agent = self._chance.choice([*self._small, 4, 5])
+        return Progress(self._stamp(), self._run, agent, self._step(), self._text()).encode()
+
+    def _state(self) -> bytes:
+        """With at least one field that is impossible for any agent."""
+        fields: dict[str, Any] = {"agent": 2, "step": self._step(), "mode": 1, "state": np.full(2, 7.0)}
+        fields |= self._chance.choice(
+            [
+                {"agent": self._chance.choice([0, 6, 2**31, 2**32 - 1])},
+                {"step": self._chance.choice([step for step in self._steps if step > self._last])},
+                {"mode": self._chance.choice([3, 255, 2**32 - 1])},
+                {"state": np.full(self._chance.choice([0, 1, 3, 40]), 7.0)},
+                {"state": np.array([7.0, self._chance.choice([np.nan, np.inf, -np.inf])])},
+                {"frame_id": self._text() or "map"},
+                {"heard": np.array([2**64 - 1] * self._chance.randrange(5, 99), np.uint64)},
+            ]
+        )
+        return AgentState(self._stamp(), self._run, **fields).encode()
+
+
+@pytest.mark.parametrize("pace", PACES)
+def test_absurd_fields(network: Any, pace: str, rng: random.Random) -> None:
+    """2,000 of each kind, half of them while the run goes on."""
+    record = new_record(network.experiment(run={"processes": 2, "duration": 200} | PACES[pace] | {"speed": 50}))
+    absurd = Absurd(record, rng)
+    trajectory, _, refused = run_beside(network, record, absurd.messages(MANY), absurd.messages(MANY))
+    unharmed(record, trajectory)
+    counts: Counter[tuple[str, str]] = Counter()
+    for (node, topic, reason), count in refused.items():
+        assert reason != "contradicts an earlier copy"
+        counts[node, topic] += count
+    hosts = [(host, topic) for host in ("agent_1", "agent_3") for topic in ("resend", "end")]
+    hosts += [("agent_1", "epoch"), ("agent_3", "epoch")] if pace == "realtime" else []
+    for reader in [*hosts, ("switcher", "progress"), ("recorder", "experiment"), ("recorder", "end")]:
+        assert counts[reader] > 1.1 * MANY, reader
+    for agent in (1, 2, 3, 5):
+        (heard,) = (n for (node, topic), n in counts.items() if topic == f"agent_{agent}/state")
+        assert heard > 1.1 * MANY

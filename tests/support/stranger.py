@@ -1,0 +1,126 @@
+"""A stranger in the ROS domain of a run: what it publishes arrives before anything of the run."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.process_plan import ProcessPlan, plan_network
+from msg_agents.processes.ros_domain import free_domain
+from msg_agents.running.supervisor import Supervisor
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.wire.messages import ActiveGraph, AgentState
+
+STEPS = 300
+# Waits for every reader of the run, publishes, waits until they have everything, and only then appears as the node that
+# the agents and the switcher have been told to wait for; then it publishes the rest.
+STRANGER = """
+import sys, time
+from pathlib import Path
+import rclpy
+from rclpy.duration import Duration
+from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress
+from std_msgs.msg import String
+from msg_agents.nodes.ros.qos import ros_profile
+from msg_analysis.wire.topics import LATCHED, STREAM
+
+AGENTS, PROCESSES = 5, 2
+latched, stream = ros_profile(LATCHED), ros_profile(STREAM)
+rclpy.init()
+node = rclpy.create_node("stranger", enable_rosout=False)
+kinds = dict.fromkeys(("progress", "end", "epoch", "resend"), Progress) | {"graph": ActiveGraph, "experiment": String}
+readers = {"graph": PROCESSES + 1, "progress": 1, "end": PROCESSES + 1, "epoch": PROCESSES, "experiment": 1}
+readers |= {"resend": PROCESSES}
+readers |= {f"agent_{i}/state": 2 for i in (1, 2, 3, 5)}  # the recorder and the neighbour in the other process
+readers["agent_4/state"] = 1
+messages = [line.split() for line in Path(sys.argv[1]).read_text().splitlines()]
+publishers = {
+    topic: node.create_publisher(kinds.get(topic, AgentState), topic, latched) for topic in dict(messages)
+}
+for topic, publisher in publishers.items():
+    while publisher.get_subscription_count() < readers[topic]:
+        time.sleep(0.1)
+early = int(sys.argv[2])
+for topic, data in messages[:early]:
+    publishers[topic].publish(bytes.fromhex(data))
+for publisher in publishers.values():
+    assert publisher.wait_for_all_acked(Duration(seconds=30))
+referee = rclpy.create_node("referee", enable_rosout=False)
+topics = {"graph": ActiveGraph} | {f"agent_{i}/state": AgentState for i in range(1, AGENTS + 1)}
+for topic, kind in topics.items():
+    referee.create_subscription(kind, topic, lambda _: None, latched if topic == "graph" else stream)
+for topic, data in messages[early:]:
+    publishers[topic].publish(bytes.fromhex(data))
+    time.sleep(0.0001)
+time.sleep(600)
+"""
+Forgery = tuple[str, bytes]  # topic, message
+Refused = Counter[tuple[str, str, str]]
+
+
+def run_beside(
+    network: Any, record: RunRecord, early: Sequence[Forgery], meanwhile: Sequence[Forgery] = ()
+) -> tuple[Trajectory, dict[str, str], Refused]:
+    """Run a network of five agents in two processes while a stranger's messages meet every reader before its own.
+
+    More are sent ``meanwhile``. What comes back: trajectory, logs by process, and what was refused by (node, topic,
+    reason).
+    """
+    directory: Path = network.directory
+    (directory / "run.json").write_text(record.to_json(with_key=True))
+    (directory / "forged").write_text("".join(f"{topic} {data.hex()}\n" for topic, data in [*early, *meanwhile]))
+    with free_domain() as domain:
+        environment = node_environment(domain)
+        with _stranger(directory / "forged", len(early), environment), Supervisor(directory, environment) as nodes:
+            plans = plan_network(record.experiment, directory / "run.json", directory / "bag")
+            nodes.start([plans[0], *(_awaiting_referee(plan) for plan in plans[1:])])
+            network.wait_for(lambda: not nodes.running or nodes.failures, 90, "the end of the run")
+            failures = [(child.plan.name, child.failure, child.last_words()) for child in nodes.failures]
+    assert failures == []
+    logs = {child.plan.name: child.log.read_text() for child in nodes.children}
+    return read_bag(directory / "bag"), logs, nodes.account().refused
+
+
+def _awaiting_referee(plan: ProcessPlan) -> ProcessPlan:
+    return dataclasses.replace(plan, arguments=(*plan.arguments, "--await", "referee"))
+
+
+@contextmanager
+def _stranger(file: Path, early: int, environment: dict[str, str]) -> Iterator[None]:
+    command = [sys.executable, "-P", "-c", STRANGER, str(file), str(early)]
+    with subprocess.Popen(command, env=environment) as process:
+        try:
+            yield
+        finally:
+            process.kill()
+
+
+def states(run: bytes, agent: int, *, replicas: int = 2, value: float = 9.0) -> list[Forgery]:
+    """A whole run of one agent."""
+    state = np.full(replicas, value)
+    return [
+        (f"agent_{agent}/state", AgentState(k * 50_000_000, run, agent, k, 1 if k else 0, state).encode())
+        for k in range(STEPS + 1)
+    ]
+
+
+def graph(run: bytes, **changes: Any) -> Forgery:
+    fields: dict[str, Any] = {
+        "sequence": 0,
+        "mode": 2,
+        "name": "ring",
+        "first_step": 0,
+        "last_step": STEPS - 1,
+    } | changes
+    return "graph", ActiveGraph(stamp=0, run=run, **fields).encode()
