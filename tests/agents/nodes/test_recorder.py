@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
+from array import array
+from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,8 +18,10 @@ import rclpy
 from msg_agents.nodes.recorder import Recorder
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.ros_domain import free_domain
+from msg_agents.stepping.received_steps import ReceivedSteps
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.graph_path import Sojourn
 from msg_analysis.twin.simulate import new_record
 from msg_analysis.wire.messages import StateCodec
 from msg_analysis.wire.refusals import Refusal
@@ -47,16 +52,19 @@ def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Record
         rclpy.shutdown()
 
 
-def sizes(value: object) -> Iterator[int]:
-    """Of a container, and of all in it."""
-    if isinstance(value, dict | list | set | tuple):
-        yield len(value)
-        for each in value.values() if isinstance(value, dict) else value:
-            yield from sizes(each)
+def held(value: object) -> int:
+    """Numbers and containers in a value and in what it holds, deep down: what would grow."""
+    if isinstance(value, array):
+        return len(value)
+    if isinstance(value, ReceivedSteps):
+        return held(vars(value))
+    if isinstance(value, dict | list | set | tuple | deque):
+        return len(value) + sum(map(held, value.values() if isinstance(value, dict) else value))
+    return 0
 
 
 def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> None:
-    """At most 2 RESEND_LIMIT steps per topic are kept, however long the run; the last RESEND_LIMIT are recognised."""
+    """Marks of 2 RESEND_LIMIT steps per topic are kept, however long the run; the last RESEND_LIMIT are recognised."""
     receivers = {s.topic_name: s.callback for s in recorder.subscriptions if s.topic_name.endswith("/state")}
     codecs = {f"/agent_{i}/state": StateCodec(recorder.run, i, 1, DT) for i in range(1, AGENTS + 1)}
     assert set(receivers) == set(codecs)
@@ -69,8 +77,9 @@ def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> 
     for step in range(STEPS):
         send(step)
         if step % 500 == 499:
-            most = max(most, *sizes(vars(recorder)))
-    assert RESEND_LIMIT <= most <= 2 * RESEND_LIMIT
+            most = max(most, held(vars(recorder)))
+    marks = 2 * AGENTS * RESEND_LIMIT
+    assert marks <= most <= marks + 1000
     newest = STEPS - 1
     for step in range(newest - RESEND_LIMIT + 1, newest + 1):
         send(step)
@@ -80,4 +89,18 @@ def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> 
     assert recorder.bag.messages == AGENTS * (STEPS + 1)
     assert recorder.repeated == AGENTS * RESEND_LIMIT
     assert recorder.refused == {(topic, Refusal.TOO_OLD): 1 for topic in codecs}
-    assert max(sizes(vars(recorder))) <= 2 * RESEND_LIMIT
+    assert held(vars(recorder)) <= marks + 1000
+
+
+def test_sojourns_are_recorded_once(recorder: Recorder) -> None:
+    """Of the record's path only; however often, and whatever else comes."""
+    (receive,) = (s.callback for s in recorder.subscriptions if s.topic_name == "/graph")
+    sojourn = Sojourn(0, 0, 0, STEPS - 1)
+    true = recorder.rules.sojourn_message(sojourn)
+    for forged in (replace(true, mode=0), replace(true, last_step=10**9), replace(true, sequence=5)):
+        receive(forged.encode())
+    for _ in range(3):
+        receive(true.encode())
+    assert recorder.bag.messages == 1
+    assert recorder.repeated == 2
+    assert recorder.refused.total() == 3
