@@ -190,8 +190,11 @@ def _choose(contents: _Contents) -> RunRecord:
     errors = [each for each in found if isinstance(each, InputError)]
     records: dict[bytes, RunRecord] = {}
     for each in found:
-        if isinstance(each, RunRecord):
-            records.setdefault(each.run.bytes, each)
+        if isinstance(each, RunRecord) and each.to_json() != records.setdefault(each.run.bytes, each).to_json():
+            raise BagError(
+                f"{path}: two records of run {each.run} contradict each other, and one of them is forged: another "
+                "program published on the topic `experiment`; record the run again"
+            )
     if not records:
         raise errors[0]
     with_states = [record for run, record in records.items() if contents.states.count(run)]
@@ -213,6 +216,10 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
         truth = contents.truths.finish(record, widths[1])
     else:
         truth = contents.states.finish(record, widths[0])
+    if experiment.run.pace == "lockstep":  # in real time agents may use older graphs
+        differs = ((truth.modes[1:] != modes[:, None]) & (truth.modes[1:] >= 0)).any(axis=1) & (modes >= 0)
+        contents.refused[Refusal.OTHER_GRAPH] += int(differs.sum())
+        modes[differs] = -1
     parts = [truth] if published is None else [truth, published]
     for part in parts:
         contents.refused.update(part.refused)

@@ -24,7 +24,8 @@ class Check:
     compared
         states that were compared; where the run logs both exact and published states, both count
     missing
-        states that could not be compared: not in the bag or, in real time, without all their inputs
+        what could not be compared: states that are not in the bag or, in real time, without all their inputs; steps
+        whose graph is not in the bag
     difference
         the first difference in words (lowest step, then lowest agent; agents from 1), or None
     """
@@ -60,7 +61,8 @@ def check(trajectory: Trajectory) -> Check:
         _first_loss(trajectory, twin),
         _first_graph(trajectory, twin.modes),
     ]
-    return Check(trajectory.completeness.received, trajectory.completeness.missing, _earliest(found))
+    count = trajectory.completeness
+    return Check(count.received, count.missing + count.missing_modes, _earliest(found))
 
 
 def _check_realtime(trajectory: Trajectory) -> Check:
@@ -73,7 +75,8 @@ def _check_realtime(trajectory: Trajectory) -> Check:
         _first_graph(trajectory, path),
     ]
     compared = int((trajectory.present & ~np.isnan(law).any(axis=2)).sum())
-    return Check(compared, trajectory.completeness.expected - compared, _earliest(found))
+    count = trajectory.completeness
+    return Check(compared, count.expected - compared + count.missing_modes, _earliest(found))
 
 
 def _earliest(found: Sequence[tuple[float, str] | None]) -> str | None:

@@ -39,6 +39,7 @@ class Refusal:
     OUT_OF_SEQUENCE = "a sojourn out of sequence"
     TOO_EARLY = "a sojourn before its time"
     GRAPH_OUT_OF_RANGE = "graph out of range"
+    OTHER_GRAPH = "graph of a step that its states contradict"
 
     # Files of a bag
     UNREADABLE_FILE = "unreadable file"

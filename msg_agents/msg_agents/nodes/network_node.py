@@ -85,10 +85,14 @@ class NetworkNode(LeanNode):
             return []
         return [f"a publisher of {topics.CLOCK.name}"]
 
+    def names_in_namespace(self) -> Counter[str]:
+        """How many nodes have each name, in the namespace of the run; other runs may share the domain."""
+        here = self.get_namespace()
+        return Counter(name for name, namespace in self.get_node_names_and_namespaces() if namespace == here)
+
     def duplicate_names(self) -> list[str]:
         """Names of this run that more than one node has."""
-        here = self.get_namespace()
-        count = Counter(name for name, namespace in self.get_node_names_and_namespaces() if namespace == here)
+        count = self.names_in_namespace()
         names = [*map(agent_name, range(self.record.experiment.agents)), SWITCHER, RECORDER]
         return [name for name in names if count[name] > 1]
 

@@ -28,7 +28,7 @@ class PeerPresence:
         every(node, CHECK_PERIOD, self._check)
 
     def _check(self) -> None:
-        there, now = set(self._node.get_node_names()), time.monotonic()
+        there, now = self._node.names_in_namespace(), time.monotonic()
         self._since = {name: self._since.get(name, now) for name in self._node.required_peers() if name not in there}
         if now - min(self._since.values(), default=now) > self._patience:
             self._node.fail(

@@ -80,8 +80,7 @@ class Switcher(NetworkNode):
 
     def missing_nodes(self) -> list[str]:
         """Names of nodes that have not been discovered yet; all topics are latched, so readers need not be matched."""
-        here = self.get_namespace()
-        there = {name for name, namespace in self.get_node_names_and_namespaces() if namespace == here}
+        there = self.names_in_namespace()
         return [name for name in self._expected if name not in there]
 
     def required_peers(self) -> list[str]:

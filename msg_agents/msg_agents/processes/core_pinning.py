@@ -12,11 +12,6 @@ RECORDING = 0.25
 """Cost of a message for the recorder, relative to the cost of the step that made it for the agent."""
 
 
-def available_cores() -> list[int]:
-    """The cores that this process may use, ascending; none where the system does not say (not Linux)."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-
-
 def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) -> dict[str, int]:
     """A core for each process by name, where agent processes and recorder outnumber two or more cores; else empty.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from msg_agents.processes.environment import DISCOVERY_TIMEOUT
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, MEGABYTE, Storage
+from msg_analysis.common.cores import count_cores
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 
@@ -53,7 +53,7 @@ def count_processes(experiment: ValidExperiment, agents: int | None = None) -> i
     wanted, count = experiment.run.processes, wanted_processes(experiment, agents)
     if wanted == "auto" and agents > SMALL:
         # A message to another process costs more than the step it is for: no more processes than can run at once.
-        return min(math.ceil(agents / SMALL), MOST_PROCESSES, os.cpu_count() or 1)
+        return min(math.ceil(agents / SMALL), MOST_PROCESSES, count_cores())
     if count > MOST_PROCESSES:
         raise InputError(
             f"run.processes: {wanted} ({count} processes): expected at most {MOST_PROCESSES}, because discovery on one "

@@ -18,7 +18,7 @@ MOST_KEPT, LEAST_KEPT, ROOM = RESEND_LIMIT, 256, 1 << 24
 """States kept of each agent: as many as fit into ROOM bytes, from LEAST_KEPT to MOST_KEPT. Where possible, more than
 the 5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
 
-# Length of the message and step + 1, written after the message: 0 or the mark of an older step until it is whole.
+# Length of the message and step + 1; 0 from before the message is written until it is whole.
 MARK = struct.Struct("<QQ")
 
 
@@ -67,6 +67,7 @@ class Checkpoint:
     def write(self, step: int, message: bytes) -> None:
         """Keep the message (CDR) of a step; steps must be consecutive."""
         start = step % self._capacity * self._slot
+        MARK.pack_into(self._map, start + self._size, 0, 0)  # who reads meanwhile must not take it for the old one
         self._map[start : start + len(message)] = message
         MARK.pack_into(self._map, start + self._size, len(message), step + 1)
 

@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from msg_agents.processes.core_pinning import available_cores, place
+from msg_agents.processes.core_pinning import place
 from msg_agents.processes.environment import RESTARTS, node_environment
 from msg_agents.processes.fork_server import ForkServer
 from msg_agents.processes.process_plan import Share, count_processes, plan_network
@@ -27,6 +27,7 @@ from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.writer import RECORDING_MARKER
+from msg_analysis.common.cores import available_cores
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord

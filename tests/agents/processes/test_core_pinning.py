@@ -10,8 +10,9 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.processes.core_pinning import RECORDING, available_cores, keep_to, place
+from msg_agents.processes.core_pinning import RECORDING, keep_to, place
 from msg_agents.processes.process_plan import RECORDER, SWITCHER, ProcessPlan
+from msg_analysis.common.cores import available_cores
 
 
 def plans(agents: int, processes: int, *, recorder: bool) -> list[ProcessPlan]:

@@ -58,13 +58,13 @@ def test_every_agent_exactly_once(agents: int, processes: int) -> None:
     [(2, 2, 2), (2, 8, 8), (2, 9, 2), (1, 9, 1), (1, 100, 1), (8, 9, 2), (8, 100, 8), (64, 100, 13)],
 )
 def test_auto(monkeypatch: pytest.MonkeyPatch, cores: int, agents: int, expected: int) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     assert count_processes(experiment(agents, "auto")) == expected
 
 
 @pytest.mark.parametrize("cores", [1, 2, 14, 64, 256])
 def test_auto_never_asks_for_too_many(monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     assert count_processes(experiment(200, "auto")) <= MOST_PROCESSES
 
 

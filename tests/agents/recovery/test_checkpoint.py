@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import mmap
 import os
 import signal
 import subprocess
@@ -10,8 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import wait_for
 
-from msg_agents.recovery.checkpoint import LEAST_KEPT, Checkpoint
+from msg_agents.recovery.checkpoint import LEAST_KEPT, MARK, Checkpoint
 from msg_analysis.errors import InputError
 
 LARGE = 100_000  # bytes of a message, so that the ring has its least length
@@ -80,6 +82,33 @@ def test_killed_in_the_middle_of_it(tmp_path: Path) -> None:
         assert steps == list(range(steps[0], steps[0] + len(steps)))
         assert len(steps) > 1000
         assert all(data == step.to_bytes(8, "little") * 1000 for step, data in found)
+
+
+def test_read_while_it_is_written(tmp_path: Path) -> None:
+    """By another process, as the live panel does: a step whose mark stands before and after is whole."""
+    code = (
+        "import sys; from pathlib import Path; from msg_agents.recovery.checkpoint import Checkpoint\n"
+        f"ring, step = Checkpoint(Path(sys.argv[1]), {LARGE}), 0\n"
+        f"while True: ring.write(step, step.to_bytes(8, 'little') * ({LARGE} // 8)); step += 1"
+    )
+    file, slot = tmp_path / "states", LARGE + MARK.size
+    writer = subprocess.Popen([sys.executable, "-P", "-c", code, str(file)])
+    try:
+        wait_for(lambda: file.exists() and file.stat().st_size == LEAST_KEPT * slot)
+        with file.open("rb") as stream:
+            ring = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        whole = 0
+        for number in range(40_000):
+            start = number % LEAST_KEPT * slot
+            before = MARK.unpack_from(ring, start + LARGE)
+            found = ring[start : start + LARGE]
+            if before[1] and MARK.unpack_from(ring, start + LARGE) == before:
+                assert found == message(before[1] - 1)
+                whole += 1
+        assert whole > 1000
+    finally:
+        writer.kill()
+        writer.wait()
 
 
 def test_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,8 +18,10 @@ from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.errors import BagError, InputError
+from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.step_model import build_model
+from msg_analysis.twin.check import check
 from msg_analysis.wire.messages import ActiveGraph, AgentState, encode_string
 from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
 
@@ -250,6 +252,36 @@ def test_gaps_and_overlaps_of_sojourns(tmp_path: Path, make_run: MakeRun) -> Non
     assert np.flatnonzero(found.modes < 0).tolist() == unknown
     assert found.completeness.refused == {"graph out of range": 1}
     assert found.prefix == 8
+
+
+def test_a_graph_that_the_states_contradict(tmp_path: Path, make_run: MakeRun) -> None:
+    """No verdict, and no "equal", on a bag whose graph topic names another graph, or none."""
+    run = make_run()
+    changed = []
+    for topic, kind, data, time in _messages(run):
+        if topic == "/graph":
+            graph = ActiveGraph.decode(data)
+            data = dataclasses.replace(graph, mode=3 - graph.mode).encode()
+        changed.append((topic, kind, data, time))
+    found = read_bag(_mcap(tmp_path / "other.mcap", changed))
+    assert found.completeness.missing_modes == len(run.modes)
+    assert found.completeness.refused == {"graph of a step that its states contradict": len(run.modes)}
+    assert compare(found).verdict == "incomplete"
+    assert check(found).missing == len(run.modes)
+    none = read_bag(_mcap(tmp_path / "none.mcap", [message for message in _messages(run) if message[0] != "/graph"]))
+    assert compare(none).verdict == "incomplete"
+    assert check(none).missing == len(run.modes)
+
+
+def test_two_records_of_one_run(tmp_path: Path, make_run: MakeRun) -> None:
+    """One of them is forged: which, nobody can say."""
+    run = make_run()
+    (topic, kind, _, _), *rest = _messages(run)
+    for order in (1, -1):
+        texts = [run.record.to_json(), dataclasses.replace(run.record, start=run.record.start + 1).to_json()][::order]
+        both = [(topic, kind, encode_string(text), 0) for text in [*texts, texts[0]]]
+        with pytest.raises(BagError, match=f"two records of run {run.record.run} contradict each other"):
+            read_bag(_mcap(tmp_path / "bag.mcap", [*both, *rest]))
 
 
 def test_two_runs(tmp_path: Path, make_run: MakeRun) -> None:

@@ -21,6 +21,7 @@ from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
+from msg_analysis.common.cores import count_cores
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.software import installed_software
 
@@ -61,11 +62,6 @@ class Lost:
         self.reason = reason
 
 
-def available() -> int:
-    """CPUs that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def warm_up() -> None:
     """Begin to start the server that workers are forked from: it imports while this process does other things.
 
@@ -87,7 +83,7 @@ class Workers:
     """
 
     def __init__(self, count: int | None = None, scheduler: str | None = None) -> None:
-        self._count = count or available()
+        self._count = count or count_cores()
         self._scheduler = scheduler
         self._client: Client | None = None
         self._cluster: Any = None

@@ -1,0 +1,60 @@
+"""Which nodes count as present: those of the run, not those of another one in the same domain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+import rclpy
+from rclpy.node import Node
+from waiting import record_of_two, wait_for
+
+from msg_agents.nodes.network_node import NetworkNode
+from msg_agents.nodes.peer_presence import PeerPresence, PeersLostError
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.ros_domain import free_domain
+from msg_analysis.model.run.record import RunRecord
+
+pytestmark = pytest.mark.filterwarnings("ignore:module .sre_:DeprecationWarning")  # of a package that rclpy imports
+
+
+@pytest.fixture
+def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Node]]:
+    """Makes nodes in a domain of the test's own."""
+    record = RunRecord.from_json(record_of_two(tmp_path).read_text(), "run.json")
+    nodes: list[Node] = []
+
+    def make(name: str, namespace: str | None = None) -> Node:
+        nodes.append(NetworkNode(name, record=record) if namespace is None else Node(name, namespace=namespace))
+        return nodes[-1]
+
+    with free_domain() as domain:
+        for name, value in node_environment(domain).items():
+            monkeypatch.setenv(name, value)
+        rclpy.init()
+        yield make
+        for node in nodes:
+            node.destroy_node()
+        rclpy.shutdown()
+
+
+@pytest.mark.parametrize(("namespace", "there"), [("/", True), ("/other", False)])
+def test_a_switcher_of_another_namespace_is_not_ours(start: Callable[..., Node], namespace: str, there: bool) -> None:
+    agent = start("agent_1")
+    assert isinstance(agent, NetworkNode)
+    start("switcher", namespace)
+    wait_for(lambda: "switcher" in agent.get_node_names())
+    assert ("switcher" in agent.names_in_namespace()) == there
+    PeerPresence(agent, patience=0.0)
+    executor = rclpy.executors.SingleThreadedExecutor()
+    executor.add_node(agent)
+    executor.spin_until_future_complete(agent.done, timeout_sec=3.0)
+    executor.shutdown()
+    assert agent.done.done() == (not there)
+    if not there:
+        with pytest.raises(PeersLostError, match="switcher left the network"):
+            agent.done.result()
