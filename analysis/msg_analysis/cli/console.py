@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import signal
 import stat
@@ -34,6 +35,7 @@ class CommandGroup(click.Group):
     def main(self, *args: Any, **extra: Any) -> Any:
         """Run the program; see click.Command."""
         _open_closed_streams()
+        _tolerate_streams()
         return super().main(*args, **extra)
 
     def make_context(self, *args: Any, **extra: Any) -> click.Context:
@@ -85,6 +87,26 @@ def _open_closed_streams() -> None:
                 sys.stdout = os.fdopen(1, "w")
             elif number == 2:
                 sys.stderr = os.fdopen(2, "w")
+
+
+class _Unfailing(io.FileIO):
+    """A file that drops what cannot be written: it is full, or its reader has gone."""
+
+    def write(self, data: Any) -> int:
+        """As many bytes as there are."""
+        with suppress(OSError):
+            super().write(data)
+        return len(data)
+
+
+def _tolerate_streams() -> None:
+    """Notes and errors that cannot be printed, or characters that stdout does not have, change no result."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+    if isinstance(sys.stderr, io.TextIOWrapper) and sys.stderr is sys.__stderr__:
+        unfailing = io.BufferedWriter(_Unfailing(sys.stderr.fileno(), "w", closefd=False))
+        encoding = sys.stderr.encoding
+        sys.stderr = io.TextIOWrapper(unfailing, encoding, "backslashreplace", line_buffering=True)
 
 
 def _stdout_can_fail() -> bool:

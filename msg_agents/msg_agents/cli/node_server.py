@@ -25,8 +25,10 @@ def main() -> None:
     from setproctitle import setproctitle
 
     from msg_agents.cli.main import main as run
+    from msg_agents.processes.environment import tolerate_warnings
     from msg_agents.processes.fork_server import serve
 
+    tolerate_warnings()
     _import_all()
     arguments = serve(socket.socket(fileno=int(sys.argv[1])))
     setproctitle(f"msg-agents {' '.join(arguments)}")

@@ -15,7 +15,7 @@ from msg_agents.nodes.ros.node_parameters import (
     name_of,
     options_of,
 )
-from msg_agents.processes.environment import check_domain
+from msg_agents.processes.environment import check_domain, tolerate_warnings
 
 
 class RosCommand(click.Command):
@@ -45,6 +45,7 @@ class RosCommand(click.Command):
 
     def invoke(self, ctx: click.Context) -> Any:
         """As in click; without ``--domain``, ROS_DOMAIN_ID is checked first."""
+        tolerate_warnings()
         if ctx.params.get("domain") is None:
             check_domain()
         return super().invoke(ctx)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import tempfile
+import warnings
 from pathlib import Path
 
 from msg_analysis.errors import InputError
@@ -17,6 +19,8 @@ SINGLE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
 DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
 PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
+SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
+LOGS_VARIABLE = "ROS_LOG_DIR"
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
 
 
@@ -33,8 +37,39 @@ def discovery_scope() -> str:
     return f"in ROS_DOMAIN_ID {domain} and within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}"
 
 
+def can_log() -> bool:
+    """Whether ROS can write its log files where the environment says: not without a home, on a read-only root, ...
+
+    Without them no node starts.
+    """
+    ros_home, home = os.environ.get("ROS_HOME"), os.environ.get("HOME")
+    place = os.environ.get(LOGS_VARIABLE) or (ros_home and f"{ros_home}/log") or (home and f"{home}/.ros/log")
+    if not place:
+        return False
+    path = Path(place).expanduser()
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(path, os.W_OK | os.X_OK)
+
+
+def ensure_logs() -> None:
+    """Give this process another directory for the log files of ROS if it cannot write to the usual one."""
+    if not can_log():
+        os.environ[LOGS_VARIABLE] = str(Path(tempfile.gettempdir()) / f"msg_agents_log_{os.getuid()}")
+
+
+def tolerate_warnings() -> None:
+    """Let rclpy be imported where PYTHONWARNINGS makes errors of warnings: a package that it uses is deprecated."""
+    warnings.filterwarnings("ignore", "module 'sre_", DeprecationWarning)
+
+
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
-    """Our environment with what the nodes need; another discovery range or profile of the user's is kept."""
+    """Our environment with what the nodes need; another discovery range or profile of the user's is kept.
+
+    A discovery server is not used: with one, the nodes of a run on this machine would not find each other without it.
+    """
     environment = {
         **SINGLE_THREAD,
         **os.environ,
@@ -47,6 +82,7 @@ def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str,
     if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
         environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SYSTEM_DEFAULT"  # the profile decides
         environment.update(dict.fromkeys(PROFILE_VARIABLES, str(profile)))
+        environment.pop(SERVER_VARIABLE, None)
     return environment
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msg_agents.processes.core_pinning import place
-from msg_agents.processes.environment import RESTARTS, node_environment
+from msg_agents.processes.environment import LOGS_VARIABLE, RESTARTS, can_log, node_environment
 from msg_agents.processes.fork_server import ForkServer
 from msg_agents.processes.process_plan import Share, count_processes, plan_network
 from msg_agents.processes.ros_domain import free_domain
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 POLL = 0.05  # s
 REPORT_FILE = "report.html"
+ROS_LOGS = "ros"  # of nodes that have no other place for the log files of ROS
 
 
 @dataclass(slots=True)
@@ -167,6 +168,8 @@ def run_network(
     try:
         with workshop() as folder, free_domain() if domain is None else nullcontext(domain) as chosen:
             variables = node_environment(chosen) | dict(environment or {})
+            if not can_log():
+                variables[LOGS_VARIABLE] = str(folder / ROS_LOGS)
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 record = record or new_record(experiment)
                 run_file = folder / "run.json"
@@ -280,7 +283,7 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
 
 def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
     try:
-        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS, STEPS))
+        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS, STEPS, ROS_LOGS))
     except OSError as error:
         # The argument of shutil.Error is a list of (from, to, reason).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
+from msg_agents.processes.environment import ensure_logs
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
@@ -118,7 +119,8 @@ def _ros_value(option: click.Parameter, value: Any) -> Any:
 
 @contextlib.contextmanager
 def ros_arguments() -> Iterator[None]:
-    """Turn an error of rcl about arguments for ROS 2 into an InputError with its reason."""
+    """Around the start of rclpy: log files have a place, and wrong arguments for ROS 2 are an InputError."""
+    ensure_logs()
     from msg_agents.nodes.ros.rclpy_error import RCLError
 
     try:

@@ -1,0 +1,74 @@
+"""Surroundings in which a run has the same result as anywhere else."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
+
+RUN = {"processes": 2, "duration": 5}
+READ_ONLY = 'mount --bind "$1" "$1" && mount -o remount,ro,bind / && export TMPDIR="$1" && shift && exec "$@"'
+
+
+def undisturbed(network: Any, run: subprocess.Popen[str]) -> None:
+    stdout, stderr = run.communicate(timeout=90)
+    assert (run.returncode, stderr or "") == (0, "")
+    result = json.loads(stdout)
+    assert (result["verdict"], result["failures"], result["restarts"]) == ("agrees", [], [])
+    assert Path(result["report"]).stat().st_size > 100_000
+    outcome = check(read_bag(result["bag"]))
+    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert sorted(path.name for path in (Path(result["bag"]) / "log").iterdir()) == [
+        *("agents_1_to_2.log", "agents_3_to_5.log", "recorder.log", "run.json", "switcher.log")
+    ]
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [
+        {"HOME": None, "PYTHONWARNINGS": "error"},
+        {"HOME": "/dev/null/home", "ROS_LOG_DIR": "/dev/null/logs", "ROS_DISCOVERY_SERVER": "127.0.0.1:11811"},
+    ],
+    ids=["no home", "nothing can be written"],
+)
+def test_variables(network: Any, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str | None]) -> None:
+    for name, value in variables.items():
+        if value is None:
+            monkeypatch.delenv(name)
+        else:
+            monkeypatch.setenv(name, value)
+    run = network.start("run", network.file(run=RUN), "--out", network.directory / "runs", "--json")
+    undisturbed(network, run)
+
+
+def test_a_full_stderr(network: Any) -> None:
+    """Nothing that cannot be said there changes the result or the exit code."""
+    program = Path(sys.executable).with_name("msg-agents")
+    command = [program, "run", network.file(run=RUN), "--out", network.directory / "runs", "--json"]
+    with Path("/dev/full").open("w") as full:
+        run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=full, text=True)
+        undisturbed(network, run)
+        slow = {"pace": "realtime", "duration": 3, "processes": 1}
+        command[2] = network.file("slow.yaml", run=slow)
+        run = subprocess.run([*command, "--no-analyse"], stdout=subprocess.PIPE, stderr=full, text=True)
+    assert run.returncode == 0
+    assert json.loads(run.stdout)["failures"] == []
+
+
+def test_a_read_only_root(network: Any) -> None:
+    """Only the working directory can be written, as in a hardened container."""
+    works = ["unshare", "--mount", "sh", "-c", READ_ONLY, "sh", str(network.directory), "true"]
+    if not shutil.which("unshare") or subprocess.run(works, capture_output=True).returncode:
+        pytest.skip("this machine: cannot make a root that is read-only (needs root and unshare)")
+    program = Path(sys.executable).with_name("msg-agents")
+    command = [program, "run", network.file(run=RUN), "--out", network.directory / "runs", "--json"]
+    run = subprocess.Popen([*works[:-1], *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    undisturbed(network, run)
