@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.yaml_document import read_yaml
 
@@ -19,6 +20,12 @@ def load_with_overrides(path: Path, run: Mapping[str, Any]) -> ValidExperiment:
     if str(changes.get("processes", "")).isdigit():
         changes["processes"] = int(changes["processes"])
     document = read_yaml(path)
-    if isinstance(document, dict) and isinstance(section := document.get("run", {}), dict):
-        document["run"] = section | changes
-    return ValidExperiment.parse(document, source=str(path), directory=path.parent)
+    if not changes or not isinstance(document, dict) or not isinstance(section := document.get("run", {}), dict):
+        return ValidExperiment.parse(document, source=str(path), directory=path.parent)
+    changed = document | {"run": section | changes}
+    try:
+        return ValidExperiment.parse(changed, source=str(path), directory=path.parent)
+    except InputError:
+        ValidExperiment.parse(document, source=str(path), directory=path.parent)  # the fault may be the file's
+        given = ", ".join(f"--{key}" for key in changes)
+        return ValidExperiment.parse(changed, source=given, directory=path.parent)

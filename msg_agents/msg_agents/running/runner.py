@@ -28,7 +28,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.writer import RECORDING_MARKER
 from msg_analysis.common.cores import available_cores
-from msg_analysis.errors import BagError
+from msg_analysis.errors import BagError, InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
@@ -81,15 +81,23 @@ class RunResult:
 
 
 def make_bag_directory(experiment: ValidExperiment, out: Path) -> Path:
-    """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name."""
+    """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name.
+
+    InputError: it cannot be made.
+    """
     stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
     candidate, number = out / stem, 2
-    while True:
-        try:
-            candidate.mkdir()
-            return candidate
-        except FileExistsError:
-            candidate, number = out / f"{stem}_{number}", number + 1
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        while True:
+            try:
+                candidate.mkdir()
+                return candidate
+            except FileExistsError:
+                candidate, number = out / f"{stem}_{number}", number + 1
+    except OSError as error:
+        place = "is a file" if out.is_file() else f"cannot be written ({error.strerror})"
+        raise InputError(f"--out: {out}: {place}: give a directory for the bags of runs") from error
 
 
 def run_network(
@@ -160,8 +168,6 @@ def run_network(
     view = view or View(on_progress, on_note)
     experiment.require_available()
     count_processes(experiment, None if share is None else len(share.agents))
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
     bag = directory if share is None or share.home else None
     result = RunResult(bag)

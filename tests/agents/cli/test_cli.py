@@ -94,9 +94,10 @@ def run_file(tmp_path: Path) -> Path:
         ({"noise": {"loss": 0.1}}, ["--pace", "realtime"], ["noise.loss: 0.1", "real time"]),
         ({"noise": {"delay": 1}}, ["--pace", "realtime"], ["noise.delay: 1"]),
         ({}, ["--pace", "realtime", "--speed", "0"], ["run.speed: 0", "> 0"]),
-        ({}, ["--pace", "fast"], ["run.pace", "fast"]),
-        ({}, ["--processes", "many"], ["run.processes", "many"]),
+        ({}, ["--pace", "fast"], ["error: --pace: run.pace", "fast"]),
+        ({}, ["--processes", "many", "--seed", "1"], ["error: --seed, --processes: run.processes", "many"]),
         ({}, ["--processes", "0"], ["run.processes"]),
+        ({"run": {"dt": -1}}, ["--seed", "1"], ["bad.yaml: run.dt"]),
         ({}, ["--seed", "-1"], ["run.seed", "-1"]),
         ({}, ["--duration", "-5"], ["run.duration"]),
         ({}, ["--duration", "nan"], ["run.duration"]),
@@ -118,6 +119,13 @@ def test_experiments_that_cannot_be_run(
     file.write_text(yaml.safe_dump(content))
     refused(call("run", file, "--out", tmp_path / "runs", *options), *words)
     assert not (tmp_path / "runs").exists()  # nothing half-done
+
+
+@pytest.mark.parametrize(("out", "reason"), [("small.yaml", "is a file"), ("small.yaml/x", "Not a directory")])
+def test_a_place_where_no_bag_can_be_made(experiment: Path, out: str, reason: str) -> None:
+    place = experiment.parent / out
+    refused(call("run", experiment, "--out", place), f"error: --out: {place}: ", reason, "give a directory")
+    assert list(experiment.parent.iterdir()) == [experiment]
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
