@@ -7,7 +7,6 @@ All names can be imported from ``msg_analysis`` itself. Agents and graphs count 
 from __future__ import annotations
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import Any, Self
 
@@ -158,29 +157,30 @@ class Experiment(model.ValidExperiment):
 
     def select_leaders(
         self,
-        count: int,
+        count: int | None = None,
         *,
         method: SearchMethod = "auto",
         law: SelectionLaw | None = None,
-        gain: float = math.inf,
+        gain: float | None = None,
         top: int = 10,
         watch: SearchProgress = ignore,
     ) -> Selection:
-        """The sets of leaders with the least system error; the experiment's own leaders are ignored.
+        """The sets of leaders with the least system error, and that of the experiment's own leaders.
 
         At infinite gain these are the sets of largest joint robustness centrality.
 
         Parameters
         ----------
         count
-            number of leaders
+            number of leaders; None: as many as the experiment has
         method
             "exhaustive" (every set), "greedy" or "swap" (good sets), or "auto": exhaustive up to 1000 sets, else swap
         law
             "continuous" (the paper's), "emulated" (the steps of the run) or "discrete"; by default the paper's where
             there is one, else that of the steps
         gain
-            pull of the leaders [1 / unit of simulated time]; inf holds them at the reference
+            pull of the leaders [1 / unit of simulated time]; inf holds them at the reference; None: that of the
+            experiment's leaders, inf in consensus
         top
             most sets in the result
         watch
@@ -189,14 +189,14 @@ class Experiment(model.ValidExperiment):
         Returns
         -------
         Selection
-            ``sets``: (system error, agents from 0), best first
+            ``sets``: (system error, agents from 0), best first; ``present``: that of the experiment's own leaders
 
         Raises
         ------
         NotAvailableError
             the experiment asks for something that cannot be predicted
         InputError
-            an impossible count, gain or law, too many sets, or no set from which all agents can be reached
+            an impossible count, gain or law; no count in consensus; too many sets; no set that reaches all agents
         """
         self.require_available("predict")
         return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch)

@@ -106,7 +106,7 @@ def simulate(
     )
 )
 @experiment_argument
-@click.option("--count", type=int, metavar="K", required=True, help="Number of leaders.")
+@click.option("--count", type=int, metavar="K", show_default="as many as EXPERIMENT has", help="Number of leaders.")
 @click.option(
     "--method",
     type=click.Choice(["auto", "exhaustive", "greedy", "swap"]),
@@ -123,15 +123,24 @@ def simulate(
     "--gain",
     type=float,
     metavar="KAPPA",
-    default=float("inf"),
+    show_default="that of EXPERIMENT's leaders, else inf",
     help="Gain of the leaders; inf: states held fixed.",
 )
 @click.option("--top", type=int, metavar="N", default=10, help="Number of sets to list.")
 @json_option
-def leaders(experiment: Path, count: int, method: str, law: str | None, gain: float, top: int, as_json: bool) -> None:
+def leaders(
+    experiment: Path,
+    *,
+    count: int | None,
+    method: str,
+    law: str | None,
+    gain: float | None,
+    top: int,
+    as_json: bool,
+) -> None:
     """Find the best leaders for the network of EXPERIMENT, by joint robustness centrality.
 
-    Leaders named in EXPERIMENT are ignored.
+    The leaders that EXPERIMENT names are shown beside them.
     """
     from msg_analysis.api import Experiment
     from msg_analysis.cli.progress import SolveProgress

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from msg_analysis.api import Experiment
 from msg_analysis.cli import main as cli
 from msg_analysis.cli import progress
 from msg_analysis.paper import examples
@@ -60,6 +61,24 @@ def test_laws_and_gains() -> None:
     assert leaders(EXPERIMENTS / "discrete.yaml", "--count", "1")["law"] == "discrete"
 
 
+def test_leaders_of_the_file() -> None:
+    """Their number and gain unless others are given, and what they achieve beside the best."""
+    tracking = EXPERIMENTS / "tracking.yaml"
+    document = leaders(tracking)
+    assert (document["count"], document["gain"]) == (2, 0.7)
+    predicted = Experiment.load(tracking).predict().continuous
+    assert document["present"]["agents"] == [1, 4]
+    assert document["present"]["system_error"] == pytest.approx(predicted.system_error, rel=1e-9)
+    assert document["sets"][0]["system_error"] < document["present"]["system_error"]
+    other = leaders(tracking, "--count", "1", "--gain", "inf")
+    assert (other["count"], other["gain"], other["present"]["agents"]) == (1, "inf", [1, 4])
+    assert "leaders now: 1, 4" in call("leaders", tracking).stdout
+    assert leaders(LINE_RING, "--count", "1")["present"] is None
+    missing = call("leaders", LINE_RING)
+    assert missing.exit_code == 2
+    assert "has no leaders: give their number" in missing.stderr
+
+
 def test_text() -> None:
     result = call("leaders", LINE_RING, "--count", "2")
     assert (result.exit_code, result.stderr) == (0, "")
@@ -91,7 +110,7 @@ def test_no_guarantee_says_why(tmp_path: Path) -> None:
         (["--count", "2", "--gain", "nan"], "gain nan: expected a number > 0"),
         (["--count", "2", "--top", "0"], "top 0: expected a number >= 1"),
         (["--count", "2", "--method", "best"], "--method"),
-        ([], "--count"),
+        ([], "count: "),
     ],
 )
 def test_bad_usage(options: list[str], message: str) -> None:

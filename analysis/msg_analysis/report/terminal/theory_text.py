@@ -63,6 +63,8 @@ def print_leaders(document: dict[str, Any], console: Console) -> None:
         facts.add_row("guarantee", f"every set has at least {number_text(bound)}{above}")
     else:
         facts.add_row("guarantee", f"none: {document['note']}")
+    if present := document["present"]:
+        facts.add_row(f"leaders now: {listed(present['agents'])}", number_text(present["system_error"]))
     console.print(facts)
 
 

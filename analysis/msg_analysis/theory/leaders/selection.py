@@ -128,6 +128,8 @@ class Selection:
         number of system errors that were solved for
     bound
         no set of this size has a smaller system error; None where no bound is known
+    present
+        (E, agents) of the experiment's own leaders, with the same gain; None if it has none
     """
 
     problem: LeaderProblem
@@ -136,6 +138,7 @@ class Selection:
     order: tuple[int, ...]
     evaluations: int
     bound: float | None
+    present: tuple[float, tuple[int, ...]] | None = None
 
     def __repr__(self) -> str:
         error, agents = self.sets[0]
@@ -167,6 +170,8 @@ class Selection:
             "order": [agent + 1 for agent in self.order],
             "evaluations": self.evaluations,
             "bound": {"system_error": self.bound, "gap": gap},
+            "present": self.present
+            and {"agents": [agent + 1 for agent in self.present[1]], "system_error": self.present[0]},
             "supermodular": self.problem.supermodular,
             "note": self.problem.doubt,
         }
@@ -230,11 +235,11 @@ def joint_robustness_centrality(
 
 def select_leaders(
     experiment: ValidExperiment,
-    count: int,
+    count: int | None = None,
     *,
     method: SearchMethod = "auto",
     law: SelectionLaw | None = None,
-    gain: float = math.inf,
+    gain: float | None = None,
     top: int = 10,
     watch: SearchProgress = ignore,
 ) -> Selection:
@@ -243,15 +248,17 @@ def select_leaders(
     Parameters
     ----------
     experiment
-        consensus or tracking; its own leaders are ignored
+        consensus or tracking
     count
-        number of leaders
+        number of leaders; None: as many as the experiment has
     method
         "exhaustive" evaluates every set; "greedy" adds the best agent beside those chosen before; "swap" exchanges
         single leaders, from three starts, until that does not help; "auto" is exhaustive up to ``AUTO_SETS`` sets, else
         swap
-    law, gain
+    law
         see ``system_error``
+    gain
+        kappa [1 / unit of time]; None: that of the experiment's leaders, inf in consensus
     top
         most sets in the result
     watch
@@ -260,9 +267,14 @@ def select_leaders(
     Raises
     ------
     InputError
-        impossible count, gain or law; no set of this size reaches all agents; too many sets
+        no count in consensus; impossible count, gain or law; no set of this size reaches all agents; too many sets
     """
     _check(method in get_args(SearchMethod), f"method {method}: expected one of {', '.join(get_args(SearchMethod))}")
+    own = experiment.spec.leaders
+    leading = tuple(int(agent) for agent in np.flatnonzero(experiment.leader_gains))
+    gain = gain if gain is not None else own.gain if own else math.inf
+    _check(count is not None or bool(own), f"count: {experiment.source} has no leaders: give their number")
+    count = len(leading) if count is None else count
     _check(gain > 0.0, f"gain {gain}: expected a number > 0, or inf for leaders held at the reference")
     most = experiment.agents - (1 if math.isinf(gain) else 0)
     _check(
@@ -292,7 +304,8 @@ def select_leaders(
     if chosen_method == "exhaustive" or count == 1:  # a single leader: all of them were evaluated
         bound = found[0][0]
     result = [(error, tuple(sorted(agents))) for error, agents in found]
-    return Selection(problem, chosen_method, result, tuple(order), search.evaluations, bound)
+    present = (problem.system_error(frozenset(leading)), leading) if leading else None
+    return Selection(problem, chosen_method, result, tuple(order), search.evaluations, bound, present)
 
 
 def _check(condition: bool, complaint: str) -> None:
