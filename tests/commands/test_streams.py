@@ -91,14 +91,23 @@ def test_no_command_is_forgotten() -> None:
 
 @pytest.mark.timeout(400)
 def test_results_go_to_stdout(folder: Path) -> None:
-    """In 80 columns; on a terminal without colours, if NO_COLOR says so; nothing on stderr."""
+    """On a terminal in 80 columns, and without colours if NO_COLOR says so; nothing on stderr."""
     jobs = [(command, kind) for command in QUICK for kind in ("plain", "terminal")]
     for command, kind, code, stdout, stderr in outcomes(folder, *jobs):
         assert (code, stderr) == (0, ""), (command, kind)
         assert stdout.endswith("\n"), command
         assert not COLOUR.search(stdout), command
-        if command not in JSON_ANYWAY:
+        if command not in JSON_ANYWAY and kind == "terminal":
             assert max(map(len, re.sub(r"\x1b\[[0-9;]*m", "", stdout).splitlines())) <= 80, command
+
+
+def test_sentences_are_not_wrapped_for_programs(folder: Path) -> None:
+    ((_, _, _, piped, _),) = outcomes(folder, (("msg-analysis", "compare"), "plain"))
+    ((_, _, _, shown, _),) = outcomes(folder, (("msg-analysis", "compare"), "terminal"))
+    (counts,) = (line for line in piped.splitlines() if " out of order" in line)
+    assert re.fullmatch(r"1005 of 1005 states .*: 0 missing, 0 duplicates, 0 out of order", counts)
+    assert counts not in shown
+    assert counts in " ".join(re.sub(r"\x1b\[[0-9;]*m", "", shown).split())
 
 
 @pytest.mark.timeout(400)

@@ -142,6 +142,12 @@ def result_console() -> Console:
     from rich.console import Console
 
     class ResultConsole(Console):
+        def print(self, *objects: Any, **options: Any) -> None:
+            # Sentences are wrapped for readers at a terminal, not for programs.
+            if not self.is_terminal and all(isinstance(each, str) for each in objects):
+                options.setdefault("soft_wrap", True)
+            super().print(*objects, **options)
+
         def on_broken_pipe(self) -> None:
             # Rich exits with 1, which means "disagrees" here.
             raise BrokenPipeError
