@@ -226,7 +226,10 @@ while not node.count_publishers("agent_1/state"):
     rclpy.spin_once(node, timeout_sec=0.2)
 while len(seen) < 5 * 301 and node.count_publishers("agent_1/state"):
     rclpy.spin_once(node, timeout_sec=0.2)
-for _ in range(20):
+quiet = 0  # what has arrived stays when its writer leaves, and each spin takes one message
+while len(seen) < 5 * 301 and quiet < 20:
+    before = len(seen)
     rclpy.spin_once(node, timeout_sec=0.05)
+    quiet = 0 if len(seen) > before else quiet + 1
 print(json.dumps(sorted(seen)))
 """
