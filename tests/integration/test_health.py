@@ -37,16 +37,20 @@ def statuses(file: Path) -> list[dict[str, Any]]:
     return [status for line in lines if line.endswith("\n") for status in json.loads(line)]
 
 
+def heard_of(file: Path) -> set[str]:
+    return {status["name"] for status in statuses(file)}
+
+
 def test_a_stopped_agent_is_named(network: Any) -> None:
     """On /diagnostics, in the log of its neighbour, and to the user; then all goes on as if nothing had been."""
     heard = network.directory / "heard"
     with free_domain() as domain, heard.open("w") as output:
-        file = network.file(run={"duration": 300, "processes": "one_per_agent"})
+        file = network.file(run={"duration": 600, "processes": "one_per_agent"})
         run = network.record(file, "--domain", str(domain), "--json")
         monitor = subprocess.Popen([sys.executable, "-P", "-c", MONITOR], env=node_environment(domain), stdout=output)
         try:
             network.wait_until_moving()
-            network.wait_for(lambda: len(statuses(heard)) > 7, 30, "diagnostics")
+            network.wait_for(lambda: len(heard_of(heard)) == 7, 30, "diagnostics of every node")
             (victim,) = (process for process in network.processes("agent") if process.agent == 2)
             victim.kill(signal.SIGSTOP)
 
@@ -71,7 +75,7 @@ def test_a_stopped_agent_is_named(network: Any) -> None:
     assert note.endswith("; no report from agent_2\n")
 
     known = statuses(heard)
-    assert {status["name"] for status in known} == {
+    assert heard_of(heard) == {
         *(f"agent_{i}: network" for i in range(1, 6)),
         "switcher: network",
         "recorder: network",
