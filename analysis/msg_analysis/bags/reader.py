@@ -190,7 +190,10 @@ def _choose(contents: _Contents) -> RunRecord:
     errors = [each for each in found if isinstance(each, InputError)]
     records: dict[bytes, RunRecord] = {}
     for each in found:
-        if isinstance(each, RunRecord) and each.to_json() != records.setdefault(each.run.bytes, each).to_json():
+        if not isinstance(each, RunRecord):
+            continue
+        first = records.setdefault(each.run.bytes, each)
+        if first is not each and first.to_json() != each.to_json():
             raise BagError(
                 f"{path}: two records of run {each.run} contradict each other, and one of them is forged: another "
                 "program published on the topic `experiment`; record the run again"

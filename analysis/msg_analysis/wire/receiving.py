@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import fields
+from functools import cached_property
 from typing import TypeVar
 
 from msg_analysis.model.arithmetic.payload import all_finite
@@ -36,10 +37,14 @@ class RunRules:
 
     def __init__(self, record: RunRecord) -> None:
         self._record = record
-        self._experiment = encode_string(record.to_json())
         self._graphs = [(graph.name, tuple(graph.arcs)) for graph in record.experiment.graph_list]
         self._clock = StepClock(record.experiment.step_length)
         self._path = PathWindow(record.experiment, first_graph(record.experiment))
+
+    @cached_property
+    def _experiment(self) -> bytes:
+        """The message on the topic ``experiment``: only the recorder compares it, so others do not make it."""
+        return encode_string(self._record.to_json())
 
     def experiment(self, data: bytes) -> str | None:
         """The ``Refusal`` of a message on the topic ``experiment``; None: it is the record of this run."""

@@ -57,15 +57,14 @@ def _sampled(
 
 
 class PathWindow:
-    """The sojourns of a graph path by number, from a step on, drawn as far as they are asked for."""
+    """The sojourns of a graph path by number, drawn as far as they are asked for, without those that are forgotten."""
 
     MOST_AHEAD = 10_000  # sojourns beyond the first one that is kept; more are never published ahead
 
-    def __init__(self, experiment: ValidExperiment, initial: FloatArray, step: int = 0) -> None:
+    def __init__(self, experiment: ValidExperiment, initial: FloatArray) -> None:
         self._path = sojourns(experiment, initial)
         self._kept: deque[Sojourn] = deque()
         self.first = 0  # number of the first sojourn that is kept
-        self.forget(step)
 
     def forget(self, step: int) -> None:
         """Keep only the sojourns that end at a step or later."""
