@@ -96,7 +96,7 @@ class ForkServer:
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
-        self._adopted = _adopt_orphans(adopt=True)
+        self._adopted = adopt_orphans(adopt=True)
         if self._adopted is None:
             return self
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -154,13 +154,13 @@ class ForkServer:
     ) -> None:
         self._stop()
         if self._adopted is False:
-            _adopt_orphans(adopt=False)
+            adopt_orphans(adopt=False)
         with contextlib.suppress(OSError):
             if not self._log.stat().st_size:
                 self._log.unlink()
 
 
-def _adopt_orphans(*, adopt: bool) -> bool | None:
+def adopt_orphans(*, adopt: bool) -> bool | None:
     """Whether this process becomes the parent of processes below it whose own parent has ended: set it.
 
     Returns what was set before; None where the system has no such setting.
@@ -188,7 +188,7 @@ def serve(control: socket.socket) -> list[str]:
         message, descriptors, _, _ = socket.recv_fds(control, LONGEST, MOST_DESCRIPTORS)
         if not message:
             os._exit(0)
-        pid = _fork_orphan()
+        pid = fork_orphan()
         if pid is None:
             control.close()
             return _begin(json.loads(message), *descriptors)
@@ -197,7 +197,7 @@ def serve(control: socket.socket) -> list[str]:
         control.send(str(pid).encode())
 
 
-def _fork_orphan() -> int | None:
+def fork_orphan() -> int | None:
     """Fork a process that is a child of our parent: its number, 0 if that failed; in itself, None."""
     ours, theirs = socket.socketpair()
     with warnings.catch_warnings(), ours, theirs:
@@ -221,9 +221,20 @@ def _fork_orphan() -> int | None:
         return None
 
 
+def end_without_libraries() -> None:
+    """Let this forked process end where Python has ended, before what C libraries do at the end.
+
+    A tracer's (LTTng) stops its threads there, which a forked process does not have, and crashes now and then.
+    """
+    with contextlib.suppress(AttributeError):  # only in the C library of GNU
+        library = ctypes.CDLL(None)
+        library.on_exit(library._exit, None)
+
+
 def _begin(request: dict[str, Any], output: int, *others: int) -> list[str]:
     """Make a forked process one of its own; the arguments of its command."""
     os.setsid()
+    end_without_libraries()
     for stream in (sys.stdout, sys.stderr):
         os.dup2(output, stream.fileno())
     os.close(output)

@@ -142,3 +142,22 @@ def test_it_ends_when_its_user_is_killed(tmp_path: Path) -> None:
         assert server.exists()
         parent.kill()
     wait_for(lambda: gone(int(server.name)))
+
+
+ENDS = """
+import atexit, ctypes, os, sys
+from msg_agents.processes.fork_server import end_without_libraries
+at_exit = ctypes.CFUNCTYPE(None)(lambda: os._exit(99))  # of a library: it would crash in a forked process
+ctypes.CDLL(None).atexit(at_exit)
+pid = os.fork()
+if not pid:
+    end_without_libraries()
+    atexit.register(print, "Python has ended")
+    sys.exit(3)
+print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
+"""
+
+
+def test_the_ends_of_libraries_are_left_out() -> None:
+    process = subprocess.run([sys.executable, "-P", "-c", ENDS], capture_output=True, text=True)
+    assert (process.returncode, process.stdout.split("\n")) == (99, ["Python has ended", "3", ""])
