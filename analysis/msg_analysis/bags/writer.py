@@ -14,10 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
 
-from mcap.writer import CompressionType, Writer
-
+from msg_analysis.bags.format.mcap_writer import McapWriter
 from msg_analysis.bags.format.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
-from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Compression, Storage
+from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.errors import BagError
 from msg_analysis.wire.topics import Topic
 
@@ -27,11 +26,6 @@ CHUNK_SIZE = 768 * 1024
 RECORDING_MARKER = ".recording"
 RECORD_NAME = "msg_agents"  # of the MCAP metadata record with the run record
 ROSBAG2_RECORD = "rosbag2"
-COMPRESSION_TYPES: dict[Compression, CompressionType] = {
-    "none": CompressionType.NONE,
-    "zstd": CompressionType.ZSTD,
-    "lz4": CompressionType.LZ4,
-}
 
 
 class _Channel:
@@ -55,7 +49,7 @@ class BagWriter:
     ) -> None:
         self.directory = Path(directory).absolute()
         self._topics, self._record = tuple(topics), record
-        self._compression, self._split_size = COMPRESSION_TYPES[storage.compression], storage.split_size
+        self._compression, self._split_size = storage.compression, storage.split_size
         self._files: list[FileCount] = []
         self._channels: dict[str, _Channel] = {}
         self._custom: dict[str, str] = {}
@@ -89,8 +83,7 @@ class BagWriter:
     def _begin_file(self) -> None:
         """Write all that is needed to read this file without the others."""
         chunk_size = min(CHUNK_SIZE, self._split_size or CHUNK_SIZE)
-        self._mcap = Writer(self._stream, chunk_size=chunk_size, compression=self._compression)
-        self._mcap.start(profile="ros2", library="mcap")
+        self._mcap = McapWriter(self._stream, chunk_size=chunk_size, compression=self._compression)
         self._add_information()
         if self._record is not None:
             self._mcap.add_metadata(RECORD_NAME, {"record": self._record})
@@ -136,7 +129,7 @@ class BagWriter:
                 self._split()
                 channel = self._channels[topic]
             count = channel.count
-            self._mcap.add_message(channel.id, time_ns, data, time_ns, channel.before + count.messages)
+            self._mcap.add_message(channel.id, time_ns, data, channel.before + count.messages)
         except OSError as error:
             raise self._failed(error) from error
         count.messages += 1

@@ -1,0 +1,200 @@
+"""Writes MCAP files with their messages in chunks: the same bytes as ``mcap.writer.Writer``, in a fifth of its time.
+
+The records other than messages and their indexes are encoded by ``mcap``.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import BinaryIO
+
+import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+from msg_analysis.bags.format.storage_options import Compression
+
+MAGIC = b"\x89MCAP0\r\n"
+MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time; then the data
+MESSAGE_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries; then the entries
+CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the records
+FOOTER = struct.Struct("<BQQQ")  # what of it the checksum of the summary covers
+COMPRESSION_NAMES: dict[Compression, str] = {"none": "", "zstd": "zstd", "lz4": "lz4"}
+
+
+class McapWriter:
+    """An MCAP file being written to a stream; OSError, from every method: the stream takes no more."""
+
+    def __init__(self, stream: BinaryIO, *, chunk_size: int, compression: Compression) -> None:
+        self._stream, self._chunk_size, self._compression = stream, chunk_size, compression
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
+        self._chunk_indexes: list[ChunkIndex] = []
+        self._metadata_indexes: list[MetadataIndex] = []
+        self._counts: dict[int, int] = {}  # messages by channel, of the chunks that are finished
+        self._chunk: list[bytes] = []  # records of the chunk in progress, in parts
+        self._size = 0  # of the chunk in progress
+        self._index: dict[int, list[int]] = defaultdict(list)  # by channel: time and place of every message in turn
+        stream.write(MAGIC + _encoded(Header(profile="ros2", library="mcap")))
+
+    def add_metadata(self, name: str, data: dict[str, str]) -> None:
+        """Append a metadata record, outside the chunks."""
+        record = _encoded(Metadata(name=name, metadata=data))
+        self._metadata_indexes.append(MetadataIndex(offset=self._stream.tell(), length=len(record), name=name))
+        self._stream.write(record)
+
+    def register_schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Register a schema; its number."""
+        self._schemas.append(Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name))
+        return self._register(self._schemas)
+
+    def register_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
+        """Register a channel; its number."""
+        self._channels.append(
+            Channel(
+                id=len(self._channels) + 1, topic=topic, message_encoding=encoding, schema_id=schema, metadata=metadata
+            )
+        )
+        return self._register(self._channels)
+
+    def _register(self, records: Sequence[McapRecord]) -> int:
+        record = _encoded(records[-1])
+        self._chunk.append(record)
+        self._size += len(record)
+        self._finish_full_chunk()
+        return len(records)
+
+    def add_message(self, channel: int, time_ns: int, data: bytes, sequence: int) -> None:
+        """Append a message, logged and published at that time."""
+        length = len(data)
+        self._chunk += (MESSAGE.pack(Opcode.MESSAGE, length + 22, channel, sequence, time_ns, time_ns), data)
+        self._index[channel] += (time_ns, self._size)
+        self._size += length + MESSAGE.size
+        if self._size > self._chunk_size:
+            self._finish_chunk()
+
+    def _finish_full_chunk(self) -> None:
+        if self._size > self._chunk_size:
+            self._finish_chunk()
+
+    def _finish_chunk(self) -> None:
+        """Write the chunk in progress; one without messages stays in progress."""
+        if not self._index:
+            return
+        records = b"".join(self._chunk)
+        entries = {channel: np.array(index, dtype="<u8") for channel, index in self._index.items()}
+        self._chunk.clear()
+        self._index.clear()
+        self._size = 0
+        compressed = _compressed(records, self._compression)
+        name = COMPRESSION_NAMES[self._compression].encode()
+        start = int(min(index[::2].min() for index in entries.values()))
+        end = int(max(index[::2].max() for index in entries.values()))
+        tail = struct.pack(f"<I{len(name)}sQ", len(name), name, len(compressed))
+        length = CHUNK.size - 9 + len(tail) + len(compressed)
+        head = CHUNK.pack(Opcode.CHUNK, length, start, end, len(records), zlib.crc32(records)) + tail
+        place = self._stream.tell()
+        after = place + len(head) + len(compressed)
+        indexes, offsets = bytearray(), {}
+        for channel, index in entries.items():
+            self._counts[channel] = self._counts.get(channel, 0) + len(index) // 2
+            offsets[channel] = after + len(indexes)
+            indexes += MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, index.nbytes + 6, channel, index.nbytes)
+            indexes += index.tobytes()
+        for part in (head, compressed, indexes):
+            self._stream.write(part)
+        self._chunk_indexes.append(
+            ChunkIndex(
+                message_start_time=start,
+                message_end_time=end,
+                chunk_start_offset=place,
+                chunk_length=after - place,
+                message_index_offsets=offsets,
+                message_index_length=len(indexes),
+                compression=name.decode(),
+                compressed_size=len(compressed),
+                uncompressed_size=len(records),
+            )
+        )
+
+    def flush(self) -> None:
+        """Finish the chunk in progress and hand everything to the operating system."""
+        self._finish_chunk()
+        self._stream.flush()
+
+    def finish(self) -> None:
+        """Write the summary; the stream stays open."""
+        self._finish_chunk()
+        self._stream.write(_encoded(DataEnd(0)))
+        start = self._stream.tell()
+        summary, offsets = b"", []
+        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
+            (Opcode.SCHEMA, self._schemas),
+            (Opcode.CHANNEL, self._channels),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, self._chunk_indexes),
+            (Opcode.ATTACHMENT_INDEX, []),
+            (Opcode.METADATA_INDEX, self._metadata_indexes),
+        ]
+        for opcode, records in groups:
+            group = b"".join(map(_encoded, records))
+            offsets.append(
+                SummaryOffset(group_opcode=opcode, group_start=start + len(summary), group_length=len(group))
+            )
+            summary += group
+        offset_start = start + len(summary)
+        summary += b"".join(map(_encoded, offsets))
+        checksum = zlib.crc32(FOOTER.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary))
+        footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=checksum)
+        self._stream.write(summary + _encoded(footer) + MAGIC)
+
+    def _statistics(self) -> Statistics:
+        chunks = self._chunk_indexes
+        return Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(chunks),
+            message_count=sum(self._counts.values()),
+            metadata_count=len(self._metadata_indexes),
+            message_start_time=min((chunk.message_start_time for chunk in chunks), default=0),
+            message_end_time=max((chunk.message_end_time for chunk in chunks), default=0),
+            schema_count=len(self._schemas),
+        )
+
+
+def _encoded(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    data: bytes = builder.end()
+    return data
+
+
+def _compressed(data: bytes, compression: Compression) -> bytes:
+    if compression == "zstd":
+        import zstandard
+
+        compressed: bytes = zstandard.compress(data)
+        return compressed
+    if compression == "lz4":
+        import lz4.frame
+
+        framed: bytes = lz4.frame.compress(data)
+        return framed
+    return data
