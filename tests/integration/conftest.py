@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import forked_commands
 import pytest
 import yaml
 
@@ -230,6 +231,11 @@ class Network:
     def wait_until_moving(self, out: str = "runs") -> None:
         """The run is in the middle: what is there of the bag is more than its head."""
         self.wait_for(lambda: self.recorded_bytes(out) > 50_000, 60, "recorded states")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _forked() -> None:
+    forked_commands.install()
 
 
 @pytest.fixture

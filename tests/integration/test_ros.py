@@ -130,10 +130,13 @@ node = rclpy.create_node("asking")
 client = AsyncParameterClient(node, "/lab/recorder")
 assert client.wait_for_services(timeout_sec=60)
 names = ["out", "compression"]
-futures = [client.describe_parameters(names), client.get_parameters(names)]
-for future in futures:
-    rclpy.spin_until_future_complete(node, future, timeout_sec=60)
-descriptors, values = futures[0].result().descriptors, futures[1].result().values
+def ask(request):  # again if there is no answer: a server does not wait until the reader of its answers is discovered
+    for _ in range(10):
+        future = request(names)
+        rclpy.spin_until_future_complete(node, future, timeout_sec=5)
+        if future.done():
+            return future.result()
+descriptors, values = ask(client.describe_parameters).descriptors, ask(client.get_parameters).values
 print(json.dumps({
     d.name: {"type": d.type, "read_only": d.read_only, "value": v.string_value} for d, v in zip(descriptors, values)
 }))

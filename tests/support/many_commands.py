@@ -7,6 +7,7 @@ stderr of each.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import pty
@@ -90,4 +91,6 @@ def run(program: str, arguments: list[str], kind: str) -> list[Any]:
 
 if __name__ == "__main__":
     matplotlib.use("Agg")
+    gc.collect()
+    gc.freeze()  # the collector writes to what it looks at, and the memory would be copied
     print(json.dumps([run(*job) for job in json.load(sys.stdin)]))

@@ -1,0 +1,245 @@
+"""Our own commands are forked from a process that has imported everything, instead of being executed.
+
+After ``install``, ``subprocess`` forks ``msg-agents``, ``msg-analysis`` and the fork server of a network, if nothing is
+asked for but streams, a directory, a session, and variables that are read after the imports. It executes all else as
+ever. A forked process is a child of the process that asked, has the title of its command, and its mark can be read in
+its environment, as after exec.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import gc
+import importlib
+import io
+import json
+import os
+import random
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from msg_agents.processes.fork_server import adopt_orphans, end_without_libraries, fork_orphan
+
+MARK = "MSG_AGENTS_TEST"
+LENGTH_OF_MARK = 32
+NODE_SERVER = "msg_agents.cli.node_server"
+PROGRAMS = {
+    "msg-agents": ("msg_agents.cli.entry_points", "msg_agents"),
+    "msg-analysis": ("msg_analysis.cli.main", "main"),
+}
+PREPARED = (
+    "msg_agents.cli.replay",
+    "msg_agents.nodes.replay.player",
+    "msg_agents.nodes.watching.live",
+    "msg_agents.running.runner",
+    "msg_analysis.api",
+    "msg_analysis.twin.check",
+    "scipy.stats",
+)
+READ_LATER = re.compile("(ROS_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_).*|NO_COLOR|COLUMNS|LINES|OPENBLAS_NUM_THREADS")
+"""Names of variables that are read after the imports, or are the same for all that is forked."""
+WITH_NETWORK = (["run"], ["host"])
+"""Commands that start a network; their first words."""
+LONGEST = 1 << 17  # bytes of a request
+MOST_DESCRIPTORS = 16
+LONGEST_TITLE = 2000
+FREE = 200  # descriptors from here on are not used
+
+_fork_exec: Callable[..., int] | None = getattr(
+    subprocess, "_fork_exec", None
+)  # where Popen ends; not of the public API
+
+
+def install() -> None:
+    """Fork from now on, where the system can do it."""
+    if _fork_exec is not None and sys.platform == "linux":
+        adopt_orphans(adopt=True)
+        subprocess._fork_exec = _Forker().fork_exec  # type: ignore[attr-defined]
+
+
+def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Sequence[Any]) -> dict[str, Any] | None:
+    """What the arguments of ``_fork_exec`` ask for; None if it is not known how to fork that."""
+    command = [os.fsdecode(word) for word in words]
+    of_ours = Path(command[0]).parent == Path(sys.executable).parent and Path(command[0]).name in PROGRAMS
+    close, kept, directory, environment = arguments[2:6]
+    new_group, *identity = arguments[16:21]
+    unusual = not close or new_group != -1 or identity != [None, None, None, -1] or arguments[21] is not None
+    if unusual or not (of_ours or command[1:3] == ["-m", NODE_SERVER]):
+        return None
+    lines = [f"{name}={value}" for name, value in os.environ.items()] if environment is None else environment
+    return {
+        "command": command,
+        "directory": os.fsdecode(directory or Path.cwd()),
+        "environment": dict(os.fsdecode(line).split("=", 1) for line in lines),
+        "session": arguments[15],
+        "kept": [number for number in kept if number != arguments[13]],
+    }
+
+
+def descriptors_of(request: dict[str, Any], arguments: Sequence[Any]) -> list[int]:
+    """Standard input, output and error, and what else is kept."""
+    streams = (arguments[6], arguments[9], arguments[11])
+    return [own if asked == -1 else asked for own, asked in enumerate(streams)] + request["kept"]
+
+
+class _Forker:
+    """Takes the place of ``_fork_exec`` in a process of the tests: its server starts when it is needed."""
+
+    def __init__(self) -> None:
+        self._control: socket.socket | None = None
+        self._environment: dict[str, str] = {}
+
+    def fork_exec(self, *arguments: Any) -> int:
+        request = request_of(arguments[0], arguments)
+        if request is None:
+            return _fork_exec(*arguments)  # type: ignore[misc]
+        if self._control is None:
+            self._control = self._start()
+        if _fixed(request["environment"]) != self._environment:
+            return _fork_exec(*arguments)  # type: ignore[misc]
+        socket.send_fds(self._control, [json.dumps(request).encode()], descriptors_of(request, arguments))
+        return int(self._control.recv(LONGEST)) or _fork_exec(*arguments)  # type: ignore[misc]
+
+    def _start(self) -> socket.socket:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._environment = _fixed(os.environ)
+        same = {"OPENBLAS_NUM_THREADS": "1", MARK: "0" * LENGTH_OF_MARK, "SPT_NOENV": "1"}  # titles leave it readable
+        with theirs:
+            subprocess.Popen(
+                [sys.executable, __file__, str(theirs.fileno()), " " * LONGEST_TITLE],
+                env=os.environ | same,
+                pass_fds=[theirs.fileno()],
+            )
+        return ours
+
+
+def _fixed(environment: Any) -> dict[str, str]:
+    return {name: value for name, value in environment.items() if not READ_LATER.fullmatch(name)}
+
+
+def serve(control: socket.socket) -> Callable[[], None]:
+    """Fork a process for each request; in it, what it is to do comes back."""
+    while True:
+        message, descriptors, _, _ = socket.recv_fds(control, LONGEST, MOST_DESCRIPTORS)
+        if not message:
+            os._exit(0)
+        pid = fork_orphan()
+        if pid is None:
+            control.close()
+            request = json.loads(message)
+            with_network = Path(request["command"][0]).name == "msg-agents" and request["command"][1:2] in (
+                ["run"],
+                ["host"],
+            )
+            if with_network and (waiting := _leave_one_waiting(descriptors)):
+                return waiting
+            return become(request, descriptors)
+        for descriptor in descriptors:
+            os.close(descriptor)
+        control.send(str(pid).encode())
+
+
+def _leave_one_waiting(descriptors: list[int]) -> Callable[[], None] | None:
+    """Fork a child of this process, from which the fork server of its network is made; in it, what it is to do."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    pid = os.fork()
+    if pid == 0:
+        ours.close()
+        for descriptor in descriptors:
+            os.close(descriptor)
+        with theirs:
+            message, descriptors, _, _ = socket.recv_fds(theirs, LONGEST, MOST_DESCRIPTORS)
+        if not message:
+            os._exit(0)
+        return become(json.loads(message), descriptors)
+    theirs.close()
+
+    def fork_exec(*arguments: Any) -> int:
+        request = request_of(arguments[0], arguments)
+        if request is None or ours.fileno() == -1:
+            return _fork_exec(*arguments)  # type: ignore[misc]
+        with ours:
+            socket.send_fds(ours, [json.dumps(request).encode()], descriptors_of(request, arguments))
+        return pid
+
+    subprocess._fork_exec = fork_exec  # type: ignore[attr-defined]
+    return None
+
+
+def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None]:
+    """Make this process what is asked for; what it is to do then."""
+    import numpy as np
+    from setproctitle import setproctitle
+
+    end_without_libraries()
+    command: list[str] = request["command"]
+    if request["session"]:
+        os.setsid()
+    os.chdir(request["directory"])
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    _write_mark(request["environment"].get(MARK, ""))
+    free = [fcntl.fcntl(descriptor, fcntl.F_DUPFD, FREE) for descriptor in descriptors]
+    for descriptor in descriptors:
+        os.close(descriptor)
+    for source, target in zip(free, [0, 1, 2, *request["kept"]], strict=True):
+        os.dup2(source, target)
+        os.close(source)
+    _open_streams()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    random.seed()
+    np.random.seed()
+    of_python = [] if command[0] == sys.executable else [sys.executable]
+    setproctitle(" ".join([*of_python, *command]).rstrip())
+    if command[1:2] == ["-m"]:
+        sys.argv = command[2:]
+        return importlib.import_module(NODE_SERVER).main  # type: ignore[no-any-return]
+    sys.argv = command
+    module, name = PROGRAMS[Path(command[0]).name]
+    return lambda: sys.exit(getattr(importlib.import_module(module), name)())
+
+
+def _open_streams() -> None:
+    """As Python does it at its start."""
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        raw = io.FileIO(number, mode, closefd=False)
+        buffered = io.BufferedReader(raw) if mode == "r" else io.BufferedWriter(raw)
+        before = getattr(sys, name)
+        at_lines = name == "stderr" or raw.isatty()
+        stream = io.TextIOWrapper(buffered, before.encoding, before.errors, line_buffering=at_lines)
+        setattr(sys, name, stream)
+        setattr(sys, f"__{name}__", stream)
+
+
+def _write_mark(mark: str) -> None:
+    """Into the environment that others see, which is that of the first process."""
+    if len(mark) != LENGTH_OF_MARK:
+        return
+    start = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[47])
+    place = Path("/proc/self/environ").read_bytes().index(f"{MARK}=".encode()) + len(MARK) + 1
+    ctypes.memmove(start + place, mark.encode(), LENGTH_OF_MARK)
+
+
+def main() -> None:
+    """The server."""
+    from setproctitle import setproctitle
+
+    setproctitle("commands of tests")  # it finds its place only before the environment is changed
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in PREPARED:
+        importlib.import_module(name)
+    importlib.import_module(NODE_SERVER)._import_all()
+    gc.collect()
+    gc.freeze()
+    serve(socket.socket(fileno=int(sys.argv[1])))()
+
+
+if __name__ == "__main__":
+    main()
