@@ -5,16 +5,12 @@ See docs/theory.md, "Transients".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-import scipy.sparse.linalg
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.network.markov_chain import Time
-from msg_analysis.theory.solvers.moment_operators import homogeneous_propagator, mean_propagator
 from msg_analysis.theory.solvers.propagator import Flow, Power
-from msg_analysis.theory.solvers.rational_krylov import RationalFlow, slowest_rate
+from msg_analysis.theory.solvers.rational_krylov import slowest_rate
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.theory.transient import (
@@ -156,48 +152,3 @@ def _stepped(system: JumpSystem, judge: _Judge, away: Snapshot) -> float:
             return float(last + 1)
         away = advance(system, away)
     raise InputError(f"settling time: more than {MAX_STEPS} steps: raise run.dt, or use fewer agents")
-
-
-@dataclass(frozen=True, slots=True)
-class Rates:
-    """How fast the effect of the start dies out in the end: like exp(-rate t), or exp(-rate k) in steps."""
-
-    mean: float  # of the means: least real part of the eigenvalues of N, or -log of the spectral radius of H
-    second_moment: float | None  # the same of M, or A; None where it was not found
-    graph: float | None  # of the law of the graph; None for one graph
-
-
-def asymptotic_rates(system: JumpSystem, steady: FloatArray) -> Rates:
-    """Rates of a reduced system, per unit of time or per step; infinite for what is gone in finitely many steps.
-
-    From the eigenvalues of the matrices of Propositions 1 and 6 of the paper; for large systems, those of the second
-    moments are found by Arnoldi iterations (discrete time) or in a rational Krylov space (continuous time).
-    ``steady``: (n, d, d) of ``MomentSolver(system).steady()``.
-    """
-    means = mean_propagator(system)
-    second: float | None = None
-    if unknowns(system) <= MAX_UNKNOWNS:
-        second = homogeneous_propagator(system).slowest
-    elif system.time == "discrete":
-        second = _by_arnoldi(system)
-    elif steady.any():
-        stack = joint_stack(Snapshot(np.zeros(system.modes), np.zeros(0), steady))
-        second = RationalFlow(system, stack, slowest_rate(system, steady), decays=True).slowest
-    return Rates(means.slowest, second, means.slowest_jump if system.modes > 1 else None)
-
-
-def _by_arnoldi(system: JumpSystem) -> float | None:
-    def step(packed: FloatArray) -> FloatArray:
-        moments = packed_symmetric.unpack(packed.reshape(system.modes, -1), system.dimension)
-        after = np.tensordot(system.chain, system.propagate(moments), axes=(0, 0))
-        return packed_symmetric.pack(after).ravel()
-
-    size = unknowns(system) - system.modes
-    operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=step, dtype=float)
-    start = packed_symmetric.pack(np.broadcast_to(np.eye(system.dimension), system.matrices.shape)).ravel()
-    try:
-        values = scipy.sparse.linalg.eigs(operator, k=1, v0=start, tol=1e-9, maxiter=1000, return_eigenvectors=False)
-    except scipy.sparse.linalg.ArpackNoConvergence:
-        return None
-    radius = float(np.abs(values).max())
-    return float(-np.log(radius)) if radius > 0.0 else np.inf

@@ -9,8 +9,9 @@ from switching_systems import LINE_RING, network, steady_of
 
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory import settling, transient
+from msg_analysis.theory.decay_rates import asymptotic_rates
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.settling import asymptotic_rates, settling_time
+from msg_analysis.theory.settling import settling_time
 from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.transient import point_start, start_of
 
@@ -46,7 +47,7 @@ def test_settling_of_one_pair_in_closed_form():
     system = systems.continuous(ValidExperiment.parse(document))
     steady = steady_of(system)
     assert settling_time(system, steady, point_start(system, np.zeros(2))) == pytest.approx(np.log(20) / 4, rel=1e-9)
-    rates = asymptotic_rates(system, steady_of(system))
+    rates = asymptotic_rates(system)
     assert (rates.mean, rates.second_moment) == (pytest.approx(2.0), pytest.approx(4.0))
     assert rates.graph is None
 
@@ -82,9 +83,9 @@ def test_asymptotic_rates_are_those_of_the_full_matrices(tracking, time, monkeyp
         second = np.kron(system.chain.T, np.eye(d * d)) @ blocks(*(np.kron(w, w) for w in system.matrices))
         expected = [-np.log(np.abs(np.linalg.eigvals(matrix)).max()) for matrix in (first, second)]
         graph = -np.log(sorted(np.abs(np.linalg.eigvals(system.chain)))[-2])
-    rates = asymptotic_rates(system, steady_of(system))
+    rates = asymptotic_rates(system)
     assert rates.mean == pytest.approx(expected[0], rel=1e-9)
     assert rates.second_moment == pytest.approx(expected[1], rel=1e-9)
     assert rates.graph == pytest.approx(graph, rel=1e-9)
     monkeypatch.setattr(settling, "MAX_UNKNOWNS", 1)
-    assert asymptotic_rates(system, steady_of(system)).second_moment == pytest.approx(expected[1], rel=1e-6)
+    assert asymptotic_rates(system).second_moment == pytest.approx(expected[1], rel=1e-6)

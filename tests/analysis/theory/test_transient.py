@@ -13,8 +13,9 @@ from switching_systems import LINE_RING, network, steady_of
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory import transient
+from msg_analysis.theory.decay_rates import asymptotic_rates
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.settling import asymptotic_rates, settling_time
+from msg_analysis.theory.settling import settling_time
 from msg_analysis.theory.solvers import rational_krylov
 from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.transient import point_start, start_of, unreduced_consensus
@@ -228,7 +229,7 @@ def test_sixty_agents_in_continuous_time():
     found = transient.transient(system, point_start(system, np.zeros(m)), times, steady_of(system))
     expected = [np.sum(-np.expm1(-2 * values * t) / (2 * values)) for t in times]
     np.testing.assert_allclose(found.system_error, expected, rtol=1e-9)
-    rates = asymptotic_rates(system, steady_of(system))
+    rates = asymptotic_rates(system)
     assert rates.second_moment == pytest.approx(2 * values[0], rel=1e-6)
     both = systems.continuous(experiment)
     settled = settling_time(both, steady_of(both), point_start(both, np.zeros(m)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,10 +12,11 @@ import numpy as np
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.theory.decay_rates import asymptotic_rates
 from msg_analysis.theory.facts import check_facts
 from msg_analysis.theory.graph_indices import error_bounds, graph_indices
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.settling import asymptotic_rates, settling_time
+from msg_analysis.theory.settling import settling_time
 from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.theory.transient import TransientLaw, point_start, solve_transient, start_of
@@ -67,7 +69,7 @@ def _settling(
         "from_start": start_of(experiment, system, steady),
         "from_zero": point_start(system, np.zeros(experiment.agents)),
     }
-    rates = asymptotic_rates(system, steady)
+    rates = asymptotic_rates(system)
     return {
         "steady_system_error": error,
         "settling": {
@@ -78,11 +80,7 @@ def _settling(
                 for key, start in starts.items()
             },
         },
-        "rates": {
-            "mean": rates.mean / unit,
-            "second_moment": None if rates.second_moment is None else rates.second_moment / unit,
-            "graph": None if rates.graph is None else rates.graph / unit,
-        },
+        "rates": {key: None if rate is None else rate / unit for key, rate in dataclasses.asdict(rates).items()},
     }
 
 

@@ -39,6 +39,7 @@ class JumpSystem:
     lift: FloatArray  # (k, d) for k numbers s, columns orthonormal, so that y = lift^T (s - what s should be)
     loss_variance: FloatArray | None = None  # (n, k, k), see ``StepModel.loss_variance``; discrete time only
     readout: FloatArray | None = None  # (m, d) with a delay; None without, where ``lift`` has this role
+    unreduced: FloatArray | None = None  # (n, k, k) in consensus: the same for the numbers s, whose zeros are exact
 
     @property
     def modes(self) -> int:
@@ -121,6 +122,7 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
         lift=lift,
         loss_variance=loss_variance if step.loss else None,
         readout=readout,
+        unreduced=weights if consensus else None,
     )
 
 
@@ -132,7 +134,8 @@ def continuous(experiment: ValidExperiment) -> JumpSystem:
     gains = experiment.leader_gains
     follows = np.isfinite(gains)
     m = experiment.agents
-    lift = scipy.linalg.helmert(m).T if experiment.problem == "consensus" else np.eye(m)[:, follows]
+    consensus = experiment.problem == "consensus"
+    lift = scipy.linalg.helmert(m).T if consensus else np.eye(m)[:, follows]
     drift = np.stack([g.laplacian for g in experiment.graph_list]) + np.diag(np.where(follows, gains, 0.0))
     gain = experiment.noise_gain
     return JumpSystem(
@@ -142,6 +145,7 @@ def continuous(experiment: ValidExperiment) -> JumpSystem:
         chain=experiment.chain.matrix,
         stationary=experiment.chain.stationary,
         lift=lift,
+        unreduced=drift if consensus else None,
     )
 
 
@@ -156,6 +160,7 @@ def held(system: JumpSystem, mode: int) -> JumpSystem:
         lift=system.lift,
         loss_variance=None if system.loss_variance is None else system.loss_variance[mode : mode + 1],
         readout=system.readout,
+        unreduced=None if system.unreduced is None else system.unreduced[mode : mode + 1],
     )
 
 
