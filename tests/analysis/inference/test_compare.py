@@ -294,3 +294,25 @@ def test_a_number_too_large_to_compute_with_disagrees(name, value):
     assert comparison.verdict == "disagrees"
     assert "innovations: covariance" in {test.name for test in comparison.tests if test.rejected}
     json.dumps(comparison.to_json(), allow_nan=False)
+
+
+def test_noise_that_is_common_to_all():
+    """What rounding leaves of the disagreement is none: it has no z, and no order. All of 40 runs agree."""
+    document = {
+        "name": "common",
+        "problem": "consensus",
+        "time": "continuous",
+        "graphs": {"line": {"path": [1, 2, 3]}, "star": {"edges": [[1, 2], [1, 3]]}},
+        "switching": {"generator": [[-1, 1], [1, -1]]},
+        "noise": {"process": [[1, 0, 0]] * 3},
+        "run": {"dt": 0.05, "duration": 100, "replicas": 2},
+    }
+    verdicts = []
+    for seed in range(40):
+        document["run"]["seed"] = seed
+        result = compare(simulate(ValidExperiment.parse(document)))
+        assert result.system_error.measured == result.system_error.predicted == 0.0
+        assert result.system_error.z is None
+        assert [node.measured for node in result.node_errors] == [0.0] * 3
+        verdicts.append(result.verdict)
+    assert verdicts.count("agrees") >= 38  # level 0.01: fewer in 1 of 150 cases

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.inference.errors.estimates import Estimate, estimate
-from msg_analysis.inference.errors.time_means import MAX_JOINT, TimeMeans, forms_of
+from msg_analysis.inference.errors.time_means import MAX_JOINT, TimeMeans, forms_of, without_rounding
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.step_model import StepModel
@@ -79,6 +79,7 @@ def given_path(observation: Observation, means: TimeMeans) -> GivenPath | None:
     if len(matrices) * packed_symmetric.size(system.dimension) ** 2 > MAX_NUMBERS:
         return None
     y = system.reduced((observation.start - observation.step.reference).T)
+    y = without_rounding(y, system, observation.largest)
     start = packed_symmetric.pack(y.T @ y / len(y))
     total, covariance = _follow(which, matrices, noise, start, forms)
     return GivenPath(

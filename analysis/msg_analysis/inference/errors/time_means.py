@@ -23,6 +23,7 @@ from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.theory.system.lost_messages import lost_adjoint
 from msg_analysis.types import FloatArray
 
+ROUNDING = 64 * float(np.finfo(float).eps)  # of the largest state: what thousands of steps may leave in differences
 MAX_JOINT = 210  # second moments that are all estimated (d = 20), at most; beyond that, only the node errors
 
 
@@ -269,10 +270,22 @@ def forms_of(
 
 def moments(observation: Observation, first: int, last: int, states: FloatArray) -> FloatArray:
     """(last - first, p): packed y y^T of the states first..last-1 of (N + 1, m, R), averaged over the replicas."""
-    return packed_moments(states[first:last] - observation.step.reference, observation.prediction.system)
+    deviations = states[first:last] - observation.step.reference
+    return packed_moments(deviations, observation.prediction.system, observation.largest)
 
 
-def packed_moments(deviations: FloatArray, system: JumpSystem) -> FloatArray:
-    """(b, p): packed y y^T of deviations (b, m, R) from what the states should be, averaged over the replicas."""
-    y = np.einsum("kmr,md->krd", deviations, system.lift, optimize=True)
+def packed_moments(deviations: FloatArray, system: JumpSystem, largest: float) -> FloatArray:
+    """(b, p): packed y y^T of deviations (b, m, R) from what the states should be, averaged over the replicas.
+
+    ``largest`` is the size of the largest state of the run.
+    """
+    y = without_rounding(np.einsum("kmr,md->krd", deviations, system.lift, optimize=True), system, largest)
     return packed_symmetric.pack(y.transpose(0, 2, 1) @ y / deviations.shape[2])
+
+
+def without_rounding(y: FloatArray, system: JumpSystem, largest: float) -> FloatArray:
+    """Reduced coordinates y of any shape, without what rounding leaves of them where the system has no noise.
+
+    Where agents have the same noise, for example: they move together, and their disagreement is rounding.
+    """
+    return y if system.noise.any() else np.where(np.abs(y) <= ROUNDING * largest, 0.0, y)

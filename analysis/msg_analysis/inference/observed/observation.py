@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -27,7 +28,7 @@ class Timers:
     made: IntArray  # (N + 1, m) [ns of simulated time] see ``Trajectory.made``
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots, for cached_property
 class Observation:
     """The complete beginning of a run, and its prediction."""
 
@@ -75,6 +76,11 @@ class Observation:
     def steps(self) -> int:
         """N."""
         return len(self.modes)
+
+    @cached_property
+    def largest(self) -> float:
+        """Size of the largest state."""
+        return float(max(self.states.max(), -self.states.min()))
 
     @property
     def replicas(self) -> int:

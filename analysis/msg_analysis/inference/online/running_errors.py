@@ -173,6 +173,7 @@ class _Judge:
         self.nodes = nodes and 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
         forms, _, trace = forms_of(system, "nodes" if self.nodes else "system")
         self._system, self._replicas = system, replicas
+        self._largest = 0.0  # size of the largest deviation so far
         self._values = values_of(prediction, forms)
         self._each = np.eye(len(forms)) if self.nodes else np.empty((0, len(forms)))
         self._trace = trace
@@ -209,7 +210,8 @@ class _Judge:
 
     def _packed(self, deviations: FloatArray) -> FloatArray:
         """(b, p + 1): (s, 1) of every step."""
-        packed = packed_moments(deviations, self._system)
+        self._largest = max(self._largest, float(np.abs(deviations).max(initial=0.0)))
+        packed = packed_moments(deviations, self._system, self._largest)
         return np.concatenate([packed, np.ones((len(packed), 1))], axis=1)
 
     def _sum_squares(self, mode: int, rows: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
