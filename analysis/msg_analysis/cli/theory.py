@@ -74,6 +74,9 @@ def transient(
         print_transient(document, result_console())
 
 
+MOST_TIMES = 100_000
+
+
 def _parse_times(text: str) -> FloatArray:
     """Times (T,) from ``START:STOP:STEP`` (STOP included if met) or ``t1,t2,...``; InputError for anything else."""
     import numpy as np
@@ -90,7 +93,10 @@ def _parse_times(text: str) -> FloatArray:
     if len(parts) != 3 or text.count(":") != 2 or parts[2] <= 0.0 or parts[1] < parts[0]:
         raise InputError(f"--times {text}: {wanted}")
     start, stop, step = parts
-    count = int((stop - start) / step * (1.0 + 1e-12) + 1e-9) + 1
+    most = (stop - start) / step * (1.0 + 1e-12) + 1e-9
+    if not most < MOST_TIMES:
+        raise InputError(f"--times {text}: expected at most {MOST_TIMES} times: give a larger STEP")
+    count = int(most) + 1
     return np.asarray(start + step * np.arange(count), dtype=float)
 
 

@@ -247,13 +247,17 @@ def _make(directory: Path | None) -> Path | None:
     return directory
 
 
+LONGEST_RECORD = 512 << 20  # bytes; those of large networks in discrete time hold the matrices of their steps
+
+
 def load_record(path: Path) -> RunRecord:
     """Read a run record from ``msg-agents prepare``; InputError if it cannot be read or is not one."""
+    from msg_analysis.common.bounded_input import read_text
     from msg_analysis.errors import InputError
     from msg_analysis.model.run.record import RunRecord
 
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, LONGEST_RECORD)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}): expected a run record from msg-agents prepare") from error
     return RunRecord.from_json(text, str(path))

@@ -248,7 +248,7 @@ def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path: Path) -> None:
         ("name: a\nname: b\n", "line 2, column 1: key 'name' appears twice"),
         ("run:\n  seed: 1\n  dt: 1\n  seed: 2\n", "line 4, column 3: key 'seed' appears twice"),
         ("name: [1\n", "line 2"),
-        ("a: &x [*x]\n", "name: missing"),
+        ("a: &x [*x]\n", "alias 'x' stands inside what it names"),
         ("? [1, 2]\n: 3\n", "line 1"),
         ("a: !!python/object:os.system {}\n", "line 1"),
         ("", "experiment: null: expected keys with values"),

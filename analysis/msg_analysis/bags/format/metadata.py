@@ -10,14 +10,14 @@ from typing import Any
 
 import yaml
 
+from msg_analysis.common.bounded_input import load_yaml, read_text
 from msg_analysis.errors import BagError
 
 METADATA_FILE = "metadata.yaml"
 _ROOT = "rosbag2_bagfile_information"
 # Those in C, where PyYAML has them: metadata of 1000 agents has 30,000 lines.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_DEEPEST = 50  # levels of nesting
+LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _NEVER = 2**63 - 1  # what rosbag2 writes as the start of a bag without messages
 
 
@@ -117,24 +117,14 @@ def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
     temporary.replace(directory / METADATA_FILE)
 
 
-def _load(text: str) -> Any:
-    """The document; deep nesting, which crashes PyYAML's C loader, is refused first."""
-    depth = 0
-    for event in yaml.parse(text, _LOADER):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > _DEEPEST:
-            raise yaml.YAMLError(f"nested more than {_DEEPEST} deep")
-    return yaml.load(text, _LOADER)
-
-
 def read_metadata(directory: Path) -> dict[str, Any] | None:
     """Bag information of a directory; None without metadata.yaml, BagError where it is not that of a bag."""
     file = directory / METADATA_FILE
     try:
-        document = _load(file.read_text(encoding="utf-8"))
+        document = load_yaml(read_text(file), LOADER)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:  # ValueError: not UTF-8, or !!int x
+    except (OSError, ValueError, yaml.YAMLError) as error:  # ValueError: not UTF-8, or !!int x
         raise BagError(f"{file}: cannot be read ({error}): move it away to read the .mcap files alone") from error
     information = document.get(_ROOT) if isinstance(document, dict) else None
     if not isinstance(information, dict):

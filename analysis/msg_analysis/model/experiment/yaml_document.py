@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from msg_analysis.common.bounded_input import load_yaml, read_text
 from msg_analysis.errors import InputError
 
 
@@ -54,10 +55,11 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
 def read_yaml(path: Path) -> Any:
     """The content of a YAML (or JSON) file in UTF-8.
 
-    InputError, with file and (if known) line: the file cannot be read, is not YAML in UTF-8, or has a key twice.
+    InputError, with file and (if known) line: the file cannot be read, is not YAML in UTF-8, is too large or too deep,
+    or has a key twice.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file: check the path") from error
     except IsADirectoryError as error:
@@ -67,12 +69,10 @@ def read_yaml(path: Path) -> Any:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: byte {error.start}: not UTF-8 text: expected an experiment file (YAML)") from error
     try:
-        return yaml.load(text, _StrictLoader)
+        return load_yaml(text, _StrictLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
         raise InputError(f"{path}: {line}{', '.join(filter(None, (error.context, error.problem)))}") from error
     except (yaml.YAMLError, ValueError) as error:
         raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
-    except RecursionError as error:
-        raise InputError(f"{path}: nested too deeply: expected an experiment file (YAML)") from error

@@ -15,6 +15,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from msg_analysis.common.bounded_input import read_text
 from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.common.markdown import markdown_table
 from msg_analysis.common.number_words import half_width_text, measured_text, number_text, p_text, z_text
@@ -53,10 +54,10 @@ def read_result(path: Path) -> Result:
     file = path / RESULT_FILE if path.is_dir() else path
     wanted = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
     try:
-        document = json.loads(file.read_text(encoding="utf-8"))
+        document = json.loads(read_text(file))
     except OSError as error:
         raise InputError(f"{file}: {error.strerror}: {wanted}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{file}: not JSON ({error}): {wanted}") from error
     if not isinstance(document, dict):
         raise InputError(f"{file}: not a JSON object: {wanted}")

@@ -1,0 +1,81 @@
+"""Text and YAML of strangers: bounded before they are read, and before anybody walks through them."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+LONGEST_FILE = 64 << 20  # bytes
+PART = 1 << 20  # bytes
+DEEPEST = 50  # collections in collections; PyYAML's loader in C crashes at some thousands
+MOST_REPEATED = 1_000_000  # values that aliases repeat, each counted as often as it is repeated
+
+_EVENTS: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def read_text(path: Path, longest: int = LONGEST_FILE) -> str:
+    """The text of a file in UTF-8; OSError (EFBIG) where it has more bytes than that, endless ones included."""
+    data = bytearray()
+    with path.open("rb") as stream:
+        while part := stream.read(PART):
+            data += part
+            if len(data) > longest:
+                raise OSError(errno.EFBIG, f"longer than {longest >> 20} MB")
+    return data.decode("utf-8")
+
+
+def load_yaml(text: str, loader: Any) -> Any:
+    """The document; YAMLError where it is nested too deeply, or where aliases make it too large."""
+    _Walk().check(text)
+    return yaml.load(text, loader)
+
+
+class _Walk:
+    """Sizes of what has an anchor, from the events of a document; nothing is built."""
+
+    def __init__(self) -> None:
+        self._anchors: dict[str, int | None] = {}  # values; None: not finished yet
+        self._open: list[tuple[str | None, int]] = []  # anchor and values so far of the collections around
+        self._repeated = 0
+
+    def check(self, text: str) -> None:
+        for event in yaml.parse(text, _EVENTS):
+            if isinstance(event, yaml.CollectionStartEvent):
+                self._begin(event)
+            elif isinstance(event, yaml.CollectionEndEvent):
+                anchor, size = self._open.pop()
+                self._add(anchor, size + 1)
+            elif isinstance(event, yaml.ScalarEvent):
+                self._add(event.anchor, 1)
+            elif isinstance(event, yaml.AliasEvent):
+                self._repeat(event)
+
+    def _begin(self, event: yaml.CollectionStartEvent) -> None:
+        if len(self._open) >= DEEPEST:
+            raise _error(f"nested too deeply, more than {DEEPEST} levels", event)
+        if event.anchor:
+            self._anchors[event.anchor] = None
+        self._open.append((event.anchor, 0))
+
+    def _add(self, anchor: str | None, size: int) -> None:
+        if anchor:
+            self._anchors[anchor] = size
+        if self._open:
+            around, before = self._open[-1]
+            self._open[-1] = (around, before + size)
+
+    def _repeat(self, event: yaml.AliasEvent) -> None:
+        size = self._anchors.get(event.anchor or "", 0)  # one that is not there is for the loader to name
+        if size is None:
+            raise _error(f"alias '{event.anchor}' stands inside what it names", event)
+        self._repeated += size
+        if self._repeated > MOST_REPEATED:
+            raise _error(f"aliases repeat more than {MOST_REPEATED} values: write down what is needed", event)
+        self._add(None, size)
+
+
+def _error(problem: str, event: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
