@@ -21,6 +21,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "errors",
         "types",
         "common",
+        "common/text",
         "model/network",
         "model/arithmetic",
         "protocol",

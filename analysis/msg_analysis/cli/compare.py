@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from msg_analysis.cli.console import examples, print_json, result_console
+from msg_analysis.cli.console import examples, print_json, print_text, result_console
 from msg_analysis.cli.options import BAG, FILE, RESULT, json_option, level_option
 from msg_analysis.common.files import require_place
 
@@ -73,8 +73,8 @@ def tabulate(results: tuple[Path, ...], form: str, level: float, as_json: bool) 
     if as_json or form == "json":
         print_json(saved.to_json(rows, level))
     elif form == "csv":
-        click.echo(saved.to_csv(rows), nl=False)
+        print_text(saved.to_csv(rows).removesuffix("\n"))
     elif form == "markdown":
-        click.echo(saved.to_markdown(rows), nl=False)
+        print_text(saved.to_markdown(rows).removesuffix("\n"))
     else:
         saved.print_results(rows, level, result_console())

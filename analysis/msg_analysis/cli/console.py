@@ -16,7 +16,8 @@ import click
 from click.exceptions import Exit
 
 from msg_analysis.common.exit_codes import INTERRUPTED, ExitCode, killed_by
-from msg_analysis.common.json_numbers import json_text
+from msg_analysis.common.text.json_numbers import json_text
+from msg_analysis.common.text.safe_text import visible
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
@@ -53,6 +54,9 @@ class CommandGroup(click.Group):
 def _exit_codes() -> Iterator[None]:
     try:
         yield
+    except click.ClickException as error:
+        vars(error)["message"] = visible(error.message)
+        raise
     except InputError as error:
         complain(str(error))
         raise Exit(ExitCode.BAD_INPUT) from error
@@ -129,7 +133,7 @@ def _drop_stdout() -> None:
 def complain(text: str, label: str = "error:") -> None:
     """Print one error on stderr, behind a label that is red on a terminal."""
     color = False if os.environ.get("NO_COLOR") else None
-    click.echo(f"{click.style(label, fg='red', bold=True)} {text}", err=True, color=color)
+    click.echo(f"{click.style(label, fg='red', bold=True)} {visible(text)}", err=True, color=color)
 
 
 def examples(*lines: str) -> str:
@@ -139,20 +143,14 @@ def examples(*lines: str) -> str:
 
 def result_console() -> Console:
     """The rich console for tables on stdout."""
-    from rich.console import Console
+    from msg_analysis.common.text.safe_console import ResultConsole
 
-    class ResultConsole(Console):
-        def print(self, *objects: Any, **options: Any) -> None:
-            # Sentences are wrapped for readers at a terminal, not for programs.
-            if not self.is_terminal and all(isinstance(each, str) for each in objects):
-                options.setdefault("soft_wrap", True)
-            super().print(*objects, **options)
+    return ResultConsole()
 
-        def on_broken_pipe(self) -> None:
-            # Rich exits with 1, which means "disagrees" here.
-            raise BrokenPipeError
 
-    return ResultConsole(highlight=False, markup=False)
+def print_text(text: str) -> None:
+    """Print lines on stdout, with the names in them made safe for terminals."""
+    click.echo(visible(text))
 
 
 def print_json(document: dict[str, Any], indent: int | None = None) -> None:

@@ -13,7 +13,6 @@ class _Progress:
     """Progress display, a context manager."""
 
     def __init__(self, title: str, *, time_left: bool) -> None:
-        from rich.console import Console
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
@@ -23,7 +22,9 @@ class _Progress:
             TimeRemainingColumn,
         )
 
-        console = Console(stderr=True, highlight=False, markup=False)
+        from msg_analysis.common.text.safe_console import SafeConsole
+
+        console = SafeConsole(stderr=True, highlight=False, markup=False)
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(),

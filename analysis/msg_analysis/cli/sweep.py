@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli.console import complain, examples, print_json, result_console
+from msg_analysis.cli.console import complain, examples, print_json, print_text, result_console
 from msg_analysis.cli.options import PATH, YAML, json_option
 from msg_analysis.common.exit_codes import ExitCode, killed_by
-from msg_analysis.common.json_numbers import finite
-from msg_analysis.common.notes import print_note
+from msg_analysis.common.text.json_numbers import finite
+from msg_analysis.common.text.notes import print_note
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.software import require_libraries
 
@@ -207,7 +207,7 @@ def emulate(
     else:
         for path in files:
             click.echo(path)
-        click.echo(summary(points, len(runs) - len(failed)))
+        print_text(summary(points, len(runs) - len(failed)))
     return ExitCode.DISAGREES if disagreeing(points) else ExitCode.INCOMPLETE if failed else ExitCode.FINE
 
 

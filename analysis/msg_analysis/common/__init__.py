@@ -1,4 +1,4 @@
-"""Small helpers that any folder may use: exit codes, whole files, JSON, notes, tables for notebooks, the version.
+"""Small helpers that any folder may use: exit codes, files, text, the version.
 
 Nothing about networks or runs belongs here. Imports only the modules ``errors`` and ``types`` of the package.
 """

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msg_analysis.common.files import write_whole
-from msg_analysis.common.json_numbers import json_text
+from msg_analysis.common.text.json_numbers import json_text
 from msg_analysis.sweep.conduct import Judgement
 from msg_analysis.sweep.jobs.job import Outcome
 from msg_analysis.sweep.plan import Sweep

@@ -15,9 +15,9 @@ import networkx as nx
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.common.json_numbers import finite
-from msg_analysis.common.markdown import markdown_table
-from msg_analysis.common.number_words import number_text
+from msg_analysis.common.text.json_numbers import finite
+from msg_analysis.common.text.markdown import markdown_table
+from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import InputError
 from msg_analysis.model.step.sequential_law import StepLaw, build_run_model, step_law
 from msg_analysis.model.step.step_model import StepModel, build_step_model

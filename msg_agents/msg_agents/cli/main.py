@@ -17,7 +17,7 @@ import msg_agents
 from msg_agents.cli import nodes, replay
 from msg_agents.cli.web_options import WebCommand, announce, page, web_options
 from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS
-from msg_analysis.cli.console import CommandGroup, complain, examples, print_json, result_console
+from msg_analysis.cli.console import CommandGroup, complain, examples, print_json, print_text, result_console
 from msg_analysis.cli.options import (
     BAG,
     PATH,
@@ -33,7 +33,7 @@ from msg_analysis.cli.options import (
 from msg_analysis.cli.storage_options import storage, storage_options
 from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.files import RESULT_FILE, write_whole
-from msg_analysis.common.json_numbers import json_text
+from msg_analysis.common.text.json_numbers import json_text
 
 if TYPE_CHECKING:
     from msg_agents.running.runner import RunResult
@@ -252,10 +252,10 @@ def check(bag: Path | None, *, as_json: bool) -> None:
         document = {"bag": str(path), "equal": outcome.difference is None, "compared": outcome.compared}
         print_json(document | {"missing": outcome.missing, "difference": outcome.difference})
     elif outcome.difference:
-        click.echo(f"{path}: differs from the twin, first: {outcome.difference}")
+        print_text(f"{path}: differs from the twin, first: {outcome.difference}")
     else:
         missing = f", {outcome.missing} missing" if outcome.missing else ""
-        click.echo(f"{path}: equal to the twin to the last bit: {outcome.compared} states{missing}")
+        print_text(f"{path}: equal to the twin to the last bit: {outcome.compared} states{missing}")
     sys.exit(ExitCode.DISAGREES if outcome.difference else ExitCode.INCOMPLETE if outcome.missing else ExitCode.FINE)
 
 

@@ -16,10 +16,10 @@ from msg_agents.cli.ros_command import RosCommand
 from msg_agents.cli.web_options import WebRosCommand, announce, page, web_options
 from msg_agents.processes.environment import LAST_DOMAIN
 from msg_agents.terminal.interruption import exit_on_signals
-from msg_analysis.cli.console import examples, print_json, result_console
+from msg_analysis.cli.console import examples, print_json, print_text, result_console
 from msg_analysis.cli.options import BAG, PositiveFloat, json_option
 from msg_analysis.common.exit_codes import ExitCode
-from msg_analysis.common.notes import print_note
+from msg_analysis.common.text.notes import print_note
 
 if TYPE_CHECKING:
     from msg_agents.nodes.replay.player import Played
@@ -197,13 +197,13 @@ class PlayBar:
     """Prints notes on stderr and, on a terminal, a bar with the time in the bag and the rate."""
 
     def __init__(self, name: str) -> None:
-        from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn
 
         from msg_agents.nodes.replay.player import Played
+        from msg_analysis.common.text.safe_console import SafeConsole
 
         self.played: Played = Played()
-        self._console = Console(stderr=True)
+        self._console = SafeConsole(stderr=True)
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -288,7 +288,7 @@ def live(
         if served is not None:
             announce(served, web_host, print_note)
         with Display(console, served, panel=panel, transient=False) as display:
-            view = LiveView(display, None if as_json or panel else click.echo)
+            view = LiveView(display, None if as_json or panel else print_text)
             found = watch(
                 reliable=reliable, timeout=timeout, on_report=view.show, on_note=print_note, on_look=display.check
             )

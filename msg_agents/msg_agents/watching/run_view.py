@@ -13,7 +13,7 @@ from msg_agents.watching.run_observer import RunObserver
 from msg_agents.watching.snapshot import SnapshotSource
 from msg_agents.watching.terminal_panel import plain_line
 from msg_agents.watching.view import View
-from msg_analysis.common.notes import print_note
+from msg_analysis.common.text.notes import print_note
 
 if TYPE_CHECKING:
     from msg_agents.watching.web_server import WebServer
@@ -28,10 +28,10 @@ class RunView(View):
     """Shows a run in all these ways; a context."""
 
     def __init__(self, experiment: ValidExperiment, web: WebServer | None = None) -> None:
-        from rich.console import Console
+        from msg_analysis.common.text.safe_console import SafeConsole
 
         self._experiment = experiment
-        self._console = Console(stderr=True)
+        self._console = SafeConsole(stderr=True)
         self.display = Display(self._console, web, panel=self._console.is_terminal, transient=True)
         self._source = SnapshotSource(experiment)
         self._observer: RunObserver | None = None

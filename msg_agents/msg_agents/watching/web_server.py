@@ -18,7 +18,7 @@ from importlib import resources
 from types import TracebackType
 from typing import Any, Self
 
-from msg_analysis.common.json_numbers import finite
+from msg_analysis.common.text.json_numbers import finite
 from msg_analysis.errors import InputError
 
 MOST_BROWSERS = 32

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.common.number_words import percent
+from msg_analysis.common.text.number_words import percent
 from msg_analysis.errors import InputError
 from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
-from msg_analysis.common.number_words import percent
+from msg_analysis.common.text.number_words import percent
 from msg_analysis.inference.blame import suspects
 from msg_analysis.inference.blame.switching_rates import find_rates
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from msg_analysis.common.number_words import percent
+from msg_analysis.common.text.number_words import percent
 from msg_analysis.inference.errors.estimates import Estimate, covariance_test, estimates
 from msg_analysis.inference.errors.time_means import TimeMeans, time_means
 from msg_analysis.inference.observed.observation import Observation

@@ -9,8 +9,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from msg_analysis.common.markdown import markdown_table
-from msg_analysis.common.number_words import number_text
+from msg_analysis.common.text.markdown import markdown_table
+from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import NotAvailableError
 from msg_analysis.model.experiment import memory, protocol_binding, validation
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show

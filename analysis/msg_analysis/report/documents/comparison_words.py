@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from msg_analysis.common.number_words import number_text, percent
+from msg_analysis.common.text.number_words import number_text, percent
 from msg_analysis.theory.prediction import LAW_NAMES
 
 VERDICTS = {

@@ -19,7 +19,7 @@ from bokeh.resources import Resources
 from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
-from msg_analysis.common.number_words import p_text, z_text
+from msg_analysis.common.text.number_words import p_text, z_text
 from msg_analysis.errors import InputError
 from msg_analysis.inference.observed.observation import bounded
 from msg_analysis.inference.realtime.laws import SUPPORT

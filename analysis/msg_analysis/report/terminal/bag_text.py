@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.common.number_words import counted, number_text
+from msg_analysis.common.text.number_words import counted, number_text
 from msg_analysis.model.experiment.memory import amount
 from msg_analysis.report.documents.comparison_words import gaps
 from msg_analysis.report.terminal.experiment_text import add_protocol

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.common.number_words import measured_text, number_text, p_text, z_text
+from msg_analysis.common.text.number_words import measured_text, number_text, p_text, z_text
 from msg_analysis.inference.realtime.laws import SUPPORT
 from msg_analysis.report.documents.comparison_words import (
     QUANTILES,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from msg_analysis.common.number_words import measured_text, number_text, z_text
+from msg_analysis.common.text.number_words import measured_text, number_text, z_text
 from msg_analysis.model.run.record import RunRecord
 
 if TYPE_CHECKING:  # these take long to import, while a network starts

@@ -17,8 +17,8 @@ from rich.text import Text
 
 from msg_analysis.common.bounded_input import read_text
 from msg_analysis.common.files import RESULT_FILE
-from msg_analysis.common.markdown import markdown_table
-from msg_analysis.common.number_words import half_width_text, measured_text, number_text, p_text, z_text
+from msg_analysis.common.text.markdown import markdown_table
+from msg_analysis.common.text.number_words import half_width_text, measured_text, number_text, p_text, z_text
 from msg_analysis.errors import InputError
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.errors.ranking import Ranking, rank_estimates

@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.common.number_words import half_width_text, number_text, p_text
+from msg_analysis.common.text.number_words import half_width_text, number_text, p_text
 from msg_analysis.report.terminal.tables import ROWS, first_rows, number_table
 from msg_analysis.sweep.conduct import Conducted, Judgement
 from msg_analysis.sweep.figure_series import Picture, value_text

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.common.number_words import number_text
+from msg_analysis.common.text.number_words import number_text
 
 Row = TypeVar("Row")
 

@@ -14,8 +14,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 import scipy.sparse.csgraph
 
-from msg_analysis.common.markdown import markdown_table
-from msg_analysis.common.number_words import number_text
+from msg_analysis.common.text.markdown import markdown_table
+from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.spec import LeadersSpec

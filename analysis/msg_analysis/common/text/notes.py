@@ -10,8 +10,9 @@ if TYPE_CHECKING:
 
 def print_note(line: str, console: Console | None = None) -> None:
     """Print one line after a coloured ``note:``; ``console``: that of the live display which is shown meanwhile."""
-    from rich.console import Console
     from rich.text import Text
 
-    console = console or Console(stderr=True)
+    from msg_analysis.common.text.safe_console import SafeConsole
+
+    console = console or SafeConsole(stderr=True)
     console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)

@@ -1,0 +1,17 @@
+"""Foreign text for terminals: names in files of strangers may hold the escape sequences that terminals obey."""
+
+from __future__ import annotations
+
+import unicodedata
+
+_ORDER = {*range(0x202A, 0x202F), *range(0x2066, 0x206A)}  # characters that change the order of those after them
+_SHOWN = {
+    code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
+    for code in [*range(0xA0), *_ORDER]
+    if code in _ORDER or (unicodedata.category(chr(code)) == "Cc" and chr(code) not in "\n\t")
+}
+
+
+def visible(text: str) -> str:
+    """The text with its control characters written as escapes; line ends and tabs stay."""
+    return text.translate(_SHOWN)
