@@ -110,6 +110,19 @@ def test_sentences_are_not_wrapped_for_programs(folder: Path) -> None:
     assert counts in " ".join(re.sub(r"\x1b\[[0-9;]*m", "", shown).split())
 
 
+@pytest.mark.parametrize(
+    "words", [["tabulate", "result.json"], ["info", "bag"], ["sweep", "sweep.yaml", "--workers", "1", "--out", "ascii"]]
+)
+def test_stdout_that_has_few_characters(words: list[str], folder: Path) -> None:
+    """What it does not have is "?"; an error would lose the result."""
+    environment = os.environ | {"PYTHONIOENCODING": "ascii:strict", "COLUMNS": "80"}
+    command = [Path(sys.executable).with_name("msg-analysis"), *words]
+    done = subprocess.run(command, capture_output=True, env=environment, cwd=folder)
+    assert (done.returncode, b"Traceback" in done.stderr) == (0, False), done.stderr
+    assert done.stdout.isascii()
+    assert (b"?" in done.stdout) == (words[0] == "tabulate")
+
+
 @pytest.mark.timeout(400)
 def test_json_is_one_object_and_nothing_else(folder: Path) -> None:
     """Without numbers that JSON does not have."""
