@@ -126,7 +126,6 @@ def brute_force(largest: int) -> Iterator[Row]:
         experiment = random_experiment(agents, agents, graphs, rate=rate)
         prediction, seconds = timed(predict, experiment)
         case = f"{agents} agents, {graphs} graphs, rates ~ {rate:g}"
-        assert prediction.continuous is not None
         paper, paper_seconds = timed(kronecker_continuous, experiment)
         steps, steps_seconds = timed(kronecker_emulated, experiment)
         error = difference(prediction.continuous.covariance, paper)
@@ -146,7 +145,6 @@ def resistances() -> Iterator[Row]:
         links = [[i + 1, j + 1] for i, j in graph.edges]
         experiment = ValidExperiment.parse({"name": "one", "graphs": {"g": {"edges": links}}, "run": {"dt": 0.01}})
         prediction, seconds = timed(predict, experiment)
-        assert prediction.continuous is not None
         kirchhoff = nx.effective_graph_resistance(graph) / (2 * len(graph))
         error = difference(np.array([prediction.continuous.system_error]), np.array([kirchhoff]))
         yield Row(f"one graph, {name}: E", "networkx, resistance", seconds, None, error)
@@ -224,7 +222,6 @@ def printed() -> Iterator[Row]:
             }
         )
         prediction, seconds = timed(predict, experiment)
-        assert prediction.continuous is not None
         error = difference(np.array([1.0 / prediction.continuous.system_error]), np.array([certainty]))
         yield Row(f"example 1, rates {forth:g} and {back:g}: 1/E", "the paper, 5 digits", seconds, None, error)
 

@@ -116,7 +116,7 @@ def error_bounds(prediction: Prediction) -> Bounds:
     if experiment.protocol:
         return Bounds(None, None, _NO_BOUNDS + "they belong to the built-in law, not to a protocol")
     if experiment.time == "continuous":
-        if prediction.continuous is None:
+        if prediction.continuous_moments is None:
             return Bounds(None, None, _NO_BOUNDS + "they belong to the law without noise on the air, loss or delay")
         system = systems.continuous(experiment)
     else:
@@ -125,7 +125,7 @@ def error_bounds(prediction: Prediction) -> Bounds:
         return Bounds(None, None, _NO_BOUNDS + "a graph is directed")
     if not _equal_noise(system):
         return Bounds(None, None, _NO_BOUNDS + "the noise is not the same, and independent, for every agent")
-    upper = prediction.static.system_error if prediction.static else None
+    upper = prediction.static.system_error if prediction.static_moments else None
     if system.time == "discrete":
         return Bounds(None, upper, "undirected graphs and equal noise: E is at most that of the graphs held fixed")
     try:

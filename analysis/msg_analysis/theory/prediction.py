@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from msg_analysis.common.text.json_numbers import finite
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
-from msg_analysis.errors import InputError
+from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.model.step.sequential_law import StepLaw, build_run_model, step_law
 from msg_analysis.model.step.step_model import StepModel, build_step_model
 from msg_analysis.theory.moments import MomentSolver
@@ -127,11 +127,10 @@ class Prediction:
     emulated
         exact moments of the run's steps ("discrete" in the document of a discrete-time experiment); in real time if no
         agent is late
-    continuous
-        the paper's continuous-time system; None in discrete time, with a protocol, or with noise on the air, loss or
-        delay
+    continuous_moments
+        ``continuous``; None in discrete time, with a protocol, or with noise on the air, loss or delay
     paper
-        the system of the paper: in continuous time where ``continuous`` is there, else the steps; None with noise on
+        the system of the paper: in continuous time where there is ``continuous``, else the steps; None with noise on
         the air, loss or delay
     """
 
@@ -140,12 +139,34 @@ class Prediction:
     solver: MomentSolver
     steady: FloatArray
     emulated: Moments
-    continuous: Moments | None
+    continuous_moments: Moments | None
     paper: JumpSystem | None
 
+    @property
+    def continuous(self) -> Moments:
+        """Exact moments of the paper's continuous-time system; NotAvailableError, with the reason, if it has none."""
+        if self.continuous_moments is None:
+            raise NotAvailableError(
+                f"continuous: the law of the paper in continuous time does not exist {_why_no_paper(self.experiment)}: "
+                "use emulated, the law of the run's steps"
+            )
+        return self.continuous_moments
+
+    @property
+    def static(self) -> Moments:
+        """The pi-weighted mean over the graphs held fixed; NotAvailableError, with the reason, if there is none."""
+        if self.static_moments is None:
+            why = "where a graph held fixed does not keep the agents together"
+            if self.paper is None:
+                why = _why_no_paper(self.experiment)
+            raise NotAvailableError(
+                f"static: there is no mean over the graphs held fixed {why}: use emulated, the law of the run's steps"
+            )
+        return self.static_moments
+
     @cached_property
-    def static(self) -> Moments | None:
-        """The pi-weighted mean over the graphs held fixed, computed when it is first asked for.
+    def static_moments(self) -> Moments | None:
+        """``static``, computed when it is first asked for.
 
         None without ``paper``, or where one of the graphs cannot keep the agents together.
         """
@@ -156,7 +177,7 @@ class Prediction:
     def _laws(self) -> dict[str, Moments]:
         """Those moments that there are, by the name that texts give them."""
         steps = "sequential" if self.emulated.law == "sequential" else "emulated"
-        laws = {steps: self.emulated, "continuous": self.continuous, "static": self.static}
+        laws = {steps: self.emulated, "continuous": self.continuous_moments, "static": self.static_moments}
         return {LAW_NAMES[key]: law for key, law in laws.items() if law is not None}
 
     def __repr__(self) -> str:
@@ -186,10 +207,16 @@ class Prediction:
         if self.experiment.time == "discrete":
             document["discrete"] = self.emulated.to_json()
         else:
-            document["continuous"] = self.continuous.to_json() if self.continuous else None
+            document["continuous"] = self.continuous_moments.to_json() if self.continuous_moments else None
             document["emulated"] = self.emulated.to_json()
-        document["static"] = self.static.to_json() if self.static else None
+        document["static"] = self.static_moments.to_json() if self.static_moments else None
         return document
+
+
+def _why_no_paper(experiment: ValidExperiment) -> str:
+    if experiment.noise.steps_only:
+        return "with noise on the air, loss or delay"
+    return "in discrete time" if experiment.time == "discrete" else "with a protocol"
 
 
 def predict(experiment: ValidExperiment, step: StepModel | None = None) -> Prediction:

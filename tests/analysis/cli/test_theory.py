@@ -36,7 +36,7 @@ def from_zero(tmp_path):
 
 def test_transient_tends_to_the_prediction(from_zero):
     prediction = predict(ValidExperiment.load(from_zero))
-    for law, moments in {"emulated": prediction.emulated, "continuous": prediction.continuous}.items():
+    for law, moments in {"emulated": prediction.emulated, "continuous": prediction.continuous_moments}.items():
         document = document_of("transient", from_zero, "--times", "0:50:0.5", "--law", law)
         assert document["law"] == law
         assert document["times"] == pytest.approx(np.arange(0.0, 50.1, 0.5).tolist())

@@ -74,8 +74,8 @@ def test_metropolis_against_networkx_and_scipy(laziness: float) -> None:
     covariance = scipy.linalg.solve_discrete_lyapunov(projector @ expected @ projector, 0.16 * projector)
     prediction = predict(what)
     assert prediction.emulated.covariance == pytest.approx(covariance, rel=1e-10)
-    assert prediction.continuous is None
-    assert prediction.static is not None
+    assert prediction.continuous_moments is None
+    assert prediction.static_moments is not None
     assert prediction.static.system_error == pytest.approx(np.trace(covariance), rel=1e-10)
     assert "discrete" in prediction.to_json()
 
@@ -97,7 +97,7 @@ def test_the_built_in_law_declared(changes: dict[str, Any], offer: Callable[...,
     mine, other = (experiment(protocol, **changes) for protocol in ({"name": "euler"}, None))
     one, two = predict(mine), predict(other)
     assert one.emulated.covariance == pytest.approx(two.emulated.covariance, rel=1e-9)
-    assert one.continuous is None
+    assert one.continuous_moments is None
     first, second = simulate(mine), simulate(other)
     assert first.states == pytest.approx(second.states, abs=1e-9)
     assert np.array_equal(first.modes, second.modes)

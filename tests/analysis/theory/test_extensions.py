@@ -306,8 +306,8 @@ def test_two_agents_late(delay):
     difference = scipy.linalg.solve_discrete_lyapunov(companion, entering)[0, 0]
     prediction = predict(ValidExperiment.parse(given))
     assert prediction.emulated.system_error == pytest.approx(difference / 2, rel=1e-11)
-    assert prediction.continuous is None
-    assert prediction.static is None
+    assert prediction.continuous_moments is None
+    assert prediction.static_moments is None
 
 
 def test_what_belongs_to_steps_has_no_other_law():

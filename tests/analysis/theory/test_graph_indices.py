@@ -82,7 +82,7 @@ def test_bounds_hold_for_equal_noise(seed, m, n, time, problem, rate):
         network(np.random.default_rng(seed), m=m, n=n, time=time, problem=problem, noise=0.7, rate=rate)
     )
     bounds = error_bounds(prediction)
-    law = prediction.continuous or prediction.emulated
+    law = prediction.continuous_moments or prediction.emulated
     assert law.system_error <= bounds.upper * (1 + 1e-10)
     assert bounds.upper == prediction.static.system_error
     if time == "discrete":

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from msg_analysis.errors import NotAvailableError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict, stationary_start_factor
 
@@ -152,7 +153,7 @@ def test_static_is_the_weighted_mean_of_single_graphs():
 def test_disconnected_graphs_have_no_static_baseline():
     graphs = {"left": {"edges": [[1, 2]]}, "right": {"edges": [[2, 3]]}}
     prediction = predict(experiment(graphs=graphs, agents=3))
-    assert prediction.static is None
+    assert prediction.static_moments is None
     assert prediction.to_json()["static"] is None
     assert prediction.continuous.system_error > 0.0
 
@@ -160,7 +161,7 @@ def test_disconnected_graphs_have_no_static_baseline():
 def test_a_graph_in_which_no_leader_is_heard_has_no_static_baseline():
     graphs = {"deaf": {"arcs": [[1, 2]]}, "all": {"path": [1, 2, 3]}}
     leaders = {"agents": [1], "gain": 1.0, "reference": 0.0}
-    assert predict(experiment(graphs=graphs, agents=3, problem="tracking", leaders=leaders)).static is None
+    assert predict(experiment(graphs=graphs, agents=3, problem="tracking", leaders=leaders)).static_moments is None
 
 
 def test_without_noise_certainty_is_undefined():
@@ -183,3 +184,26 @@ def test_start_factor_of_consensus_has_no_mean():
     factor = stationary_start_factor(e, 1)
     np.testing.assert_allclose(factor.sum(axis=0), 0.0, atol=1e-12)
     np.testing.assert_allclose(factor @ factor.T, predict(e).emulated.by_mode[1] / 0.5, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "law", "reason"),
+    [
+        ({"noise": {"process": 1, "loss": 0.1}}, "continuous", "with noise on the air, loss or delay: use emulated"),
+        ({"noise": {"process": 1, "delay": 1}}, "static", "with noise on the air, loss or delay: use emulated"),
+        ({"time": "discrete", "switching": {}}, "continuous", "in discrete time: use emulated"),
+        ({"graphs": {"a": {"edges": [[1, 2]]}, "b": {"edges": [[2, 3]]}}}, "static", "keep the agents together"),
+    ],
+)
+def test_a_law_that_does_not_exist_is_an_error_with_the_reason(changes: dict, law: str, reason: str) -> None:
+    document = {
+        "name": "net",
+        "agents": 3,
+        "graphs": {"a": {"path": [1, 2, 3]}} | ({} if "time" in changes else {"b": {"cycle": [1, 2, 3]}}),
+        "switching": {"generator": [[-1, 1], [1, -1]]},
+        "run": {"duration": 10} if "time" in changes else {"dt": 0.05, "duration": 10},
+    }
+    prediction = predict(ValidExperiment.parse(document | changes))
+    with pytest.raises(NotAvailableError, match=reason):
+        getattr(prediction, law)
+    assert prediction.emulated.system_error > 0

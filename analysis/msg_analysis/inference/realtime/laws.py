@@ -143,7 +143,7 @@ def _sequential(
 
 def _continuous(observation: Observation, sequential: Estimate, level: float, late: bool) -> Law:
     """With the standard error of the sequential law, from which that of the continuous law would hardly differ."""
-    law, experiment = observation.prediction.continuous, observation.prediction.experiment
+    law, experiment = observation.prediction.continuous_moments, observation.prediction.experiment
     if law is None:
         return Law(Estimate(sequential.measured), None, "not available for this experiment")
     predicted = law.system_error

@@ -92,7 +92,7 @@ def describe_facts(experiment: ValidExperiment) -> dict[str, Any]:
     """
     prediction = predict(experiment)
     laws = {"discrete" if experiment.time == "discrete" else "emulated": prediction.system}
-    if prediction.continuous is not None:
+    if prediction.continuous_moments is not None:
         laws = {"continuous": systems.continuous(experiment)} | laws
     notes: list[str] = []
 
@@ -105,7 +105,7 @@ def describe_facts(experiment: ValidExperiment) -> dict[str, Any]:
 
     facts = unless_refused(lambda: [fact.to_json() for fact in check_facts(experiment)])
     forms = None
-    if len(experiment.graph_list) == 2 and prediction.static is not None:
+    if len(experiment.graph_list) == 2 and prediction.static_moments is not None:
         forms = unless_refused(lambda: {law: two_topology(system).to_json() for law, system in laws.items()})
     indices = [graph_indices(graph) for graph in experiment.graph_list]
     return {
