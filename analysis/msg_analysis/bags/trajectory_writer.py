@@ -13,6 +13,7 @@ import numpy as np
 
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writer import BagWriter, exists_already
+from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import BagError
 from msg_analysis.model.arithmetic.payload import to_payload
 from msg_analysis.model.arithmetic.step_clock import StepClock
@@ -24,8 +25,12 @@ from msg_analysis.wire.topics import EXPERIMENT, GRAPH, STATE, TRUTH, Topic, net
 
 
 def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT_STORAGE) -> None:
-    """Write a bag, whole or not at all; BagError where the directory exists or cannot be written."""
+    """Write a bag, whole or not at all; BagError where the directory exists or cannot be written.
+
+    InputError for a name that is not UTF-8.
+    """
     directory = Path(directory).absolute()
+    require_utf8(directory)
     if directory.exists():
         raise exists_already(directory)
     record = trajectory.record.to_json()

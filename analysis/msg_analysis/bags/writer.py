@@ -17,6 +17,7 @@ from typing import BinaryIO, Self
 from msg_analysis.bags.format.mcap_writer import McapWriter
 from msg_analysis.bags.format.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
+from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import BagError
 from msg_analysis.wire.topics import Topic
 
@@ -48,6 +49,7 @@ class BagWriter:
         self, directory: Path, topics: Sequence[Topic], *, record: str | None = None, storage: Storage = DEFAULT_STORAGE
     ) -> None:
         self.directory = Path(directory).absolute()
+        require_utf8(self.directory)
         self._topics, self._record = tuple(topics), record
         self._compression, self._split_size = storage.compression, storage.split_size
         self._files: list[FileCount] = []

@@ -24,6 +24,15 @@ def require_place(file: Path | None) -> None:
         raise InputError(f"{file}: not a regular file: choose another")
 
 
+def require_utf8(path: Path) -> None:
+    """Refuse a path whose bytes are not text: it could not be written into a bag, or passed on. Raises InputError."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError as error:
+        shown = str(path).encode(errors="backslashreplace").decode()
+        raise InputError(f"{shown}: not UTF-8: choose a name in UTF-8") from error
+
+
 def write_whole(path: Path, content: bytes) -> Path:
     """Write under a temporary name and rename; after an OSError, what was at ``path`` is unchanged."""
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:

@@ -28,6 +28,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.writer import RECORDING_MARKER
 from msg_analysis.common.cores import available_cores
+from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
@@ -85,6 +86,7 @@ def make_bag_directory(experiment: ValidExperiment, out: Path) -> Path:
 
     InputError: it cannot be made.
     """
+    require_utf8(out)
     stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
     candidate, number = out / stem, 2
     try:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import resource
 import signal
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 from msg_analysis.common.files import write_whole
 
@@ -47,3 +50,16 @@ def test_a_file_like_any_other(tmp_path: Path) -> None:
         os.umask(mask)
     assert (file.read_bytes(), file.stat().st_mode & 0o777) == (b"after", 0o640)
     assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("words", [["msg-analysis", "simulate"], ["msg-agents", "run"]])
+def test_a_place_that_is_not_utf8(words: list[str], tmp_path: Path) -> None:
+    """One error that names it, before anything starts; nothing is made."""
+    if words[0] == "msg-agents":
+        pytest.importorskip("rclpy")
+    experiment = Path(__file__).parents[2] / "data/golden/line_ring.yaml"
+    command = [Path(sys.executable).with_name(words[0]), words[1], experiment, "--out", bytes(tmp_path) + b"/\xff"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"error: .*\\udcff: not UTF-8: choose a name in UTF-8\n", done.stderr)
+    assert list(tmp_path.iterdir()) == []
