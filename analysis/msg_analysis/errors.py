@@ -6,7 +6,7 @@ class InputError(Exception):
 
 
 class NotAvailableError(InputError):
-    """The experiment asks for something that the file format has but this version cannot do."""
+    """Something that the file format or the library has, but that is not there for this experiment."""
 
 
 class BagError(InputError):

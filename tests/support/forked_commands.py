@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
-import gc
 import importlib
 import io
 import json
@@ -25,7 +24,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from msg_agents.processes.fork_server import adopt_orphans, end_without_libraries, fork_orphan
+from msg_agents.processes.fork_server import LONGEST, MOST_DESCRIPTORS, adopt_orphans, serve
 
 MARK = "MSG_AGENTS_TEST"
 LENGTH_OF_MARK = 32
@@ -45,10 +44,6 @@ PREPARED = (
 )
 READ_LATER = re.compile("(ROS_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_).*|NO_COLOR|COLUMNS|LINES|OPENBLAS_NUM_THREADS")
 """Names of variables that are read after the imports, or are the same for all that is forked."""
-WITH_NETWORK = (["run"], ["host"])
-"""Commands that start a network; their first words."""
-LONGEST = 1 << 17  # bytes of a request
-MOST_DESCRIPTORS = 16
 LONGEST_TITLE = 2000
 FREE = 200  # descriptors from here on are not used
 
@@ -102,9 +97,10 @@ class _Forker:
             return _fork_exec(*arguments)  # type: ignore[misc]
         if self._control is None:
             self._control = self._start()
-        if _fixed(request["environment"]) != self._environment:
+        message = json.dumps(request).encode()
+        if len(message) > LONGEST or _fixed(request["environment"]) != self._environment:
             return _fork_exec(*arguments)  # type: ignore[misc]
-        socket.send_fds(self._control, [json.dumps(request).encode()], descriptors_of(request, arguments))
+        socket.send_fds(self._control, [message], descriptors_of(request, arguments))
         return int(self._control.recv(LONGEST)) or _fork_exec(*arguments)  # type: ignore[misc]
 
     def _start(self) -> socket.socket:
@@ -124,26 +120,10 @@ def _fixed(environment: Any) -> dict[str, str]:
     return {name: value for name, value in environment.items() if not READ_LATER.fullmatch(name)}
 
 
-def serve(control: socket.socket) -> Callable[[], None]:
-    """Fork a process for each request; in it, what it is to do comes back."""
-    while True:
-        message, descriptors, _, _ = socket.recv_fds(control, LONGEST, MOST_DESCRIPTORS)
-        if not message:
-            os._exit(0)
-        pid = fork_orphan()
-        if pid is None:
-            control.close()
-            request = json.loads(message)
-            with_network = Path(request["command"][0]).name == "msg-agents" and request["command"][1:2] in (
-                ["run"],
-                ["host"],
-            )
-            if with_network and (waiting := _leave_one_waiting(descriptors)):
-                return waiting
-            return become(request, descriptors)
-        for descriptor in descriptors:
-            os.close(descriptor)
-        control.send(str(pid).encode())
+def begin(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None]:
+    """What a forked process is to do."""
+    waiting = _leave_one_waiting(descriptors) if request["command"][1:2] == ["run"] else None
+    return waiting or become(request, descriptors)
 
 
 def _leave_one_waiting(descriptors: list[int]) -> Callable[[], None] | None:
@@ -178,7 +158,6 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
     import numpy as np
     from setproctitle import setproctitle
 
-    end_without_libraries()
     command: list[str] = request["command"]
     if request["session"]:
         os.setsid()
@@ -236,9 +215,7 @@ def main() -> None:
     for name in PREPARED:
         importlib.import_module(name)
     importlib.import_module(NODE_SERVER)._import_all()
-    gc.collect()
-    gc.freeze()
-    serve(socket.socket(fileno=int(sys.argv[1])))()
+    serve(socket.socket(fileno=int(sys.argv[1])), begin)()
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ PART = 1 << 20  # bytes
 DEEPEST = 50  # collections in collections; PyYAML's loader in C crashes at some thousands
 MOST_REPEATED = 1_000_000  # values that aliases repeat, each counted as often as it is repeated
 
-_EVENTS: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # in C, where PyYAML has it
 
 
 def read_text(path: Path, longest: int = LONGEST_FILE) -> str:
@@ -27,7 +27,7 @@ def read_text(path: Path, longest: int = LONGEST_FILE) -> str:
     return data.decode("utf-8")
 
 
-def load_yaml(text: str, loader: Any) -> Any:
+def load_yaml(text: str, loader: Any = SAFE_LOADER) -> Any:
     """The document; YAMLError where it is nested too deeply, or where aliases make it too large."""
     _Walk().check(text)
     return yaml.load(text, loader)
@@ -42,7 +42,7 @@ class _Walk:
         self._repeated = 0
 
     def check(self, text: str) -> None:
-        for event in yaml.parse(text, _EVENTS):
+        for event in yaml.parse(text, SAFE_LOADER):
             if isinstance(event, yaml.CollectionStartEvent):
                 self._begin(event)
             elif isinstance(event, yaml.CollectionEndEvent):

@@ -60,17 +60,18 @@ def _slowest(
     """Rate of the slowest component; None if one of them is not certain."""
     slowest = math.inf
     for part in parts:
-        rate = _certain(system, part, methods_of(part.system(system)))
+        reduced = part.system(system)
+        rate = _certain(system, part, reduced, methods_of(reduced))
         if rate is None:
             return None
         slowest = min(slowest, rate)
     return slowest
 
 
-def _certain(system: JumpSystem, part: Component, methods: Iterator[Method]) -> float | None:
+def _certain(system: JumpSystem, part: Component, reduced: JumpSystem, methods: Iterator[Method]) -> float | None:
     """The first rate that another rounding and another beginning would have given too."""
     for method in methods:
-        rate = method(part.system(system), None)
+        rate = method(reduced, None)
         if rate is None or part.normal:
             return rate
         rng = np.random.default_rng(0)

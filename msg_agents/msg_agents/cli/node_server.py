@@ -26,11 +26,11 @@ def main() -> None:
 
     from msg_agents.cli.main import main as run
     from msg_agents.processes.environment import tolerate_warnings
-    from msg_agents.processes.fork_server import serve
+    from msg_agents.processes.fork_server import begin_node, serve
 
     tolerate_warnings()
     _import_all()
-    arguments = serve(socket.socket(fileno=int(sys.argv[1])))
+    arguments = serve(socket.socket(fileno=int(sys.argv[1])), begin_node)
     setproctitle(f"msg-agents {' '.join(arguments)}")
     np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
     sys.argv = ["msg-agents", *arguments]

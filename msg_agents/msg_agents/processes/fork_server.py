@@ -15,10 +15,10 @@ import socket
 import subprocess
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, TypeVar
 
 PROGRAM = "msg_agents.cli.node_server"  # calls ``serve``
 LONGEST_TITLE = 1000  # bytes of the titles of processes, which take the place of the arguments of the first
@@ -26,6 +26,9 @@ LONGEST = 1 << 16  # bytes of a request
 MOST_DESCRIPTORS = 8  # that come with a request
 PATIENCE = 60.0  # s for an answer; the first comes after all imports
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # of linux/prctl.h
+
+
+Begun = TypeVar("Begun")
 
 
 class Process(Protocol):
@@ -177,10 +180,10 @@ def adopt_orphans(*, adopt: bool) -> bool | None:
     return bool(before.value)
 
 
-def serve(control: socket.socket) -> list[str]:
+def serve(control: socket.socket, begin: Callable[[Any, list[int]], Begun]) -> Begun:
     """Fork a process for each request from the other side, and end when that does.
 
-    Returns in the forked processes only: the arguments of the command to run there.
+    Returns in the forked processes only: what ``begin`` makes of the request and the descriptors that came with it.
     """
     gc.collect()
     gc.freeze()  # the collector writes to the objects that it looks at, and their memory would be copied
@@ -188,16 +191,17 @@ def serve(control: socket.socket) -> list[str]:
         message, descriptors, _, _ = socket.recv_fds(control, LONGEST, MOST_DESCRIPTORS)
         if not message:
             os._exit(0)
-        pid = fork_orphan()
+        pid = _fork_orphan()
         if pid is None:
             control.close()
-            return _begin(json.loads(message), *descriptors)
+            end_without_libraries()
+            return begin(json.loads(message), descriptors)
         for descriptor in descriptors:
             os.close(descriptor)
         control.send(str(pid).encode())
 
 
-def fork_orphan() -> int | None:
+def _fork_orphan() -> int | None:
     """Fork a process that is a child of our parent: its number, 0 if that failed; in itself, None."""
     ours, theirs = socket.socketpair()
     with warnings.catch_warnings(), ours, theirs:
@@ -231,10 +235,10 @@ def end_without_libraries() -> None:
         library.on_exit(library._exit, None)
 
 
-def _begin(request: dict[str, Any], output: int, *others: int) -> list[str]:
+def begin_node(request: dict[str, Any], descriptors: list[int]) -> list[str]:
     """Make a forked process one of its own; the arguments of its command."""
+    output, *others = descriptors
     os.setsid()
-    end_without_libraries()
     for stream in (sys.stdout, sys.stderr):
         os.dup2(output, stream.fileno())
     os.close(output)

@@ -21,7 +21,7 @@ from mcap.summary import Summary
 
 from msg_analysis.bags.format.mcap_chunks import CHUNK_CRC, RECORD_LIMIT, chunk_head
 from msg_analysis.bags.format.mcap_file import Batch, McapFile
-from msg_analysis.bags.format.metadata import LOADER, ChannelCount, FileCount
+from msg_analysis.bags.format.metadata import ChannelCount, FileCount
 from msg_analysis.common.bounded_input import load_yaml
 
 _FOOTER = struct.Struct("<9xQQI8x")  # starts of summary and summary offsets; CRC of all from the summary up to itself
@@ -128,7 +128,7 @@ def channel_count(channel: Channel, type_name: str) -> ChannelCount:
 def offered_profiles(channel: Channel) -> list[Any]:
     """The QoS profiles that the publishers of a channel offered, as rosbag2 writes them; empty if not readable."""
     try:
-        profiles = load_yaml(channel.metadata.get("offered_qos_profiles", ""), LOADER)
+        profiles = load_yaml(channel.metadata.get("offered_qos_profiles", ""))
     except (ValueError, yaml.YAMLError):
         return []
     return profiles if isinstance(profiles, list) else []

@@ -1,4 +1,4 @@
-"""Writes MCAP files with their messages in chunks: the same bytes as ``mcap.writer.Writer``, in a fifth of its time.
+"""Writes MCAP files with their messages in chunks: the same bytes as ``mcap.writer.Writer``, in half its time.
 
 The records other than messages and their indexes are encoded by ``mcap``.
 """
@@ -77,7 +77,8 @@ class McapWriter:
         record = _encoded(records[-1])
         self._chunk.append(record)
         self._size += len(record)
-        self._finish_full_chunk()
+        if self._size > self._chunk_size:
+            self._finish_chunk()
         return len(records)
 
     def add_message(self, channel: int, time_ns: int, data: bytes, sequence: int) -> None:
@@ -86,10 +87,6 @@ class McapWriter:
         self._chunk += (MESSAGE.pack(Opcode.MESSAGE, length + 22, channel, sequence, time_ns, time_ns), data)
         self._index[channel] += (time_ns, self._size)
         self._size += length + MESSAGE.size
-        if self._size > self._chunk_size:
-            self._finish_chunk()
-
-    def _finish_full_chunk(self) -> None:
         if self._size > self._chunk_size:
             self._finish_chunk()
 

@@ -15,9 +15,8 @@ from msg_analysis.errors import BagError
 
 METADATA_FILE = "metadata.yaml"
 _ROOT = "rosbag2_bagfile_information"
-# Those in C, where PyYAML has them: metadata of 1000 agents has 30,000 lines.
+# That in C, where PyYAML has them: metadata of 1000 agents has 30,000 lines.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _NEVER = 2**63 - 1  # what rosbag2 writes as the start of a bag without messages
 
 
@@ -121,7 +120,7 @@ def read_metadata(directory: Path) -> dict[str, Any] | None:
     """Bag information of a directory; None without metadata.yaml, BagError where it is not that of a bag."""
     file = directory / METADATA_FILE
     try:
-        document = load_yaml(read_text(file), LOADER)
+        document = load_yaml(read_text(file))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, yaml.YAMLError) as error:  # ValueError: not UTF-8, or !!int x

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import unicodedata
-
 _ORDER = {*range(0x202A, 0x202F), *range(0x2066, 0x206A)}  # characters that change the order of those after them
 _SHOWN = {
     code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
-    for code in [*range(0xA0), *_ORDER]
-    if code in _ORDER or (unicodedata.category(chr(code)) == "Cc" and chr(code) not in "\n\t")
+    for code in [*range(0x20), *range(0x7F, 0xA0), *_ORDER]
+    if chr(code) not in "\n\t"
 }
 
 
