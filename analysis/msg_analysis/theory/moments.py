@@ -6,6 +6,7 @@ Systems (2005).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
+MARGIN = 8.0  # of the estimated effect of rounding, see docs/accuracy.md
 MAX_FALLBACK = 1000  # unknowns up to which equations that do not converge are solved densely
 
 
@@ -59,6 +61,7 @@ class MomentSolver:
                 f"guess: shape {guess.shape}, but the second moments of this system have {system.matrices.shape}: "
                 "give those of a system with the same graphs and agents"
             )
+        self._report: SolverReport | None = None
         self._solver: DenseSolver | IterativeSolver
         if method == "dense" or unknowns == 0:
             self._solver = DenseSolver(system)
@@ -73,7 +76,7 @@ class MomentSolver:
     @property
     def report(self) -> SolverReport | None:
         """How the steady state was found; None before that."""
-        return self._solver.report
+        return self._report
 
     def steady(self) -> FloatArray:
         """(n, d, d): C_i = E[y y^T; mode i] in the steady state.
@@ -96,6 +99,9 @@ class MomentSolver:
                 "second moments: the equations have no positive solution, so the errors grow without bound: "
                 "lower run.dt, or add edges until the union of the graphs connects all agents"
             ) from None
+        report = self._solver.report
+        assert report is not None
+        self._report = replace(report, error=max(report.error, _rounding(self._system, moments)))
         return moments
 
     def dual(self, forms: FloatArray) -> FloatArray:
@@ -125,6 +131,15 @@ class MomentSolver:
         if not self._dense_too or isinstance(self._solver, DenseSolver):
             raise
         self._solver = DenseSolver(self._system)
+
+
+def _rounding(system: JumpSystem, moments: FloatArray) -> float:
+    """Relative error that rounding of Z_i or W_i may leave, whatever the method: terms of the equations over noise."""
+    law = system.stationary
+    size = float((np.linalg.norm(moments, axis=(1, 2)) / law).max(initial=0.0))
+    terms = 2.0 * float(law @ np.linalg.norm(system.matrices, np.inf, axis=(1, 2))) * size
+    noise = float(law @ np.linalg.norm(system.noise, axis=(1, 2)))
+    return MARGIN * float(np.finfo(float).eps) * terms / noise if noise > 0.0 else 0.0
 
 
 def mode_potential(system: JumpSystem, dual: FloatArray) -> tuple[FloatArray, FloatArray]:

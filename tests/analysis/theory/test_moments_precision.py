@@ -1,10 +1,14 @@
 """Second moments against the same equations in 60 digits (mpmath), at extreme rates and gains."""
 
+import importlib.util
+from pathlib import Path
+
 import mpmath
 import numpy as np
 import pytest
 import scipy.linalg
 
+from msg_analysis.errors import InputError
 from msg_analysis.model.network.markov_chain import stationary_law
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.system.jump_system import JumpSystem
@@ -119,3 +123,29 @@ def test_tracking(gain, rate):
         generator, gains = scaled("uneven", rate), [0.0, gain, 0.0, 0.0]
         measured, _ = double(graphs[:2], gains, generator, method="krylov")
         assert worst(measured, exact(graphs[:2], gains, generator)) < (1e-9 if rate <= 1e6 else 1e-7)
+
+
+@pytest.fixture(scope="module")
+def claimed_error():
+    """Networks and their exact errors in 80 digits, from the benchmark."""
+    script = Path(__file__).parents[3] / "benchmarks" / "claimed_error.py"
+    spec = importlib.util.spec_from_file_location("claimed_error", script)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(("decades", "most"), [(2, 1e-6), (12, np.inf)])
+@pytest.mark.parametrize("steps", [False, True])
+def test_the_claimed_error_covers_the_true_one(claimed_error, steps, decades, most):
+    """Twenty networks with weights and rates over so many decades, in the steps' law at very small steps, too."""
+    solved = 0
+    for seed in range(20):
+        try:
+            experiment = claimed_error.random_experiment(seed, decades, steps=steps)
+            true, claimed = claimed_error.errors(experiment, steps=steps)
+        except InputError:  # the graphs do not connect the agents, or the solver refuses the equations
+            continue
+        assert true <= 10.0 * claimed <= most, seed
+        solved += 1
+    assert solved >= 12

@@ -23,8 +23,8 @@ class SolverReport:
     iterations: int  # Krylov iterations, direct solves and steps of refinement
     residual: float  # norm of a graph's residual over that of its right-hand side, in the worst graph
     backward_error: float  # the same over the sum of the norms of the terms that the residual consists of
-    # Estimated relative error: size of the correction that one preconditioned step makes; for "dense", the backward
-    # error times the condition number.
+    # Estimated relative error: the larger of what rounding of the law may leave (in the report of ``MomentSolver``) and
+    # the correction that one preconditioned step makes; "dense": the backward error times the condition number.
     error: float
 
     def to_json(self) -> dict[str, Any]:
