@@ -106,8 +106,11 @@ def test_sentences_are_not_wrapped_for_programs(folder: Path) -> None:
     ((_, _, _, shown, _),) = outcomes(folder, (("msg-analysis", "compare"), "terminal"))
     (counts,) = (line for line in piped.splitlines() if " out of order" in line)
     assert re.fullmatch(r"1005 of 1005 states .*: 0 missing, 0 duplicates, 0 out of order", counts)
-    assert counts not in shown
-    assert counts in " ".join(re.sub(r"\x1b\[[0-9;]*m", "", shown).split())
+    (order,) = (line for line in piped.splitlines() if line.startswith("Order, smallest"))
+    assert order.endswith("(level 0.01 for all pairs together).")
+    for sentence in (counts, order):
+        assert sentence not in shown
+        assert sentence in " ".join(re.sub(r"\x1b\[[0-9;]*m", "", shown).split())
 
 
 @pytest.mark.parametrize(

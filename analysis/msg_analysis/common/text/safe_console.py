@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.text import Text
 
 from msg_analysis.common.text.safe_text import visible
 
@@ -28,7 +29,7 @@ class ResultConsole(SafeConsole):
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print; sentences are wrapped for readers at a terminal, not for programs."""
-        if not self.is_terminal and all(isinstance(each, str) for each in objects):
+        if not self.is_terminal and all(isinstance(each, str | Text) for each in objects):
             options.setdefault("soft_wrap", True)
         super().print(*objects, **options)
 
