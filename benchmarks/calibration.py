@@ -16,7 +16,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +92,47 @@ TRUE: dict[str, Mapping[str, Any]] = {
     "discrete time, three graphs, 1000 steps": discrete(),
 }
 
+FAR = [50.0, -30.0, 20.0, -40.0]
+
+
+def line_pairs(
+    duration: float, start: str | list[float] = "stationary", rate: float = 0.5, replicas: int = 1, **more: Any
+) -> dict[str, Any]:
+    """Four agents on a line, of which sometimes only the pairs at the ends hear each other."""
+    return {
+        "name": "line_pairs",
+        "graphs": {"line": {"path": [1, 2, 3, 4]}, "pairs": {"edges": [[1, 2], [3, 4]]}},
+        "switching": {"generator": [[-rate, rate], [rate, -rate]]},
+        "noise": {"process": 1.0},
+        "run": {"dt": 0.05, "duration": duration, "start": start, "replicas": replicas},
+    } | more
+
+
+def short(duration: float) -> dict[str, Mapping[str, Any]]:
+    """Laws under which a few sojourns, or the start, decide the errors of a short run."""
+    leader: dict[str, Any] = {"problem": "tracking", "leaders": {"agents": [1], "gain": 1.0}}
+    three: dict[str, Any] = {"graphs": {"line": {"path": [1, 2, 3]}, "pair": {"edges": [[1, 2]]}}, "agents": 3}
+    return {
+        "steady start": line_pairs(duration),
+        "start at zero": line_pairs(duration, "zero"),
+        "far start": line_pairs(duration, FAR),
+        "far start, 30 units, two replicas": line_pairs(30.0, FAR, replicas=2),
+        "far start, tracking": line_pairs(duration, FAR, **leader),
+        "far start, 20 % of the messages lost": line_pairs(duration, FAR, noise={"process": 1.0, "loss": 0.2}),
+        "far start, no noise": line_pairs(duration, [1.0, 0.0, -3.0], noise={"process": 0.0}, **three),
+        "noise common to all agents": line_pairs(duration, noise={"process": [[1.0, 0.0, 0.0, 0.0]] * 4}),
+        "rate 0.001": line_pairs(duration, rate=1e-3),
+        "rate 0.001, far start": line_pairs(duration, FAR, rate=1e-3),
+    }
+
+
+DURATIONS = (10.0, 20.0, 100.0)
+SHORT: dict[str, Mapping[str, Any]] = {
+    name if "units" in name else f"{name}, {duration:g} units": law
+    for duration in DURATIONS
+    for name, law in short(duration).items()
+}
+
 LONG: dict[str, Any] = {"duration": 1000.0, "replicas": 16}
 
 
@@ -126,8 +167,8 @@ FALSE: dict[str, tuple[Mapping[str, Any], tuple[str, int | None, list[int] | Non
 @functools.cache
 def experiment(case: str) -> tuple[ValidExperiment, ValidExperiment]:
     """What is run, and what the record claims."""
-    if case in TRUE:
-        true = ValidExperiment.parse(TRUE[case])
+    if case in TRUE or case in SHORT:
+        true = ValidExperiment.parse((TRUE | SHORT)[case])
         return true, true
     return ValidExperiment.parse(FALSE[case][0]), ValidExperiment.parse(line_ring(**LONG))
 
@@ -136,16 +177,17 @@ def one_run(job: tuple[str, int], _stopping: Callable[[], bool]) -> dict[str, An
     """Simulate and compare a run; what is kept of it."""
     case, number = job
     # Runs of different experiments with equal seeds would have the same noise.
-    seed = 100_000 * [*TRUE, *FALSE].index(case) + number
+    seed = 100_000 * [*TRUE, *FALSE, *SHORT].index(case) + number
     true, claimed = (each.with_run(seed=seed) for each in experiment(case))
     record = new_record(claimed)
     trajectory = simulate(true, record=RunRecord(record.run, true, record.start))
-    comparison = compare(dataclasses.replace(trajectory, record=record, lost=None))
+    lost = trajectory.lost if claimed.noise.loss else None  # messages that are ignored are not in the log
+    comparison = compare(dataclasses.replace(trajectory, record=record, lost=lost))
     return summary(case, comparison)
 
 
 def summary(case: str, comparison: Comparison) -> dict[str, Any]:
-    """What is kept of a comparison."""
+    """What is kept of a comparison; coverage is None where there is no interval."""
     predicted, batch, given, order = (
         comparison.system_error.predicted,
         comparison.batch,
@@ -155,15 +197,15 @@ def summary(case: str, comparison: Comparison) -> dict[str, Any]:
     assert predicted is not None
     assert batch is not None
     assert given is not None
-    assert order is not None
     kept: dict[str, Any] = {
         "system": covers(comparison.system_error),
         "nodes": [covers(node) for node in comparison.node_errors],
         "given": covers(given.system_error),
+        "given_nodes": [covers(node) for node in given.node_errors],
         "ratio": given.variance_ratio,
         "batch": batch[0] <= predicted <= batch[1],
         "disagrees": comparison.verdict == "disagrees",
-        "order": any(pair.predicted is False for pair in order.distinctions),
+        "order": order is not None and any(pair.predicted is False for pair in order.distinctions),
         "p": {test.name: test.p for test in comparison.tests},
         "by": sorted({test.name.partition(" of agent")[0] for test in comparison.tests if test.rejected}),
     }
@@ -174,13 +216,25 @@ def summary(case: str, comparison: Comparison) -> dict[str, Any]:
     return kept
 
 
-def covers(estimate: Estimate) -> bool:
-    """Whether the interval holds what is predicted."""
+def covers(estimate: Estimate) -> bool | None:
+    """Whether the interval holds what is predicted; None without noise, or where the run is too short for one."""
     low, high = estimate.interval
+    if estimate.z is None or low is None or high is None:
+        return None
     assert estimate.predicted is not None
-    assert low is not None
-    assert high is not None
     return low <= estimate.predicted <= high
+
+
+def part(kept: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    """Share of the intervals that hold what is predicted; None where most runs have none."""
+    flat = [value for one in kept for value in (one[key] if isinstance(one[key], list) else [one[key]])]
+    known = [value for value in flat if value is not None]
+    return float(np.mean(known)) if len(known) > len(flat) / 2 else None
+
+
+def percent(value: float | None) -> str:
+    """For a table."""
+    return "-" if value is None else f"{100 * value:.1f} %"
 
 
 def version() -> str:
@@ -233,9 +287,16 @@ def tables(results: Mapping[str, list[dict[str, Any]]]) -> str:
     ]
     for case in TRUE:
         kept = results[case]
-        shares = [np.mean([one[key] for one in kept]) for key in ("system", "nodes", "given", "batch", "disagrees")]
-        numbers = " | ".join(f"{100 * share:.1f} %" for share in shares)
+        numbers = " | ".join(percent(part(kept, key)) for key in ("system", "nodes", "given", "batch", "disagrees"))
         lines.append(f"| {case} | {numbers} | {np.mean([one['ratio'] for one in kept]):.2f} |")
+    lines += [
+        "",
+        f"| short runs, {count} each | given path | agents, given path | system error | node errors | false alarms |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for case in SHORT:
+        keys = ("given", "given_nodes", "system", "nodes", "disagrees")
+        lines.append(f"| {case} | {' | '.join(percent(part(results[case], key)) for key in keys)} |")
     lines += ["", "| false alarms, test by test: share of p below 5 % (below 1 %) | |", "|---|---|"]
     for case in TRUE:
         values: dict[str, list[float]] = {}
@@ -264,16 +325,20 @@ def tables(results: Mapping[str, list[dict[str, Any]]]) -> str:
 
 
 def complaints(results: Mapping[str, list[dict[str, Any]]]) -> list[str]:
-    """What is not as it must be: coverage 93.5 to 96.5 %, false alarms .3 to 2 %, 80 % of the blame right."""
+    """What is not as it must be: coverage 93.5 to 96.5 %, false alarms at most 1.9 %, 80 % of the blame right.
+
+    The errors over all paths cover too much in short runs, and false alarms are rarer where hardly anything is tested.
+    """
     found = []
-    for case in TRUE:
+    for case in TRUE | SHORT:
         kept = results[case]
-        for key in ("system", "nodes", "given"):
-            share = float(np.mean([one[key] for one in kept]))
-            if not 0.935 <= share <= 0.965:
-                found.append(f"{case}: {key}: {100 * share:.1f} % covered")
+        for key in ("system", "nodes", "given", "given_nodes"):
+            covered = part(kept, key)
+            most = 1.0 if case in SHORT and not key.startswith("given") else 0.965
+            if covered is not None and not 0.935 <= covered <= most:
+                found.append(f"{case}: {key}: {percent(covered)} covered")
         alarms = sum(one["disagrees"] for one in kept)
-        if not 0.003 <= alarms / len(kept) <= 0.02:
+        if not (0.003 if case in TRUE else 0.0) <= alarms / len(kept) <= 0.019:
             chance = stats.binom.sf(alarms - 1, len(kept), 0.01) if alarms else stats.binom.cdf(0, len(kept), 0.01)
             found.append(f"{case}: {100 * alarms / len(kept):.1f} % false alarms (p {chance:.2g} at 1 %)")
     for case in FALSE:
@@ -300,7 +365,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--write", action="store_true", help=f"write the tables into {PAGE.relative_to(ROOT)}")
     arguments = parser.parse_args()
-    runs = dict.fromkeys(TRUE, arguments.runs) | dict.fromkeys(FALSE, arguments.wrong_runs)
+    runs = dict.fromkeys(TRUE | SHORT, arguments.runs) | dict.fromkeys(FALSE, arguments.wrong_runs)
     store = ROOT / "build/calibration" / version() / "runs.jsonl"
     results = run_all(runs, store, arguments.processes)
     text = tables(results)

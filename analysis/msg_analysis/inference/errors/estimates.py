@@ -10,7 +10,7 @@ import numpy as np
 from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.inference.errors.time_means import TimeMeans
 from msg_analysis.inference.hypothesis_tests.innovations import quadratic_form
-from msg_analysis.inference.statistics.distributions import chi2_tail, fisher_tail, two_sided
+from msg_analysis.inference.statistics.distributions import chi2_tail, two_sided
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
@@ -48,6 +48,10 @@ class Estimate:
             return None, None
         half = HALF_WIDTH_95 * self.standard_error
         return self.measured - half, self.measured + half
+
+    def without_error(self) -> Estimate:
+        """Only measured and predicted."""
+        return Estimate(self.measured, self.predicted)
 
     def to_json(self) -> dict[str, Any]:
         """The JSON document."""
@@ -103,10 +107,7 @@ def estimate(measured: float, predicted: float, error: float, scale: float) -> E
 
 
 def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
-    """Test of all second moments together, by the quadratic form of measured - predicted.
-
-    Its law is chi-square where the covariance is known from the model. Where it is estimated from n squares (lost
-    messages), it is Hotelling's T^2: (n - dof) / (dof (n - 1)) T^2 has the law F(dof, n - dof).
+    """Test of all second moments together: the quadratic form of measured - predicted is chi-square.
 
     Parameters
     ----------
@@ -118,22 +119,11 @@ def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
     Returns
     -------
     CovarianceTest
-        without ``chi2`` where not all moments are estimated together; without ``p`` where dof = 0 or n <= dof
+        without ``chi2`` where not all moments are estimated together; without ``p`` where dof = 0
     """
     measured = system.lifted(means.second_moments)
     predicted = system.lifted(means.expected_moments)
     if not means.joint:
-        note = "too many agents for a joint test; the agent errors are tested one by one"
-        if not len(means.nodes):
-            note = "too many agents for a joint test, and for tests of the agent errors in a run of this length"
-        return CovarianceTest(measured, predicted, note=note)
+        return CovarianceTest(measured, predicted, note="too many agents for a joint test of a run of this length")
     chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
-    p: float | None = None
-    if dof and not means.squares:
-        p = float(chi2_tail(chi2, dof))
-    elif dof and means.squares > dof:
-        # The covariance is itself estimated, from this many squares. Chi-square would reject too often; Hotelling's
-        # law, which assumes that all of it is estimated, rejects slightly too seldom.
-        rest = means.squares - dof
-        p = float(fisher_tail(chi2 * rest / (dof * (means.squares - 1)), dof, rest))
-    return CovarianceTest(measured, predicted, chi2, dof, p)
+    return CovarianceTest(measured, predicted, chi2, dof, float(chi2_tail(chi2, dof)) if dof else None)

@@ -1,9 +1,16 @@
-"""Errors of a run given its own path of graphs: a control variate for slow switching (docs/statistics.md).
+"""Time means of a run next to their law given its own path of graphs (docs/statistics.md).
 
-Given the path (and which messages were lost), the states are linear in independent normal numbers. The expectation of
-the time mean follows exactly from M(k+1) = W_k M(k) W_k^T + N_k, and with Y(k) = H + W_k^T Y(k+1) W_k (backwards) its
-variance is the sum of tr( Y N Y (4 M - 2 N) ) / R: replicas are independent given the path. So measured - (expected
-given the path - predicted) has the right mean, without the part of the variance that is due to the path.
+Given the path, and which messages were lost, the reduced states are linear in independent normal numbers:
+
+    y(k+1) = W_k y(k) + noise N_k,    M(k+1) = W_k M(k) W_k^T + N_k,    Y(k) = H + W_k^T Y(k+1) W_k.
+
+M gives the exact expectation of the time mean. For quadratic forms H the dual Y gives E[sum of what is still to come |
+y(k)], with martingale increments D. The covariance of their sum is estimated by the sum of
+
+    Cov(D_a, D_b | y(k)) = tr( Y_a N Y_b (2 N + 4 W y y^T W^T) ) / R,
+
+an exact function of the states. Where a few sojourns decide the errors (far starts, short runs, rare jumps), the law
+over all paths is far from normal; this ratio is not.
 """
 
 from __future__ import annotations
@@ -15,12 +22,14 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.inference.errors.estimates import Estimate, estimate
-from msg_analysis.inference.errors.time_means import MAX_JOINT, TimeMeans, forms_of, without_rounding
-from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.errors.time_means import TimeMeans, forms_of, moments, without_rounding
+from msg_analysis.inference.observed.observation import BLOCK_NUMBERS, Observation
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.types import FloatArray, IntArray
+
+MAX_WORK = 3e10  # multiplications, at most (seconds); the joint test is left out first, then the node errors
 
 # Numbers in the matrices of all kinds of steps, at most; there are many kinds where many messages are lost
 MAX_NUMBERS = 20_000_000
@@ -28,115 +37,141 @@ MAX_NUMBERS = 20_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GivenPath:
-    """Node errors, and their expectation given the path of the graphs."""
+    """Errors of a run corrected for its path: measured - (expected given the path - expected over all paths)."""
 
-    measured: FloatArray  # (m,) time means over the run
-    expected: FloatArray  # (m,) their exact expectation given the path
-    predicted: FloatArray  # (m,) their expectation over all paths
-    covariance: FloatArray  # (m, m) of measured - expected
-    unconditional: float  # variance of the measured system error over all paths
+    means: TimeMeans  # over all paths
+    given: TimeMeans  # given the path
 
     @property
     def variance_ratio(self) -> float | None:
         """Variance of the corrected system error over that of the measured one; None without noise."""
-        return float(self.covariance.sum() / self.unconditional) if self.unconditional > 0.0 else None
+        unconditional = _variance(self.means, self.means.trace)
+        return _variance(self.given, self.given.trace) / unconditional if unconditional > 0.0 else None
+
+    @property
+    def expected(self) -> float:
+        """Exact expectation of the system error given the path."""
+        return float(self.given.trace @ self.given.predicted)
 
     @property
     def system_error(self) -> Estimate:
         """Corrected for the path."""
-        corrected = self.measured - self.expected + self.predicted
-        error = math.sqrt(max(float(self.covariance.sum()), 0.0))
-        return estimate(float(corrected.sum()), float(self.predicted.sum()), error, float(self.predicted.sum()))
+        return self._corrected(self.given.trace, self.means.trace)
 
     @property
     def node_errors(self) -> list[Estimate]:
-        """Corrected for the path; without ``p_holm``."""
-        corrected, scale = self.measured - self.expected + self.predicted, float(self.predicted.sum())
-        errors = np.sqrt(np.diag(self.covariance).clip(0.0))
-        numbers = zip(corrected, self.predicted, errors, strict=True)
-        return [estimate(float(c), float(p), float(e), scale) for c, p, e in numbers]
+        """Corrected for the path, without ``p_holm``; empty where only the system error is estimated."""
+        return [self._corrected(one, other) for one, other in zip(self.given.nodes, self.means.nodes, strict=False)]
+
+    def _corrected(self, given: FloatArray, means: FloatArray) -> Estimate:
+        """The error that is this combination of the forms of each."""
+        predicted = float(means @ self.means.predicted)
+        corrected = float(given @ (self.given.measured - self.given.predicted)) + predicted
+        scale = float(self.means.trace @ self.means.predicted)
+        return estimate(corrected, predicted, math.sqrt(max(_variance(self.given, given), 0.0)), scale)
 
     def to_json(self) -> dict[str, Any]:
         """The JSON document."""
         return {
-            "expected": float(self.expected.sum()),
+            "expected": self.expected,
             "system_error": self.system_error.to_json(),
             "node_errors": [node.to_json() for node in self.node_errors],
             "variance_ratio": self.variance_ratio,
         }
 
 
-def given_path(observation: Observation, means: TimeMeans) -> GivenPath | None:
-    """Errors of a run given its path of graphs, by the recursions of this module; ``means`` are those over all paths.
+def _variance(means: TimeMeans, combination: FloatArray) -> float:
+    return float(combination @ means.covariance @ combination)
 
-    None in real time, and where it would take long: over ``MAX_JOINT`` second moments, or too many kinds of steps.
+
+def means_given_path(observation: Observation) -> TimeMeans | None:
+    """Time means of a run in lockstep, with expectation and standard errors given the path of the graphs.
+
+    None where it would take too long: more than ``MAX_WORK``, or too many kinds of steps.
     """
     system, steps = observation.prediction.system, observation.steps
-    if packed_symmetric.size(system.dimension) > MAX_JOINT or not means.joint or observation.timers:
+    d = system.dimension
+    for kind in ("joint", "nodes", "system"):
+        forms, nodes, trace = forms_of(system, kind)
+        q = len(forms)
+        if steps * d**2 * (q**2 + 5 * q * d) <= MAX_WORK:
+            break
+    else:
         return None
-    forms, _, _ = forms_of(system, "nodes")
-    which, matrices, noise = _steps(observation)
-    if len(matrices) * packed_symmetric.size(system.dimension) ** 2 > MAX_NUMBERS:
+    kinds = _steps(observation)
+    if kinds is None:
         return None
+    which, matrices, noise = kinds
     y = system.reduced((observation.start - observation.step.reference).T)
     y = without_rounding(y, system, observation.largest)
-    start = packed_symmetric.pack(y.T @ y / len(y))
-    total, covariance = _follow(which, matrices, noise, start, forms)
-    return GivenPath(
-        measured=means.nodes @ means.measured,
-        expected=forms @ total / steps,
-        predicted=means.nodes @ means.predicted,
-        covariance=covariance / (observation.replicas * steps**2),
-        unconditional=float(means.trace @ means.covariance @ means.trace),
+    expected = _expected_sum(which, matrices, noise, y.T @ y / len(y)) / steps
+    seen, covariance, series, variances = _backwards(observation, kinds, forms, trace)
+    return TimeMeans(
+        second_moments=packed_symmetric.unpack(seen / steps, d),
+        expected_moments=expected,
+        joint=kind == "joint",
+        measured=forms @ (seen / steps),
+        predicted=forms @ packed_symmetric.pack(expected),
+        covariance=covariance / steps**2,
+        nodes=nodes,
+        trace=trace,
+        system_series=series,
+        system_variances=variances,
     )
 
 
-def _follow(
-    which: IntArray, matrices: FloatArray, noise: FloatArray, start: FloatArray, forms: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Sum of the packed M(0..N-1) (p,), and the sum of Cov(D) (q, q) of one replica.
-
-    Works in blocks: going backwards, the M of a block are computed again from its beginning.
-    """
-    steps, d, q = len(which), matrices.shape[1], len(forms)
-    ahead = np.array([packed_symmetric.product(matrix, matrix) for matrix in matrices])
-    added = packed_symmetric.pack(noise)
-    kinds = which.tolist()
-    length = max(1, math.isqrt(steps))
-    moment, total, beginnings = start, np.zeros(len(start)), []
-    for k, kind in enumerate(kinds):
-        if k % length == 0:
-            beginnings.append(moment)
+def _expected_sum(which: IntArray, matrices: FloatArray, noise: FloatArray, start: FloatArray) -> FloatArray:
+    """(d, d): sum of M(0..N-1)."""
+    moment, total = start, np.zeros_like(start)
+    for kind in which.tolist():
         total += moment
-        moment = ahead[kind] @ moment + added[kind]
-    covariance = np.zeros((q, q))
-    dual = forms  # Y(last)
-    for block in reversed(range(len(beginnings))):
-        first, last = block * length, min((block + 1) * length, steps - 1)  # the noise of the last step is in no error
+        moment = matrices[kind] @ moment @ matrices[kind].T + noise[kind]
+    return total
+
+
+def _backwards(
+    observation: Observation, kinds: tuple[IntArray, FloatArray, FloatArray], forms: FloatArray, trace: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Sum of packed y y^T (p,), sum of Cov(D | now) (q, q), and of every step the system error and its Var(D | now)."""
+    which, matrices, noise = kinds
+    steps, q, d = len(which), len(forms), matrices.shape[1]
+    lifted = packed_symmetric.unpack(forms, d)
+    seen, covariance = np.zeros(forms.shape[1]), np.zeros((q, q))
+    series, variances = np.empty(steps), np.zeros(steps)
+    length = max(1, BLOCK_NUMBERS // max(q * d**2, observation.states[0].size))
+    dual = lifted  # Y(last + 1) of the block
+    for first in reversed(range(0, steps, length)):
+        last = min(first + length, steps)
+        found = moments(observation, first, last, observation.states)
+        seen += found.sum(axis=0)
+        series[first:last] = found @ (trace @ forms)
+        last = min(last, steps - 1)  # the noise of the last step is in no error
         if last <= first:
             continue
-        moments, duals = np.empty((last - first, len(start))), np.empty((last - first, *forms.shape))
-        moment = beginnings[block]
-        for k in range(first, last):
-            moments[k - first] = moment = ahead[kinds[k]] @ moment + added[kinds[k]]
+        duals = np.empty((last - first, q, d, d))
         for k in range(last - 1, first - 1, -1):
             duals[k - first] = dual
-            dual = forms + dual @ ahead[kinds[k]]
-        n = noise[which[first:last]]
-        y, seen = packed_symmetric.unpack(duals, d), 4.0 * packed_symmetric.unpack(moments, d) - 2.0 * n
-        left = (y @ n[:, None]).transpose(1, 0, 2, 3).reshape(q, -1)
-        right = (seen[:, None] @ y).transpose(1, 0, 2, 3).reshape(q, -1)
-        covariance += left @ right.T
-    return total, covariance
+            matrix = matrices[which[k]]
+            dual = lifted + matrix.T @ dual @ matrix
+        matrix, added = matrices[which[first:last]], noise[which[first:last]]
+        now = packed_symmetric.unpack(found[: last - first], d)
+        spread = (2.0 * added + 4.0 * matrix @ now @ matrix.transpose(0, 2, 1)) / observation.replicas
+        left, right = duals @ added[:, None], spread[:, None] @ duals
+        covariance += left.transpose(1, 0, 2, 3).reshape(q, -1) @ right.transpose(1, 0, 2, 3).reshape(q, -1).T
+        total = np.tensordot(duals, trace, axes=(1, 0))
+        variances[first:last] = np.einsum("kij,kij->k", total @ added, spread @ total)
+    return seen, covariance, series, variances
 
 
-def _steps(observation: Observation) -> tuple[IntArray, FloatArray, FloatArray]:
+def _steps(observation: Observation) -> tuple[IntArray, FloatArray, FloatArray] | None:
     """(N,) kind of every step; and of every kind the reduced matrix and noise covariance, (kinds, d, d) each."""
     system, step, lost = observation.prediction.system, observation.step, observation.lost
     if lost is None or not step.loss:
         return observation.modes, system.matrices, system.noise
     keys = np.column_stack([observation.modes, lost.reshape(len(lost), -1)])
     kinds, which = np.unique(keys, axis=0, return_inverse=True)
+    if len(kinds) * step.agents**2 > MAX_NUMBERS:
+        return None
     matrices, noise = np.empty((2, len(kinds), step.agents, step.agents))
     for number, kind in enumerate(kinds):
         matrices[number], noise[number] = _with_losses(observation, step, int(kind[0]), kind[1:])

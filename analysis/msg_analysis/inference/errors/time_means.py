@@ -10,6 +10,7 @@ inside h, and share the part that is due to the jump.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,7 +25,9 @@ from msg_analysis.theory.system.lost_messages import lost_adjoint
 from msg_analysis.types import FloatArray
 
 ROUNDING = 64 * float(np.finfo(float).eps)  # of the largest state: what thousands of steps may leave in differences
-MAX_JOINT = 210  # second moments that are all estimated (d = 20), at most; beyond that, only the node errors
+PARTS = 20  # of a run, whose variances are compared
+MAX_SPREAD = 0.6  # relative standard error of the variance that follows from these parts, at most
+MIN_SWITCHES = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,11 +43,23 @@ class TimeMeans:
     measured: FloatArray  # (q,) time means, replicas averaged
     predicted: FloatArray  # (q,) their exact expectation for the run's start and length
     covariance: FloatArray  # (q, q) of measured, under the model
-    squares: int  # steps whose squares make up ``covariance``; 0 where it is known from the model
     nodes: FloatArray  # (m, q) the node errors as combinations of the functions; (0, q) where these are too many
     trace: FloatArray  # (q,) the system error as a combination of the functions
     system_series: FloatArray  # (N,) system error of every step, replicas averaged
     system_variances: FloatArray  # (N,) Var(D_k | y_k, g_k) of the system error, or its estimate with lost messages
+    # Expected number of switches away from the graph with the fewest; infinite where the path is given or certain
+    switches: float = math.inf
+
+    @property
+    def long_enough(self) -> bool:
+        """Whether the errors of such runs are nearly normal: many sojourns, none of which decides the variance."""
+        if math.isinf(self.switches):
+            return True
+        if self.switches < MIN_SWITCHES or len(self.system_variances) < PARTS:
+            return False
+        parts = np.array([part.sum() for part in np.array_split(self.system_variances, PARTS)])
+        total = float(parts.sum())
+        return total > 0.0 and float((parts / total).std(ddof=1)) * math.sqrt(PARTS) <= MAX_SPREAD
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,8 +183,7 @@ def time_means(observation: Observation) -> TimeMeans:
     """
     system, steps = observation.prediction.system, observation.steps
     p = packed_symmetric.size(system.dimension)
-    joint = p <= MAX_JOINT
-    forms, nodes, trace = forms_of(system, "joint" if joint else "nodes")
+    forms, nodes, trace = forms_of(system, "nodes")
 
     values = values_of(observation.prediction, forms)
     totals = np.zeros((system.modes, p + 1))
@@ -198,16 +212,25 @@ def time_means(observation: Observation) -> TimeMeans:
     return TimeMeans(
         second_moments=packed_symmetric.unpack(seen, system.dimension),
         expected_moments=expected,
-        joint=joint,
+        joint=False,
         measured=forms @ seen,
         predicted=forms @ packed_symmetric.pack(expected),
         covariance=covariance / steps**2,
-        squares=0 if system.loss_variance is None else steps,
         nodes=nodes,
         trace=trace,
         system_series=series,
         system_variances=variances,
+        switches=_expected_switches(observation),
     )
+
+
+def _expected_switches(observation: Observation) -> float:
+    """``TimeMeans.switches``: in the steady state."""
+    step = observation.step
+    if step.modes == 1:
+        return math.inf
+    leaving = step.stationary * (1.0 - np.diag(step.transition))
+    return float(observation.steps * leaving.min())
 
 
 def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedValue]:

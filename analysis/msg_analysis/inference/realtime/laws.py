@@ -147,6 +147,8 @@ def _continuous(observation: Observation, sequential: Estimate, level: float, la
     if law is None:
         return Law(Estimate(sequential.measured), None, "not available for this experiment")
     predicted = law.system_error
+    if sequential.standard_error is None:
+        return Law(Estimate(sequential.measured, predicted), None, "the run is too short to test this law")
     if not sequential.standard_error or sequential.measured is None or not predicted:
         return Law(Estimate(sequential.measured, predicted), None, "without noise the errors cannot be tested")
     if experiment.run.start != "stationary":
@@ -173,6 +175,8 @@ def _least(observation: Observation, means: TimeMeans) -> tuple[Estimate, float 
     """The system error, and the smallest adjusted p-value of all tests of the second moments."""
     system = observation.prediction.system
     error, nodes = estimates(means, system)
+    if not means.long_enough:
+        return error.without_error(), None
     tests = [error.p, *(node.p for node in nodes), covariance_test(means, system).p]
     tested = np.array([p for p in tests if p is not None], dtype=float)
     return error, float(holm(tested).min()) if len(tested) else None

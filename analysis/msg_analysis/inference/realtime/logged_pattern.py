@@ -6,8 +6,12 @@ are independent. With z(K) the stack of ``pattern_events``,
     z(K) = A_K z(K-1) + noise N_K,     M(K) = E[z z^T] = A_K M(K-1) A_K^T + N_K,     Y(K-1) = H + A_K^T Y(K) A_K.
 
 M gives the exact expectation of the time mean. For quadratic forms H the dual Y gives E[sum of what is still to come |
-z], with martingale increments D: E[Cov(D_a, D_b)] = tr( Y_a N Y_b (4 M(K) - 2 N) ) / R. M is computed forwards, Y
-backwards, in blocks: going backwards, the M of a block are computed again from its beginning.
+z], with martingale increments D. The covariance of their sum is estimated by the sum of
+
+    Cov(D_a, D_b | z(K-1)) = tr( Y_a N Y_b (2 N + 4 A z z^T A^T) ) / R
+
+as in ``errors.given_path``; where z contains noise, which is not logged, z z^T is replaced by its expectation M(K-1).
+M is computed forwards, Y backwards, in blocks: going backwards, the M of a block are computed again from its beginning.
 """
 
 from __future__ import annotations
@@ -113,7 +117,6 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
         measured=forms @ (seen / steps),
         predicted=forms @ packed_symmetric.pack(expected),
         covariance=covariance / (observation.replicas * steps**2),
-        squares=0,
         nodes=nodes,
         trace=trace,
         system_series=series,
@@ -136,9 +139,14 @@ def _follow(
         for number in range(first + 1, last):
             moments_of.append(_next(periods, number, moments_of[-1]))
         for number in range(last - 1, max(first, 1) - 1, -1):
-            period, moment = periods[number], moments_of[number - first]
+            period, before = periods[number], periods.stack(number - 1)
+            if before is None:
+                spread = 4.0 * moments_of[number - first] - 2.0 * period.noise
+            else:
+                after = period.matrix @ before
+                spread = 2.0 * period.noise + 4.0 * after @ after.T / after.shape[1]
             left = (dual @ period.noise).reshape(q, -1)
-            right = ((4.0 * moment - 2.0 * period.noise) @ dual).reshape(q, -1)
+            right = (spread @ dual).reshape(q, -1)
             here = left @ right.T
             covariance += here
             variances[number] = trace @ here @ trace

@@ -44,7 +44,8 @@ class Periods:
         self._shared = _shared_sources(step)
         graphs, used, made = observation.timers.graphs, observation.timers.used, observation.timers.made
         steps, m = graphs.shape
-        newest = newest_steps(observation)[:steps]
+        self._observation, self._newest = observation, newest_steps(observation)[:steps]
+        newest = self._newest
         period = np.searchsorted(sampling_times(observation)[:steps], made[1:], side="left")  # N: not seen
         agents = np.arange(m)
         senders = neighbour_tables(step).senders[graphs, agents]
@@ -90,6 +91,20 @@ class Periods:
     def entries(self, number: int) -> int:
         """Entries of the stack at sampling time ``number``, from 0."""
         return self._step.agents + int(self._extra_ends[number + 1] - self._extra_ends[number])
+
+    def stack(self, number: int) -> FloatArray | None:
+        """(S, R): the stack at sampling time ``number``, as logged; None where it contains noise, which is not."""
+        if self._shared.any():
+            return None
+        step, m = self._step, self._step.agents
+        extra = self._extra[self._extra_ends[number] : self._extra_ends[number + 1]]
+        agents = np.concatenate([np.arange(m), extra[:, 0]])
+        steps = self._newest[number, agents]
+        steps[m:] += extra[:, 1]
+        found = self._observation.states[steps, agents] - step.reference
+        # In consensus the common part does not count, and can be large.
+        consensus = self._observation.prediction.experiment.problem == "consensus"
+        return np.asarray(found - found.mean(axis=0) if consensus else found)
 
     def __getitem__(self, number: int) -> Period:
         """The period that ends at sampling time ``number`` (1..N-1)."""

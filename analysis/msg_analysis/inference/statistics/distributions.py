@@ -37,11 +37,6 @@ def student_quantile(below: Any, dof: Any) -> Any:
     return special.stdtrit(dof, below)
 
 
-def fisher_tail(x: Any, dof: Any, dof_below: Any) -> Any:
-    """P(F > x) of a ratio of mean squares with ``dof`` and ``dof_below`` degrees of freedom."""
-    return special.fdtrc(dof, dof_below, x)
-
-
 def gamma_tail(x: Any, shape: Any, scale: Any) -> Any:
     """P(X > x) of a gamma variable."""
     return special.gammaincc(shape, x / scale)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from msg_analysis.inference.blame.causes import Accused, Cause, find_causes
 from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate, covariance_test, estimates
+from msg_analysis.inference.errors.given_path import GivenPath
 from msg_analysis.inference.errors.ranking import rank_agents
 from msg_analysis.inference.errors.time_means import TimeMeans
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
@@ -22,6 +24,7 @@ from msg_analysis.inference.verdict.comparison import Comparison, Test
 from msg_analysis.inference.verdict.evidence import Evidence
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray, IntArray
 
 MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
@@ -73,17 +76,15 @@ def judge(
     Of several runs, ``trajectory`` is one with the completeness of all.
     """
     means = evidence.means
-    system_error, node_errors = estimates(means, prediction.system)
-    covariance = covariance_test(means, prediction.system)
+    system_error, node_errors = _over_all_paths(means, prediction.system)
+    covariance = _covariance(evidence, prediction.system)
     innovations = evidence.innovations.tests()
     switching = evidence.transitions.test(prediction.step.transition)
     loss = evidence.loss.test() if evidence.loss else None
     p_broadcast = evidence.broadcast.p_value() if evidence.broadcast else None
-    errors = [("system error", system_error.p)]
-    errors += [(f"error of agent {i}", node.p) for i, node in enumerate(node_errors, start=1)]
-    errors += [("covariance", covariance.p)]
-    family = errors if evidence.decisive else []
-    family += [
+    family = [
+        *_error_tests(evidence.exact, prediction.system),
+        ("covariance", covariance.p if evidence.decisive else None),
         ("innovations: covariance", innovations.p_covariance),
         ("innovations: whiteness", innovations.p_whiteness),
         ("innovations: gains", innovations.p_gain),
@@ -115,10 +116,34 @@ def judge(
         p_broadcast=p_broadcast,
         timing=evidence.timing,
         laws=evidence.laws,
-        given=evidence.given,
-        order=rank_agents(means, level),
+        given=GivenPath(means, evidence.given) if evidence.given else None,
+        order=rank_agents(means, level) if means.long_enough else None,
         blame=blame,
     )
+
+
+def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:
+    """The system error and the node errors; without standard errors where the run is too short for these."""
+    error, nodes = estimates(means, system)
+    if means.long_enough:
+        return error, nodes
+    return error.without_error(), [node.without_error() for node in nodes]
+
+
+def _error_tests(laws: Sequence[TimeMeans], system: JumpSystem) -> list[tuple[str, float | None]]:
+    """Names and p-values of the tests of the errors; ``laws`` in the order of preference."""
+    if not laws:
+        return []
+    system_error, nodes = estimates(next((law for law in laws if len(law.nodes)), laws[0]), system)
+    named = [(f"error of agent {i}", node.p) for i, node in enumerate(nodes, start=1)]
+    return [("system error", system_error.p), *named]
+
+
+def _covariance(evidence: Evidence, system: JumpSystem) -> CovarianceTest:
+    """The second moments and their expectation over all paths, tested given the path."""
+    shown = covariance_test(evidence.means, system)
+    tested = covariance_test(evidence.given, system) if evidence.given else shown
+    return replace(tested, measured=shown.measured, predicted=shown.predicted)
 
 
 def _accused(prediction: Prediction, evidence: Evidence) -> Accused:
@@ -199,10 +224,11 @@ def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
 def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:
     """Mean of the system error up to some steps, denser at the beginning, and its standard error."""
     counts = _spaced(len(means.system_series))
+    errors = np.sqrt(np.cumsum(means.system_variances)[counts - 1]) / counts
     return {
         "time": np.asarray(counts * dt, dtype=float),
         "system_error": np.cumsum(means.system_series)[counts - 1] / counts,
-        "standard_error": np.sqrt(np.cumsum(means.system_variances)[counts - 1]) / counts,
+        "standard_error": errors if means.long_enough else np.zeros(len(counts)),
     }
 
 

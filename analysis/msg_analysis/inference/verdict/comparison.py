@@ -57,6 +57,7 @@ class Member:
     steps: int  # used: all, or those before the first gap; 0 where these are too few
     completeness: Completeness
     system_error: Estimate
+    tested: Estimate  # the same, corrected for the path of the graphs where that is known
     verdict: str  # on this run alone
 
     def to_json(self) -> dict[str, Any]:
@@ -103,7 +104,8 @@ class Comparison:
     steps
         steps used: all, or those before the first gap
     system_error, node_errors, covariance, innovations, switching
-        estimates and tests; ``switching`` is None where too few steps arrived
+        estimates and tests; ``switching`` is None where too few steps arrived. The errors have standard errors over all
+        paths of the graphs, if the run is long enough for these
     continuous_error
         the paper's continuous-time system error; None where it has none
     batch
@@ -112,7 +114,7 @@ class Comparison:
         the family, in the order of the report
     running
         "time" [units of simulated time], and the mean of the system error up to then with its standard error (0 without
-        a prediction): "system_error", "standard_error"; (T,) each, T at most 400
+        a prediction, and in runs that are too short for it): "system_error", "standard_error"; (T,) each, T at most 400
     loss
         test of the lost messages; None where none can be lost
     p_broadcast
@@ -127,7 +129,7 @@ class Comparison:
     given
         errors given the path of the graphs; None where they are not computed
     order
-        which agents have smaller errors than which; None where that is not known
+        which agents have smaller errors than which; None where the run is too short to know
     blame
         what is wrong, where the verdict is "disagrees"
     pool

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msg_analysis.inference.errors.given_path import GivenPath, given_path
+from msg_analysis.inference.errors.given_path import means_given_path
 from msg_analysis.inference.errors.time_means import TimeMeans, time_means
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
 from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import BroadcastSums, LossTally
@@ -22,15 +22,24 @@ class Evidence:
     """Sums over the steps of runs; those of several runs of one experiment are added up."""
 
     steps: int
-    means: TimeMeans  # time means, and their expectation
+    means: TimeMeans  # time means, and their expectation over all paths of the graphs; in real time: given the log
     decisive: bool  # whether the law that the means are compared with is exact
-    given: GivenPath | None  # None where it is not computed
+    given: TimeMeans | None  # with their expectation given the path; None where it is not computed
     innovations: InnovationSums
     transitions: Transitions
     loss: LossTally | None  # None without loss
     broadcast: BroadcastSums | None  # None without broadcast noise
     timing: Timing | None = None  # of one run in real time
     laws: Laws | None = None  # of one run in real time
+
+    @property
+    def exact(self) -> list[TimeMeans]:
+        """The errors next to the laws that they can be tested against, the preferred one first.
+
+        In lockstep that given the path, which holds for every run, before that over all paths, which needs long runs.
+        """
+        laws = [self.given] if self.given else []
+        return [*laws, *([self.means] if self.means.long_enough else [])] if self.decisive else []
 
     @classmethod
     def of(cls, observation: Observation, level: float) -> Evidence:
@@ -42,7 +51,7 @@ class Evidence:
             means, laws = measure_laws(observation, order, timing, level)
         else:
             means = time_means(observation)
-            given = given_path(observation, means)
+            given = means_given_path(observation)
         return cls(
             steps=observation.steps,
             means=means,
@@ -69,7 +78,7 @@ class Evidence:
             self.broadcast.merge(other.broadcast)
         given = None
         if self.given and other.given:
-            given = _merged_given(self.given, self.steps, other.given, other.steps)
+            given = _merged_means(self.given, self.steps, other.given, other.steps)
         return replace(
             self,
             steps=self.steps + other.steps,
@@ -93,9 +102,9 @@ def _merged_means(one: TimeMeans, steps: int, other: TimeMeans, more: int) -> Ti
         measured=a * one.measured + b * other.measured,
         predicted=a * one.predicted + b * other.predicted,
         covariance=a**2 * one.covariance + b**2 * other.covariance,
-        squares=one.squares + other.squares,
         system_series=np.concatenate([one.system_series, other.system_series]),
         system_variances=np.concatenate([one.system_variances, other.system_variances]),
+        switches=one.switches + other.switches,
     )
 
 
@@ -111,15 +120,4 @@ def _coarser(means: TimeMeans, other: TimeMeans) -> TimeMeans:
         covariance=combinations @ means.covariance @ combinations.T,
         nodes=np.eye(count) if count > 1 else np.empty((0, 1)),
         trace=np.ones(count),
-    )
-
-
-def _merged_given(one: GivenPath, steps: int, other: GivenPath, more: int) -> GivenPath:
-    a, b = steps / (steps + more), more / (steps + more)
-    return GivenPath(
-        measured=a * one.measured + b * other.measured,
-        expected=a * one.expected + b * other.expected,
-        predicted=a * one.predicted + b * other.predicted,
-        covariance=a**2 * one.covariance + b**2 * other.covariance,
-        unconditional=a**2 * one.unconditional + b**2 * other.unconditional,
     )

@@ -71,10 +71,12 @@ def _examine(name: str, run: Trajectory, prediction: Prediction, level: float) -
     observation = Observation.of(run, own)
     if observation.steps < compare.MIN_STEPS and not run.completeness.complete:
         missing = Estimate(predicted=prediction.emulated.system_error)
-        return Member(name, run.record, 0, run.completeness, missing, "incomplete"), None
+        return Member(name, run.record, 0, run.completeness, missing, missing, "incomplete"), None
     evidence = Evidence.of(observation, level)
     alone = compare.judge(run, own, evidence, level)
-    return Member(name, run.record, evidence.steps, run.completeness, alone.system_error, alone.verdict), evidence
+    tested = alone.given.system_error if alone.given else alone.system_error
+    member = Member(name, run.record, evidence.steps, run.completeness, alone.system_error, tested, alone.verdict)
+    return member, evidence
 
 
 def _require_prediction(name: str, experiment: ValidExperiment) -> None:
@@ -143,7 +145,7 @@ def _pool(members: list[Member]) -> Pool:
     """Test whether measured - expected is the same in all runs: Cochran's Q."""
     z, errors = [], []
     for member in members:
-        error = member.system_error
+        error = member.tested
         if error.z is not None and error.standard_error:
             z.append(error.z)
             errors.append(error.standard_error)

@@ -73,6 +73,17 @@ def sentence(words: str) -> str:
     return f"{words[:1].upper()}{words[1:]}."
 
 
+def agent_errors(document: dict[str, Any]) -> tuple[list[dict[str, Any]], bool]:
+    """The agent errors, and whether they are corrected for the path of the graphs.
+
+    They are where only these have intervals: in runs that are too short for intervals over all paths.
+    """
+    given = (document.get("given_path") or {}).get("node_errors") or []
+    if document["system_error"].get("standard_error") is None and given:
+        return given, True
+    return document["node_errors"] or [], False
+
+
 def agent_order(document: dict[str, Any]) -> list[str]:
     """Which agents are more certain than which, in sentences; empty where that is not known."""
     if not document.get("order"):

@@ -50,10 +50,13 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
     data = {"time": time, "mean": mean, "low": low, "high": high, "z": (mean - centre) / np.where(error > 0, error, 1)}
     source = ColumnDataSource(data)
     rows = [("time", "@time{0.[00]}"), ("measured up to this time", "@mean{0.0000}")]
-    if predicted is not None:
+    if error.any():
         plot.varea("time", "low", "high", source=source, color=SKY, alpha=0.3, legend_label="95 % band")
+    if predicted is not None:
         plot.line(time, np.full(len(time), predicted), color=BLACK, line_dash="dashed", legend_label="predicted")
-        rows += [("predicted", f"{predicted:.4g}"), ("95 % band", "@low{0.0000} … @high{0.0000}"), ("z", "@z{+0.00}")]
+        rows.append(("predicted", f"{predicted:.4g}"))
+    if error.any():
+        rows += [("95 % band", "@low{0.0000} … @high{0.0000}"), ("z", "@z{+0.00}")]
     line = plot.line("time", "mean", source=source, color=BLUE, line_width=2, legend_label="measured up to this time")
     plot.add_tools(HoverTool(renderers=[line], mode="vline", tooltips=rows, line_policy="nearest"))
     # The earliest values are mostly noise, and would flatten the rest.

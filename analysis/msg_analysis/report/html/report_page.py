@@ -29,6 +29,7 @@ from msg_analysis.report.documents.comparison_words import (
     QUANTILES,
     REAL_TIME_LAWS,
     TIMES,
+    agent_errors,
     agent_order,
     furthest,
     sentence,
@@ -99,6 +100,7 @@ def render(
         explanation=_explanation(document),
         blame=[sentence(cause["words"]) for cause in document["blame"]],
         order=agent_order(document),
+        agents=agent_errors(document),
         experiment=experiment,
         versions=trajectory.record.versions,
         plots={name: Markup(div) for name, div in divs.items()},
@@ -133,7 +135,7 @@ def _models(
     experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
     models: dict[str, UIElement | None] = {
-        "nodes": error_plots.node_errors(document["node_errors"], document["level"]),
+        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"]),
         "covariance": error_plots.covariances(_matrix(covariance["measured"]), _matrix(covariance["predicted"])),
     }
     if len(comparison.running["time"]) > 1:
@@ -148,7 +150,7 @@ def _models(
             reference = None if experiment.problem == "consensus" else experiment.reference
             states = bounded(trajectory.values[:steps])
             models["agents"] = error_plots.agent_convergence(
-                states, reference, experiment.step_length, document["node_errors"]
+                states, reference, experiment.step_length, agent_errors(document)[0]
             )
     if ratios is not None and any(ratio is not None for ratio in ratios):
         sizes = np.array(ratios, dtype=float)  # None: nan
@@ -161,7 +163,7 @@ def _models(
 
 def _first_agents(document: dict[str, Any]) -> list[int]:
     """The agents (from 1, ascending) whose convergence is drawn at first: those with the largest abs(z)."""
-    return sorted(agent + 1 for agent in furthest([node["z"] for node in document["node_errors"]], _FIRST_LINES))
+    return sorted(agent + 1 for agent in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES))
 
 
 def _explanation(document: dict[str, Any]) -> str:

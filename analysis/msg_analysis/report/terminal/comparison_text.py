@@ -16,6 +16,7 @@ from msg_analysis.report.documents.comparison_words import (
     QUANTILES,
     REAL_TIME_LAWS,
     TIMES,
+    agent_errors,
     agent_order,
     gaps,
     sentence,
@@ -111,8 +112,9 @@ def _print_errors(document: dict[str, Any], console: Console) -> None:
     row("system", document["system_error"], end_section=not given)
     if given:
         row("system, given the path", given["system_error"], end_section=True)
-    for agent, entry in enumerate(first_rows(table, document["node_errors"] or [], "agents"), start=1):
-        row(f"agent {agent}", entry)
+    agents, corrected = agent_errors(document)
+    for agent, entry in enumerate(first_rows(table, agents, "agents"), start=1):
+        row(f"agent {agent}, given the path" if corrected else f"agent {agent}", entry)
     console.print(table)
 
 
