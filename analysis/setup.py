@@ -57,5 +57,5 @@ setup(
         "zstandard",
     ],
     extras_require={"test": ["pytest"]},  # by which colcon knows how to test it
-    entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli.main:main"]},
+    entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli.entry_point:msg_analysis"]},
 )

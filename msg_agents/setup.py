@@ -1,6 +1,12 @@
+import sys
+
 from setuptools import find_packages, setup
 
 PACKAGE = "msg_agents"
+NODES = ("agent", "switcher", "recorder", "player", "live", "markers")
+# A wheel puts executables into the user's PATH, where only the command line belongs; colcon and distributions put them
+# into lib/msg_agents (setup.cfg), where `ros2 run` and `ros2 launch` find them.
+WHEEL = {"bdist_wheel", "editable_wheel", "dist_info"} & set(sys.argv)
 
 setup(
     name=PACKAGE,
@@ -21,14 +27,10 @@ setup(
     # rclpy, std_msgs and the interfaces come with ROS 2, as system packages or as wheels: see package.xml.
     install_requires=["click", "msg_analysis", "numpy", "rich", "setproctitle", "threadpoolctl"],
     extras_require={"test": ["pytest"]},  # by which colcon knows how to test it
-    # What `ros2 run msg_agents` can run: the command line, and each node by itself.
     entry_points={
         "console_scripts": [
             "msg-agents = msg_agents.cli.entry_points:msg_agents",
-            *(
-                f"{node} = msg_agents.cli.entry_points:{node}"
-                for node in ("agent", "switcher", "recorder", "player", "live", "markers")
-            ),
+            *(f"{node} = msg_agents.cli.entry_points:{node}" for node in (() if WHEEL else NODES)),
         ]
     },
 )

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from msg_analysis.common.version import __version__ as __version__
-
 if TYPE_CHECKING:
     from msg_analysis.api import BagError as BagError
     from msg_analysis.api import Comparison as Comparison
@@ -26,6 +24,7 @@ if TYPE_CHECKING:
     from msg_analysis.api import compare as compare
     from msg_analysis.api import read_bag as read_bag
     from msg_analysis.api import write_report as write_report
+    from msg_analysis.common.version import __version__ as __version__
 
 __all__ = [
     "BagError",
@@ -46,6 +45,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from msg_analysis.common import version
+
+        return version.__version__
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from msg_analysis import api

@@ -1,6 +1,6 @@
 """``python -m msg_analysis`` is ``msg-analysis``."""
 
-from msg_analysis.cli.main import main
+from msg_analysis.cli.entry_point import msg_analysis
 
 if __name__ == "__main__":
-    main(prog_name="msg-analysis")
+    msg_analysis()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import random
+import re
 import signal
 import time
 from typing import Any
@@ -12,8 +14,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.report.terminal.saved_results import read_result
 from msg_analysis.twin.check import check
 
+NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 LONG = {"duration": 10_000, "replicas": 1, "processes": 2}  # 200,000 steps: no test waits for them
 
 
@@ -27,12 +31,15 @@ def test_in_the_middle(network: Any, repetition: int, rng: random.Random) -> Non
     stdout, stderr = run.communicate(timeout=60)
     assert run.returncode == 3, stderr
     assert network.processes() == []
-    assert f"ended by {number.name}" in stderr
-    assert "last recorded step: agent 1: " in stderr
+    assert re.search(rf"^failed: stopped by {NAMES[number]} at step \d+ of 200000$", stderr, re.M)
     assert "Traceback" not in stderr
     assert stdout.count("\n") == 1  # one JSON object
 
     (bag,) = (network.directory / "runs").iterdir()
+    result = json.loads(stdout)
+    assert (result["verdict"], result["bag"], result["report"]) == ("incomplete", str(bag), None)
+    assert result == json.loads((bag / "result.json").read_text())
+    assert read_result(bag).verdict == "incomplete"  # as `msg-analysis tabulate` does
     custom = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]["custom_data"]
     assert custom["complete"] == "false"
     assert "salvaged" not in custom
@@ -53,9 +60,27 @@ def test_before_anything_has_begun(network: Any, repetition: int, rng: random.Ra
     run.send_signal(number)
     _, stderr = run.communicate(timeout=60)
     assert run.returncode == 3, stderr
-    assert f"ended by {number.name}" in stderr
+    assert f"failed: stopped by {NAMES[number]} " in stderr
     assert "Traceback" not in stderr
     assert network.processes() == []
+
+
+def test_while_the_run_is_compared_with_the_prediction(network: Any) -> None:
+    """The network has ended; the user does not wait for the verdict. The bag is whole, and can be compared later."""
+    graphs = {"line": {"path": list(range(1, 31))}, "ring": {"cycle": list(range(1, 31))}}
+    file = network.file(graphs=graphs, run={"duration": 100, "replicas": 1, "processes": 1})
+    run = network.start("run", file, "--out", network.directory / "runs", "--json")
+    network.wait_for(lambda: list(network.directory.glob("runs/*/log/run.json")), 60, "the end of the network")
+    time.sleep(0.2)
+    run.send_signal(signal.SIGINT)
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert stderr.splitlines()[-1] == "failed: stopped by Ctrl-C while the run was compared with the prediction"
+    (bag,) = (network.directory / "runs").iterdir()
+    result = json.loads(stdout)
+    assert (result["verdict"], result["bag"], result["report"]) == ("incomplete", str(bag), None)
+    assert result == json.loads((bag / "result.json").read_text())
+    assert read_bag(bag).completeness.complete
 
 
 def test_a_killed_runner_takes_everybody_along(network: Any) -> None:

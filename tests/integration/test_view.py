@@ -60,7 +60,7 @@ def test_panel_and_ctrl_c(network: Any, terminal: Any) -> None:
     network.wait_for(lambda: screen.read(0.1) and _bottom(screen) == 40, 5, "a narrow panel")
     screen.type(b"\x03")
     assert screen.read_to_the_end() == 3
-    assert "ended by SIGINT" in _plain(screen.text)
+    assert "stopped by Ctrl-C at step " in _plain(screen.text)
     assert "Traceback" not in screen.text
     assert screen.text.rindex(SHOW_CURSOR) > screen.text.rindex(HIDE_CURSOR)
     assert screen.mode() == screen.before
@@ -135,7 +135,7 @@ def test_page_of_a_run_in_time_and_two_browsers(network: Any, page: Any) -> None
     assert len(set(fills)) > 1
     run.send_signal(signal.SIGINT)
     page.wait_for_selector("body[data-over=yes]")
-    assert "ended by SIGINT" in page.inner_text("#state")
+    assert "stopped by Ctrl-C at step " in page.inner_text("#state")
     assert log.complaints == []
     run.communicate(timeout=60)
     assert run.returncode == 3

@@ -6,6 +6,7 @@ input, 3 incomplete data. Modules that take long to import are imported by the c
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -38,6 +39,7 @@ from msg_analysis.common.text.json_numbers import json_text
 if TYPE_CHECKING:
     from msg_agents.running.runner import RunResult
     from msg_analysis.bags.format.storage_options import Compression
+    from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
 @click.group(cls=CommandGroup)
@@ -174,16 +176,24 @@ def _end(
     """Print the failures, judge what was recorded, show the result, and exit with its code."""
     from msg_agents.running.runner import conclude
 
-    for line in result.failures:
-        complain(line, "failed:")
-    if analyse:
-        conclude(result)
+    _complain(result)
+    if analyse and not result.interrupted:
+        try:
+            conclude(result)
+        except KeyboardInterrupt:
+            result.interrupt(signal.SIGINT, "while the run was compared with the prediction")
+            _complain(result)
     say(_ending(result))
     _show(result, as_json)
     if _incomplete(result) or (analyse and result.bag is not None and result.comparison is None):
         sys.exit(ExitCode.INCOMPLETE)
     if result.comparison is not None:
         sys.exit(result.comparison.exit_code)
+
+
+def _complain(result: RunResult) -> None:
+    for line in result.failures:
+        complain(line, "failed:")
 
 
 def _incomplete(result: RunResult) -> bool:
@@ -210,8 +220,10 @@ def _show(result: RunResult, as_json: bool) -> None:
     document: dict[str, Any] = {"verdict": "incomplete" if _incomplete(result) else None}  # None: nothing to judge
     if result.comparison is not None:
         document = dict(result.comparison.to_json())
+    elif result.interrupted:
+        document |= _without_comparison(result.experiment)
     document |= {
-        "bag": str(result.bag) if result.trajectory else None,
+        "bag": str(result.bag) if result.recorded else None,
         "report": str(result.bag / REPORT_FILE) if result.bag and result.comparison else None,
         "rate": result.rate,
         "wall_time": result.wall_time,
@@ -219,7 +231,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         "strangers": result.strangers,
         "failures": result.failures,
     }
-    if result.bag is not None and result.comparison is not None:
+    if result.bag is not None and (result.comparison is not None or (result.interrupted and result.recorded)):
         write_whole(result.bag / RESULT_FILE, json_text(document, 1).encode() + b"\n")
     if as_json:
         print_json(document)
@@ -231,8 +243,23 @@ def _show(result: RunResult, as_json: bool) -> None:
         click.echo(f"bag:    {document['bag']}\nreport: {document['report']}")
     elif document["bag"]:
         click.echo(f"bag: {document['bag']}")
+        if result.interrupted and result.reached > 0:
+            click.echo(f"To compare what it holds with the prediction: msg-analysis compare {document['bag']}")
     if result.rate:
         click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
+
+
+def _without_comparison(experiment: ValidExperiment) -> dict[str, Any]:
+    """What `msg-analysis tabulate` reads of a result, without numbers."""
+    from msg_analysis.inference.errors.estimates import Estimate
+
+    return {
+        "experiment": experiment.name,
+        "leaders": (experiment.leader_gains.nonzero()[0] + 1).tolist(),
+        "seed": experiment.run.seed,
+        "simulated_time": 0.0,
+        "system_error": Estimate().to_json(),
+    }
 
 
 @main.command(epilog=examples("msg-agents check runs/line_ring_20250101_120000", "msg-agents check"))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from msg_agents.processes.core_pinning import place
 from msg_agents.processes.environment import LOGS_VARIABLE, RESTARTS, can_log, node_environment
 from msg_agents.processes.fork_server import ForkServer
-from msg_agents.processes.process_plan import Share, count_processes, plan_network
+from msg_agents.processes.process_plan import SWITCHER, Share, count_processes, plan_network
 from msg_agents.processes.ros_domain import free_domain
 from msg_agents.recovery.checkpoint import room_for
 from msg_agents.running.run_folder import workshop
@@ -50,12 +50,14 @@ class RunResult:
 
     Attributes
     ----------
+    experiment
+        what was run
     bag
         directory; None if nothing was to be recorded on this host
     failures
         what went wrong, one line each
     interrupted
-        whether a signal (Ctrl-C, for example) ended the run
+        whether a signal (Ctrl-C, for example) ended the run, or the comparison; then the bag is not read
     wall_time
         s from the first state of the slowest agent to its last one, as reported a few times a second
     rate
@@ -64,12 +66,15 @@ class RunResult:
         processes that were killed, or crashed, and were started again, one line each
     strangers
         messages that the nodes refused: dictionaries with "node", "topic", "reason", "count"
+    reached
+        newest step of the slowest agent, as last reported; -1: none
     trajectory
-        states of the bag; None if there is none or it could not be read
+        states of the bag; None if there is none, or it could not be read, or the run was interrupted
     comparison
         with the prediction; None before ``conclude``
     """
 
+    experiment: ValidExperiment
     bag: Path | None
     failures: list[str] = field(default_factory=list)
     interrupted: bool = False
@@ -77,8 +82,22 @@ class RunResult:
     rate: float = 0.0
     restarts: list[str] = field(default_factory=list)
     strangers: list[dict[str, Any]] = field(default_factory=list)
+    reached: int = -1
     trajectory: Trajectory | None = None
     comparison: Comparison | None = None
+
+    @property
+    def recorded(self) -> bool:
+        """Whether there is a bag that can be read, although perhaps not to its end."""
+        if self.trajectory is None and not self.interrupted:
+            return False
+        return self.bag is not None and any(self.bag.glob("*.mcap"))
+
+    def interrupt(self, by: int, during: str) -> None:
+        """Note that the signal ``by`` has ended the run or the comparison."""
+        self.interrupted = True
+        name = "Ctrl-C" if by == signal.SIGINT else signal.Signals(by).name
+        self.failures.insert(0, f"stopped by {name} {during}".rstrip())
 
 
 def make_bag_directory(experiment: ValidExperiment, out: Path) -> Path:
@@ -172,7 +191,7 @@ def run_network(
     count_processes(experiment, None if share is None else len(share.agents))
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
     bag = directory if share is None or share.home else None
-    result = RunResult(bag)
+    result = RunResult(experiment, bag)
     try:
         with workshop() as folder, free_domain() if domain is None else nullcontext(domain) as chosen:
             variables = node_environment(chosen) | dict(environment or {})
@@ -207,7 +226,10 @@ def run_network(
                     _collect_failures(supervisor, result, interruption, restarts)
             result.strangers = supervisor.account().strangers()
             if bag is not None:
-                _settle(bag, result)
+                try:
+                    _settle(bag, result)
+                except KeyboardInterrupt:
+                    result.interrupt(signal.SIGINT, "while the bag was read")
             if directory is not None:
                 _keep_logs(folder, directory / "log", result)
     finally:
@@ -274,9 +296,12 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
 
 
 def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: Interruption, restarts: int) -> None:
+    result.reached = min(supervisor.steps, default=-1)
     if interruption.caught is not None:
-        result.interrupted = True
-        result.failures.append(f"ended by {signal.Signals(interruption.caught).name}")
+        reached, steps = result.reached, result.experiment.steps
+        unknown = all(child.plan.name != SWITCHER for child in supervisor.children)  # it is on another host
+        where = "" if unknown else f"at step {reached} of {steps}" if reached >= 0 else "before step 0"
+        result.interrupt(interruption.caught, where)
     for child in supervisor.failures:
         words = child.last_words()
         line = f"{child.plan.name}: {child.failure}" + (f": {words}" if words else "")
@@ -308,6 +333,8 @@ def _settle(bag: Path, result: RunResult) -> None:
         if result.failures and not any(bag.glob("*.mcap")):
             result.failures.append("nothing was recorded: the run ended before the recorder created a bag")
             return
+        if result.interrupted:  # whoever has stopped the run does not want to wait
+            return
         result.trajectory = read_bag(bag)
     except BagError as error:
         result.failures.append(str(error))
@@ -324,7 +351,7 @@ def _settle(bag: Path, result: RunResult) -> None:
 def conclude(result: RunResult) -> None:
     """Compare the bag of a run with its prediction, and write report.html into the bag.
 
-    Does nothing if there is no bag or it could not be read.
+    Does nothing if there is no bag, or it was not read.
 
     Parameters
     ----------
@@ -341,6 +368,7 @@ def conclude(result: RunResult) -> None:
     from msg_analysis.inference.verdict.compare import compare
     from msg_analysis.report.html.report_page import write_report
 
-    result.comparison = compare(result.trajectory)
+    comparison = compare(result.trajectory)
     report = result.bag / REPORT_FILE
-    write_report(result.comparison, result.trajectory, report, restarts=result.restarts, strangers=result.strangers)
+    write_report(comparison, result.trajectory, report, restarts=result.restarts, strangers=result.strangers)
+    result.comparison = comparison
