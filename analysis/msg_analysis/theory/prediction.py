@@ -15,6 +15,7 @@ import networkx as nx
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from msg_analysis.common.blas_threads import few_blas_threads
 from msg_analysis.common.text.json_numbers import finite
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
@@ -219,6 +220,7 @@ def _why_no_paper(experiment: ValidExperiment) -> str:
     return "in discrete time" if experiment.time == "discrete" else "with a protocol"
 
 
+@few_blas_threads
 def predict(experiment: ValidExperiment, step: StepModel | None = None) -> Prediction:
     """Steady-state prediction of an experiment (Propositions 2 and 3 of the paper, 7 and 8 in discrete time).
 

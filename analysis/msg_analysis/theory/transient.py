@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from msg_analysis.common.blas_threads import few_blas_threads
 from msg_analysis.errors import InputError
 from msg_analysis.model.step.sequential_law import build_run_model
 from msg_analysis.theory.moments import MomentSolver
@@ -133,6 +134,7 @@ class SolvedTransient:
     unit: float | None  # [units of simulated time] of a step; None in continuous time
 
 
+@few_blas_threads
 def solve_transient(
     experiment: ValidExperiment,
     times: FloatArray,  # (T,) ascending [units of simulated time]

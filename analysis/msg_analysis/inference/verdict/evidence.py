@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from msg_analysis.common.blas_threads import blas_threads
 from msg_analysis.inference.errors.given_path import means_given_path
 from msg_analysis.inference.errors.time_means import TimeMeans, time_means
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
@@ -44,6 +45,11 @@ class Evidence:
     @classmethod
     def of(cls, observation: Observation, level: float) -> Evidence:
         """Evidence of one run; laws of a run in real time are tested at ``level``."""
+        with blas_threads(observation.step.agents):
+            return cls._of(observation, level)
+
+    @classmethod
+    def _of(cls, observation: Observation, level: float) -> Evidence:
         laws, timing, position, given = None, None, None, None
         if observation.timers:
             timing, order = measure_timing(observation), order_events(observation)

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import scipy.sparse.csgraph
 
+from msg_analysis.common.blas_threads import few_blas_threads
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import InputError
@@ -195,6 +196,7 @@ def resolve_law(experiment: ValidExperiment, law: SelectionLaw | None = None) ->
     return law
 
 
+@few_blas_threads
 def system_error(
     experiment: ValidExperiment, agents: list[int], *, law: SelectionLaw | None = None, gain: float = math.inf
 ) -> float:
@@ -233,6 +235,7 @@ def joint_robustness_centrality(
     return 1.0 / error if error > 0.0 else math.inf
 
 
+@few_blas_threads
 def select_leaders(
     experiment: ValidExperiment,
     count: int | None = None,

@@ -1,0 +1,33 @@
+"""Threads of linear algebra: one for small networks, as many as there were for large ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from msg_analysis.common.blas_threads import LARGE, few_blas_threads
+
+
+@dataclass
+class Network:
+    agents: int
+
+
+@few_blas_threads
+def threads(network: Network, size: int, *, more: int = 0) -> set[int]:
+    """Of BLAS, while this runs."""
+    assert np.ones((size, size + more)) @ np.ones(size + more) == pytest.approx((size + more) * np.ones(size))
+    assert network.agents > 0
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_small_networks_have_one_thread() -> None:
+    with threadpool_limits(3, user_api="blas"):
+        before = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+        assert threads(Network(LARGE - 1), 2, more=1) == {1}
+        assert threads(Network(LARGE), 2) == before
+        assert threads(Network(5), 2) == {1}
+        assert {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"} == before
