@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import signal
@@ -81,6 +82,21 @@ def test_while_the_run_is_compared_with_the_prediction(network: Any) -> None:
     assert (result["verdict"], result["bag"], result["report"]) == ("incomplete", str(bag), None)
     assert result == json.loads((bag / "result.json").read_text())
     assert read_bag(bag).completeness.complete
+
+
+def test_agents_that_are_interrupted_say_nothing(network: Any) -> None:
+    """A signal shuts rclpy down between two calls of a callback, and what is then published is no error of ours."""
+    fast = {"duration": 10_000, "replicas": 1, "processes": 2, "pace": "realtime", "speed": 60.0}
+    run = network.start("run", network.file(run=fast), "--out", network.directory / "runs", "--json", "--restarts", "0")
+    network.wait_until_moving()
+    agents = network.processes("agent")
+    for process in agents:
+        os.kill(process.pid, signal.SIGINT)
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    (bag,) = (network.directory / "runs").iterdir()
+    for log in (bag / "log").glob("*.log"):
+        assert not re.search("FATAL|Traceback|Error", log.read_text()), log
 
 
 def test_a_killed_runner_takes_everybody_along(network: Any) -> None:

@@ -106,6 +106,20 @@ def test_a_busy_machine_is_no_wrong_theory(network: Any) -> None:
         assert comparison.laws.sequential.supported is False
 
 
+def test_sojourns_of_one_step(network: Any) -> None:
+    """They are over before they arrive: agents go on with the next ones, and nothing is refused.
+
+    Between two graphs of 1.3 steps on average, an agent that had missed one would have kept its graph for ever.
+    """
+    fast = {"switching": {"generator": [[-20.0, 20.0], [20.0, -20.0]]}}
+    result = network.run(network.experiment(**fast, run={**REALTIME, "speed": 30, "duration": 60, "processes": 2}))
+    assert result.failures == []
+    assert result.strangers == []
+    assert_possible(result.trajectory)
+    changes = np.diff(result.trajectory.agent_modes[1:], axis=0) != 0
+    assert (changes.sum(axis=0) >= 20).all()  # of some 800; on a busy machine agents make many steps at once
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -10,6 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from msg_agents.nodes.ros.lean_node import LeanNode
+from msg_agents.nodes.ros.rclpy_error import until_shutdown
 from msg_agents.nodes.ros.timers import every
 from msg_agents.processes.status_file import write_account
 from msg_analysis.wire.refusals import Refusal
@@ -64,7 +65,8 @@ class HealthReporter:
             status=[health.to_status(node, node.refused, node.repeated) for node, health in healths]
         )
         array.header.stamp = self._nodes[0].get_clock().now().to_msg()
-        self._publisher.publish(array)
+        with until_shutdown(self._nodes[0]):
+            self._publisher.publish(array)
         self._waiting = {node.get_name(): health.message if health.waiting else "" for node, health in healths}
         self.write_status_file()
 

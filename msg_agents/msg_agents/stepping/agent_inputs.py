@@ -24,8 +24,6 @@ class AgentInputs(Generic[Value]):
         self.agent, self.step, self.steps = agent, start, steps
         self._inputs = [tuple(row) for row in inputs]
         self._newest = dict.fromkeys(sorted(peers), NOTHING)  # newest step received of each peer
-        # Of the next sojourn; None: any, since a process that takes over starts in the middle.
-        self._sequence: int | None = 0 if start == 0 else None
         missing = {j for row in inputs for j in row} - self._newest.keys()
         if missing:
             raise ValueError(f"agent {agent} uses {sorted(missing)}, which are not among its peers {sorted(peers)}")

@@ -25,27 +25,16 @@ class NewestValues(AgentInputs[Value]):
         self._values: dict[int, Value] = {}
         self._mode: int | None = None
         self._first_step = NOTHING  # of the newest sojourn
-        self._unplanned = 0  # first step that no sojourn covers
 
-    def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
-        """Take a sojourn (steps ``first_step`` to ``last_step``) as the newest; None if taken, else a ``Refusal``.
+    def learn(self, mode: int, first_step: int) -> str | None:
+        """Take a sojourn of the run's path as the newest; None if taken, else a ``Refusal``.
 
-        Sojourns must come in sequence, each where the last one ended, and not before their time.
+        One may be missing before it: it was over before it arrived here.
         """
-        if not 0 <= first_step <= last_step < self.steps:
-            return Refusal.OUT_OF_SEQUENCE
-        if self._sequence is not None:
-            if sequence < self._sequence:
-                return Refusal.REPEATED
-            if sequence != self._sequence or first_step != self._unplanned:
-                return Refusal.OUT_OF_SEQUENCE
-        elif first_step < self._unplanned:
+        if first_step <= self._first_step:
             return Refusal.REPEATED
         if first_step > self._reach():
-            self._sequence = None  # if it is genuine after all, the next one does not follow what we have
             return Refusal.TOO_EARLY
-        self._sequence = sequence + 1
-        self._unplanned = last_step + 1
         self._mode, self._first_step = mode, first_step
         return None
 
@@ -70,7 +59,7 @@ class NewestValues(AgentInputs[Value]):
                 self._newest[j] = NOTHING
                 self._values.pop(j)
         if self._first_step > reach:
-            self._mode, self._sequence, self._unplanned, self._first_step = None, None, 0, NOTHING
+            self._mode, self._first_step = None, NOTHING
 
     def ready(self) -> bool:
         """Whether the next step can be made when it is due."""

@@ -43,6 +43,8 @@ class Synchronizer(AgentInputs[Value]):
         self._buffers: dict[int, dict[int, Value]] = {j: {} for j in self._newest}
         self._limit = window - 1 if self._newest else self.steps
         self._known: deque[_Known] = deque()
+        # Number of the next sojourn; None: any, since a process that takes over starts in the middle.
+        self._sequence: int | None = 0 if self.step == 0 else None
         self._unplanned = self.step  # first step whose graph is not known
         self._mode = 0  # of the next step, if its graph is known
         self._needed: tuple[int, ...] = ()  # by the next step

@@ -133,7 +133,7 @@ class RealtimeAgent(Agent):
 
     def learn(self, graph: ActiveGraph) -> str | None:
         """See Agent."""
-        return self._newest.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step)
+        return self._newest.learn(graph.mode - 1, graph.first_step)
 
     def health(self) -> Health:
         """How late the agent is, or what it waits for."""

@@ -122,7 +122,7 @@ class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
             raise InputError(f"parameter qos_overrides.{final}.{side}: {reason}") from error
 
     def publish(self, publisher: Publisher, data: bytes) -> None:
-        """Publish CDR bytes on a reliable, keep-all publisher, again until they go through.
+        """Publish CDR bytes on a reliable, keep-all publisher, again until they go through, or this process has to end.
 
         A slow reader blocks such a writer; after 100 ms the middleware raises, and the message has not been written.
         """
@@ -132,8 +132,8 @@ class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
                 publisher.handle.publish_raw(data)
                 return
             except RCLError:
-                if not self.context.ok():
-                    raise
+                if not self.context.ok():  # see ``until_shutdown``
+                    return
 
 
 def objection(before: QoSProfile, after: QoSProfile, *, publishes: bool) -> str:

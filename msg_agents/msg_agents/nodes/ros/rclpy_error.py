@@ -1,5 +1,12 @@
 """RCLError, the error of rclpy's C layer, wherever this version of rclpy has it."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rclpy.node import Node
+
 try:
     from rclpy._rclpy_pybind11 import RCLError
 except ImportError:  # rclpy of other distributions
@@ -7,4 +14,17 @@ except ImportError:  # rclpy of other distributions
 
     RCLError = rclpy_implementation.RCLError
 
-__all__ = ["RCLError"]
+__all__ = ["RCLError", "until_shutdown"]
+
+
+@contextmanager
+def until_shutdown(node: Node) -> Iterator[None]:
+    """Drop what cannot be published any more: a signal has shut rclpy down in the middle of a callback.
+
+    The executor would print the error as FATAL, with a stack.
+    """
+    try:
+        yield
+    except RCLError:
+        if node.context.ok():
+            raise

@@ -11,6 +11,7 @@ from builtin_interfaces.msg import Time
 from msg_agents_interfaces.msg import Estimate as EstimateMsg
 from std_msgs.msg import Header
 
+from msg_agents.nodes.ros.rclpy_error import until_shutdown
 from msg_agents.nodes.ros.timers import every
 from msg_agents.nodes.watching.watch_process import Watcher, run_watcher
 from msg_analysis.inference.online.running_errors import LiveEstimate, LiveReport
@@ -82,7 +83,8 @@ class Live(Watcher):
         newest, now = watched.report.newest, time.monotonic()
         before, then = self._before
         self._before = newest, now
-        self._writer.publish(self._message(watched))
+        with until_shutdown(self):
+            self._writer.publish(self._message(watched))
         self._on_report(watched, (newest - before) / max(now - then, 1e-9) if before >= 0 else 0.0)
         last = watched.record.experiment.steps
         assert self._estimate is not None

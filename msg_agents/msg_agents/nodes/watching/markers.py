@@ -10,6 +10,7 @@ from geometry_msgs.msg import Point, Pose, Vector3
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from msg_agents.nodes.ros.rclpy_error import until_shutdown
 from msg_agents.nodes.ros.timers import every
 from msg_agents.nodes.watching.watch_process import Watcher, run_watcher
 from msg_analysis.errors import InputError
@@ -86,7 +87,8 @@ class Markers(Watcher):
         steps = [-1 if state is None else state.step for state in states]
         if steps != self._drawn:
             self._drawn, self._moved = steps, time.monotonic()
-            self._writer.publish(self._picture(states))
+            with until_shutdown(self):
+                self._writer.publish(self._picture(states))
         quiet = time.monotonic() - self._moved > SILENT_TIME
         over = min(steps) >= self.record.experiment.steps or (quiet and (self._ended or not self._has_publishers()))
         if over and not self.done.done():
