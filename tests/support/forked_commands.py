@@ -89,7 +89,8 @@ class _Forker:
 
     def __init__(self) -> None:
         self._control: socket.socket | None = None
-        self._environment: dict[str, str] = {}
+        self._whole = dict(os.environ)  # as it is before any test changes it
+        self._environment = _fixed(self._whole)
 
     def fork_exec(self, *arguments: Any) -> int:
         request = request_of(arguments[0], arguments)
@@ -105,12 +106,11 @@ class _Forker:
 
     def _start(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._environment = _fixed(os.environ)
         same = {"OPENBLAS_NUM_THREADS": "1", MARK: "0" * LENGTH_OF_MARK, "SPT_NOENV": "1"}  # titles leave it readable
         with theirs:
             subprocess.Popen(
                 [sys.executable, __file__, str(theirs.fileno()), " " * LONGEST_TITLE],
-                env=os.environ | same,
+                env=self._whole | same,
                 pass_fds=[theirs.fileno()],
             )
         return ours

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from msg_agents.processes.core_pinning import place
 from msg_agents.processes.environment import LOGS_VARIABLE, RESTARTS, can_log, node_environment
 from msg_agents.processes.fork_server import ForkServer
+from msg_agents.processes.middleware_check import require_middleware
 from msg_agents.processes.process_plan import SWITCHER, Share, count_processes, plan_network
 from msg_agents.processes.ros_domain import free_domain
 from msg_agents.recovery.checkpoint import room_for
@@ -195,6 +196,7 @@ def run_network(
     try:
         with workshop() as folder, free_domain() if domain is None else nullcontext(domain) as chosen:
             variables = node_environment(chosen) | dict(environment or {})
+            require_middleware(variables)
             if not can_log():
                 variables[LOGS_VARIABLE] = str(folder / ROS_LOGS)
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:

@@ -1,0 +1,62 @@
+"""Whether ROS 2 can be used in this environment: asked before the processes of a run start, which would all fail."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+
+from msg_analysis.errors import InputError
+
+# With none of these, rclpy, its libraries and its middleware can only be those of this Python.
+SUSPECTS = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
+PATIENCE = 60.0  # s
+PROBE = """
+import importlib.util, os, warnings
+warnings.simplefilter("ignore")
+print(os.path.dirname(importlib.util.find_spec("rclpy").origin), flush=True)
+import rclpy
+rclpy.init()
+rclpy.shutdown()
+from rclpy.type_support import check_for_type_support
+from msg_agents_interfaces.msg import AgentState
+check_for_type_support(AgentState)
+"""
+
+
+def require_middleware(environment: Mapping[str, str]) -> None:
+    """InputError, with the variable to unset, unless rclpy and the messages can be loaded in this environment.
+
+    It is tried, in a process of its own, only where a variable could lead to another ROS 2 than that of this Python.
+    """
+    present = [name for name in SUSPECTS if environment.get(name)]
+    if not present:
+        return
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-P", "-c", PROBE],
+            env=dict(environment),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=PATIENCE,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return  # a busy machine: the run will say what is wrong
+    if probe.returncode == 0:
+        return
+    wanted = environment.get("RMW_IMPLEMENTATION")
+    found = re.search(r"instead found '(\w+)'", probe.stderr)
+    if wanted and (found or wanted in probe.stderr):
+        has = f"this ROS 2 has {found[1]}" if found else "this ROS 2 cannot load it"
+        raise InputError(f"RMW_IMPLEMENTATION: {wanted}: {has}: unset it, or install that middleware")
+    lines = [line for line in probe.stderr.splitlines() if line.strip()]
+    reason = lines[-1].strip() if lines else f"exit code {probe.returncode}"
+    place = probe.stdout.strip()
+    raise InputError(
+        f"{place or 'rclpy'}: cannot be used ({reason}): {' and '.join(present)} may lead to another ROS 2: unset "
+        f"{'it' if len(present) == 1 else 'them'}, or use a terminal in which no other ROS 2 is sourced"
+    )
