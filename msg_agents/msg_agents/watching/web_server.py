@@ -1,13 +1,16 @@
 """A small page on which browsers follow a run: one HTML file, and server-sent events.
 
 Each browser has a thread of its own, which sends what is newest whenever the browser is ready. A slow or lost browser
-delays nothing; it misses what it is too slow for.
+delays nothing; it misses what it is too slow for. Connections are few, and a request must arrive soon: nothing that a
+browser does may take the file descriptors of the run.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import json
+import re
 import socket
 import threading
 import time
@@ -21,11 +24,14 @@ from typing import Any, Self
 from msg_analysis.common.text.json_numbers import finite
 from msg_analysis.errors import InputError
 
-MOST_BROWSERS = 32
+MOST_BROWSERS = 32  # that follow the run; one more takes the place of the one that has followed longest
+MOST_CONNECTIONS = 64
+REQUEST_TIME = 5.0  # s for a request to arrive
 HISTORY = 600
 """Points of the running error that a browser gets when it connects."""
 SEND_TIMEOUT = 10.0  # s for a browser to take what it is sent
 ALIVE = 5.0  # s after which a comment is sent if there is nothing new, to detect lost browsers
+HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^:@/\[\]]+)(?::\d+)?")  # of a Host header: name, port
 FAREWELL = 1.5  # s for telling the browsers of the end
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
@@ -49,7 +55,7 @@ class WebServer:
         self._moment: dict[str, Any] | None = None
         self._ending: dict[str, Any] | None = None
         self._history: deque[list[float | None]] = deque(maxlen=HISTORY)
-        self._browsers = 0
+        self._browsers: dict[_Handler, None] = {}  # in the order in which they came
         try:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
             self._server = _Server(self, host, port, family)
@@ -114,10 +120,12 @@ class WebServer:
     def follow(self, handler: _Handler) -> None:
         """Send one browser what is newest until the end or until it has gone; runs in that browser's thread."""
         with self._changed:
-            if self._browsers >= MOST_BROWSERS:
-                handler.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"the limit of {MOST_BROWSERS} browsers is reached")
-                return
-            self._browsers += 1
+            if len(self._browsers) >= MOST_BROWSERS:
+                # It may be one that never reads; a browser comes back by itself.
+                longest = next(iter(self._browsers))
+                del self._browsers[longest]
+                longest.hang_up()
+            self._browsers[handler] = None
         try:
             handler.start_events()
             told, number = set[str](), -1
@@ -130,7 +138,7 @@ class WebServer:
                     return
         finally:
             with self._changed:
-                self._browsers -= 1
+                self._browsers.pop(handler, None)
                 self._changed.notify_all()
 
     def _events(self, told: set[str]) -> list[tuple[str, Any]]:
@@ -158,6 +166,9 @@ class _Server(ThreadingHTTPServer):
         page = resources.files("msg_agents.watching") / "pages" / "live.html"
         self.page = page.read_bytes()
         self.names: set[str] | None = None  # allowed in the Host header; None: any
+        # When they were made [s]; None once their request has arrived
+        self._connections: dict[socket.socket, float | None] = {}
+        self._lock = threading.Lock()
         super().__init__((host, port), _Handler)
         address = ipaddress.ip_address(str(self.server_address[0]))
         if address.is_loopback:
@@ -170,8 +181,44 @@ class _Server(ThreadingHTTPServer):
         self.server_address = self.socket.getsockname()
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection in a thread of its own, unless there are too many."""
+        with self._lock:
+            room = len(self._connections) < MOST_CONNECTIONS
+            if room:
+                self._connections[request] = time.monotonic()
+        if room:
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection."""
+        with self._lock:
+            self._connections.pop(request, None)
+        super().shutdown_request(request)
+
+    def service_actions(self) -> None:
+        """End connections whose request does not arrive; called several times a second."""
+        latest = time.monotonic() - REQUEST_TIME
+        with self._lock:
+            for connection, begun in self._connections.items():
+                if begun is not None and begun < latest:
+                    _hang_up(connection)
+
+    def has_arrived(self, connection: socket.socket) -> None:
+        """Note that the request of a connection has arrived."""
+        with self._lock:
+            if connection in self._connections:
+                self._connections[connection] = None
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore browsers that disconnect."""
+
+
+def _hang_up(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -181,10 +228,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Serve the page or the events."""
+        self.server.has_arrived(self.connection)
         path = self.path.partition("?")[0]
         # DNS rebinding: a foreign page whose name has been made to point here must not read this one.
-        name = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
-        if self.server.names is not None and name.lower() not in self.server.names:
+        names = [HOST.fullmatch(host) for host in self.headers.get_all("Host", [])]
+        name = names[0][1].lower() if len(names) == 1 and names[0] else None
+        if self.server.names is not None and name not in self.server.names:
             self.refuse(HTTPStatus.FORBIDDEN, "this page is served under the name of this machine only")
         elif path == "/":
             self._send(HTTPStatus.OK, self.server.page, "text/html; charset=utf-8")
@@ -194,6 +243,15 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.NO_CONTENT, b"", "image/x-icon")
         else:
             self.refuse(HTTPStatus.NOT_FOUND, "not found: only / and /events are served")
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:  # noqa: ARG002
+        """Answer a request that is none, or of another method."""
+        self.request_version = "HTTP/1.0"  # what cannot be read counts as 0.9, whose answers have no headers
+        self.refuse(HTTPStatus(code), message or HTTPStatus(code).phrase)
+
+    def hang_up(self) -> None:
+        """End the connection; from any thread."""
+        _hang_up(self.connection)
 
     def refuse(self, status: HTTPStatus, words: str) -> None:
         """Answer with an error and its reason."""

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import re
 import socket
+import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import click
 import pytest
 from click.testing import CliRunner
+from waiting import wait_for
 
 from msg_agents.cli.main import main
 from msg_agents.cli.web_options import WebCommand, web_options
-from msg_agents.watching.web_server import MOST_BROWSERS, WebServer
+from msg_agents.watching.web_server import MOST_BROWSERS, MOST_CONNECTIONS, WebServer
 from msg_analysis.errors import InputError
 
 MOMENT = {"system": {"measured": 1.5, "predicted": 1.4, "standard_error": 0.1}, "values_step": 7, "reached": 8}
@@ -77,6 +81,9 @@ def test_page(web: WebServer) -> None:
         ("evil.example", 403),
         ("127.0.0.1.evil.example:80", 403),
         ("", 403),
+        ("localhost:8421@evil.example", 403),
+        ("user@localhost", 403),
+        ("localhost:", 403),
     ],
 )
 def test_only_under_our_own_name(web: WebServer, host: str, status: int) -> None:
@@ -142,8 +149,66 @@ def test_not_too_many(web: WebServer) -> None:
     web.begin({"name": "net"})
     streams = [Events(web) for _ in range(MOST_BROWSERS)]
     assert all(stream.next() for stream in streams)
-    assert _get(web, "/events").status == 503
+    one_more = Events(web)
+    assert one_more.next() == ("setting", {"name": "net"})
+    while streams[0].next():  # the first one has made room; a browser would come back
+        pass
+    web.show(MOMENT)
+    for stream in (streams[1], streams[-1], one_more):
+        while (event := stream.next()) and event[0] != "moment":
+            pass
+        assert event == ("moment", MOMENT)
     assert _get(web, "/").status == 200
+
+
+def test_two_names(web: WebServer) -> None:
+    connection = _connection(web)
+    connection.putrequest("GET", "/", skip_host=True)
+    connection.putheader("Host", "localhost")
+    connection.putheader("Host", "evil.example")
+    connection.endheaders()
+    assert connection.getresponse().status == 403
+
+
+@pytest.mark.parametrize("request_line", [b"POST / HTTP/1.1", b"GET", b"GET / HTTP/9.9", b"\xff\xfe"])
+def test_errors_have_the_headers_of_the_page(web: WebServer, request_line: bytes) -> None:
+    with _dial(web) as browser:
+        browser.sendall(request_line + b"\r\nHost: localhost\r\n\r\n")
+        answer = browser.makefile("rb").read()
+    assert re.match(rb"HTTP/1.0 (400|501|505) ", answer)
+    assert b"Content-Security-Policy: default-src 'none'" in answer
+    assert b"text/plain" in answer
+
+
+def test_dripping_requests(web: WebServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice as many as there may be, which send a byte now and then: few stay open, and not for long."""
+    monkeypatch.setattr("msg_agents.watching.web_server.REQUEST_TIME", 0.5)
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    dripping = [_dial(web) for _ in range(2 * MOST_CONNECTIONS)]
+    for _ in range(3):
+        for browser in dripping:
+            with contextlib.suppress(OSError):
+                browser.sendall(b"G")
+        time.sleep(0.1)
+    of_the_server = len(list(Path("/proc/self/fd").iterdir())) - before - len(dripping)
+    assert of_the_server <= MOST_CONNECTIONS
+    wait_for(lambda: _answers(web), 10)
+    for browser in dripping:
+        browser.settimeout(10)
+        with contextlib.suppress(ConnectionResetError):
+            assert browser.recv(1) == b""  # closed
+        browser.close()
+
+
+def _dial(web: WebServer) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", int(web.address.rstrip("/").rpartition(":")[2])), timeout=20)
+
+
+def _answers(web: WebServer) -> bool:
+    try:
+        return _get(web, "/").status == 200
+    except (OSError, http.client.HTTPException):
+        return False
 
 
 def test_the_end_reaches_who_watches() -> None:
