@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,26 @@ def test_the_level_is_that_of_the_verdict(bags: list[Path]) -> None:
         assert (document["verdict"], document["level"]) == ("disagrees", pytest.approx(least * 1.01))
         assert document["blame"]
     assert json.loads(call("compare", bags[0], "--json", "--level", least / 2).stdout)["verdict"] == "agrees"
+
+
+@pytest.mark.parametrize("width", [60, 80, 40])
+def test_tabulate_in_narrow_windows(results: list[Path], width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows can be told apart by the ends of their names, and no number is cut."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    places = [
+        results[0].parent / name / "result.json"
+        for name in ("leaders_of_the_first_kind_1", "leaders_of_the_first_kind_2")
+    ]
+    for place, result in zip(places, results, strict=False):
+        place.parent.mkdir(exist_ok=True)
+        place.write_text(result.read_text())
+    lines = call("tabulate", *places).stdout.splitlines()
+    rows = [line.split() for line in lines if re.match(r"  \S*kind_[12] ", line)]
+    assert [row[0][-6:] for row in rows] == ["kind_1", "kind_2"], lines
+    for row, place in zip(rows, places, strict=True):
+        error = json.loads(place.read_text())["system_error"]
+        assert {f"{error['measured']:.6g}", f"{error['predicted']:.6g}", f"{error['z']:+.2f}"} <= set(row)
+    assert width < 80 or max(map(len, lines[:6])) <= width
 
 
 def test_tabulate(results: list[Path], bags: list[Path]) -> None:

@@ -23,7 +23,7 @@ from msg_analysis.report.documents.comparison_words import (
     timing_facts,
     verdict_line,
 )
-from msg_analysis.report.terminal.tables import ROWS, fact_table, first_rows, interval_text, number_table
+from msg_analysis.report.terminal.tables import ROWS, fact_table, first_rows, interval_text, number_table, print_table
 
 _STYLES = {"agrees": "bold green", "disagrees": "bold red", "incomplete": "bold yellow", "unpredicted": "bold"}
 
@@ -79,7 +79,7 @@ def _print_bags(bags: Sequence[dict[str, Any]], console: Console) -> None:
             str(bag["missing"]),
             bag["verdict"],
         )
-    console.print(table)
+    print_table(console, table)
     torn = [bag["bag"] for bag in bags if not bag["complete"]]
     if torn:
         console.print(Text(f"Incomplete: {', '.join(torn)}. Leave them out for a verdict on the others."))
@@ -115,7 +115,7 @@ def _print_errors(document: dict[str, Any], console: Console) -> None:
     agents, corrected = agent_errors(document)
     for agent, entry in enumerate(first_rows(table, agents, "agents"), start=1):
         row(f"agent {agent}, given the path" if corrected else f"agent {agent}", entry)
-    console.print(table)
+    print_table(console, table)
 
 
 def _print_timing(document: dict[str, Any], console: Console) -> None:
@@ -127,7 +127,7 @@ def _print_timing(document: dict[str, Any], console: Console) -> None:
     for key, title in TIMES.items():
         values = timing[key]
         table.add_row(Text(title), *(number_text(values[quantile], 3) for quantile in QUANTILES))
-    console.print(table)
+    print_table(console, table)
     facts = fact_table(console, "Real time")
     for title, text in timing_facts(timing):
         facts.add_row(title, text)
@@ -137,7 +137,7 @@ def _print_timing(document: dict[str, Any], console: Console) -> None:
         law = laws[key]
         error = law["system_error"]
         table.add_row(title, number_text(error["predicted"]), z_text(error["z"]), Text(SUPPORT[law["supported"]]))
-    console.print(table)
+    print_table(console, table)
     console.print(Text(laws["why"]))
 
 
@@ -151,7 +151,7 @@ def _print_tests(document: dict[str, Any], console: Console) -> None:
     shown = [test for test in tests if test["rejected"]] + [test for test in tests if not test["rejected"]]
     for test in first_rows(table, shown, "tests"):
         table.add_row(Text(str(test["name"])), p_text(test["p"]), p_text(test["p_adjusted"]), _mark(test))
-    console.print(table)
+    print_table(console, table)
 
 
 def _mark(test: dict[str, Any]) -> Text:

@@ -24,7 +24,7 @@ from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.errors.ranking import Ranking, rank_estimates
 from msg_analysis.inference.statistics.distributions import two_sided
 from msg_analysis.report.documents.comparison_words import order_statements
-from msg_analysis.report.terminal.tables import number_table
+from msg_analysis.report.terminal.tables import number_table, print_table, room_for_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,9 +195,16 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
     wide = ("experiment", "seed", "time", "smallest p")  # too much for 80 columns
     kept = [place for place, head in enumerate(heads) if head not in wide and {line[place] for line in body} != {"-"}]
     table = number_table(console, "Results", *(heads[place] for place in kept))
-    for line in body:
-        table.add_row(*(Text(line[place]) for place in kept))
-    console.print(table)
+    numbers = [[line[place] for place in kept[1:]] for line in body]
+    room = room_for_names(console, [heads[place] for place in kept[1:]], numbers)
+    names = [
+        name if len(name) <= room else f"…{name[1 - room :]}"  # the end tells them apart
+        for name in short_names([row.file for row in rows])
+    ]
+    table.columns[0].min_width = max(map(len, names), default=0)
+    for line, name in zip(numbers, names, strict=True):
+        table.add_row(Text(name), *map(Text, line))
+    print_table(console, table)
     for row in rows:
         if row.blame:
             console.print(Text(f"{row.file}: {row.blame}."))
@@ -216,6 +223,16 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
             order.to_json(), [row.file for row in rows], "has a smaller system error than"
         ):
             console.print(Text(sentence))
+
+
+def short_names(files: Sequence[str]) -> list[str]:
+    """The files without what all of them begin with, and without the name that a result has in its folder."""
+    parts = [Path(file).parts for file in files]
+    parts = [each[:-1] if each[-1:] == (RESULT_FILE,) and len(each) > 1 else each for each in parts]
+    common = 0
+    while len(parts) > 1 and all(len(each) > common + 1 and each[common] == parts[0][common] for each in parts):
+        common += 1
+    return [str(Path(*each[common:])) for each in parts]
 
 
 def _shown(rows: Sequence[Result]) -> tuple[list[str], list[list[str]]]:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 from msg_analysis.common.text.number_words import half_width_text, number_text, p_text
-from msg_analysis.report.terminal.tables import ROWS, first_rows, number_table
+from msg_analysis.report.terminal.tables import ROWS, first_rows, number_table, print_table
 from msg_analysis.sweep.conduct import Conducted, Judgement
 from msg_analysis.sweep.figure_series import Picture, value_text
 from msg_analysis.sweep.jobs.job import FAILED
@@ -48,7 +48,7 @@ def print_sweep(sweep: Sweep, document: dict[str, Any], picture: Picture, consol
         else:
             numbers += [number_text(place.reference)]
         table.add_row(*([Text(label)] if several else []), Text(value_text(place.x)), *numbers)
-    console.print(table)
+    print_table(console, table)
     for row in [row for row in document["points"] if row["status"] == FAILED][:ROWS]:
         console.print(Text(f"point {row['point']}: no result: {row['reason']}"))
     for row in [row for row in document["points"] if row.get("verdict") == "disagrees"][:ROWS]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
 
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -14,6 +16,9 @@ from msg_analysis.common.text.number_words import number_text
 
 Row = TypeVar("Row")
 
+MARGIN = 3  # of every column: padding, and the line of the box
+LEAST_NAME = 12  # characters for names, however narrow the terminal is
+_NUMBER = re.compile(r"[-+0-9.e%±<>∞… ]*(inf|nan)?")
 ROWS = 30
 """Most rows of a table; --json has them all."""
 
@@ -26,6 +31,36 @@ def number_table(console: Console, title: str, first: str, *numbers: str) -> Tab
     for number in numbers:
         table.add_column(Text(number), justify="right")
     return table
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Print a table of ``number_table``: a narrow terminal folds words and headings, but never cuts a number."""
+    heads = [str(column.header) for column in table.columns]
+    cells = [[str(cell) for cell in column.cells] for column in table.columns]
+    widest = sum(MARGIN + max(map(cell_len, [head, *column])) for head, column in zip(heads, cells, strict=True))
+    width = console.width
+    if widest > console.width:
+        for column, head, texts in zip(table.columns[1:], heads[1:], cells[1:], strict=True):
+            column.min_width = _least_width(head, texts)
+            if all(map(_NUMBER.fullmatch, texts)):
+                column.width = column.min_width
+        least = 1 + sum(MARGIN + (column.min_width or 0) for column in table.columns[1:])
+        console.width = max(width, least + MARGIN + (table.columns[0].min_width or LEAST_NAME))
+    console.print(table)
+    console.width = width
+
+
+def room_for_names(console: Console, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
+    """Characters for each name of a ``number_table`` with these columns of numbers, and rows without the name."""
+    columns = list(zip(*rows, strict=True))
+    numbers = sum(MARGIN + _least_width(head, column) for head, column in zip(heads, columns, strict=True))
+    return max(LEAST_NAME, console.width - numbers - MARGIN - 1)
+
+
+def _least_width(head: str, cells: Sequence[str]) -> int:
+    """Of a column whose heading and words may be folded, but not its numbers."""
+    parts = [part for cell in cells for part in ([cell] if _NUMBER.fullmatch(cell) else cell.split(" "))]
+    return max(map(cell_len, [*head.split(" "), *parts]), default=0)
 
 
 def fact_table(console: Console, title: str) -> Table:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from msg_analysis.common.text.number_words import number_text
-from msg_analysis.report.terminal.tables import fact_table, first_rows, listed, number_table
+from msg_analysis.report.terminal.tables import fact_table, first_rows, listed, number_table, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _METHODS = {
@@ -52,7 +52,7 @@ def print_leaders(document: dict[str, Any], console: Console) -> None:
     for entry in first_rows(table, document["sets"], "sets"):
         row = (listed(entry["agents"]), number_text(entry["system_error"]), number_text(entry["joint_centrality"]))
         table.add_row(*row)
-    console.print(table)
+    print_table(console, table)
     facts = fact_table(console, f"Method: {_METHODS[document['method']]}")
     facts.add_row("system errors computed", str(document["evaluations"]))
     bound, gap = document["bound"]["system_error"], document["bound"]["gap"]
@@ -80,7 +80,7 @@ def print_transient(document: dict[str, Any], console: Console) -> None:
     rows = list(zip(document["times"], document[key], document["graph_law"], strict=True))
     for time, error, law in first_rows(table, rows, "times", "--json or --csv"):
         table.add_row(number_text(time), number_text(error), *map(number_text, law if few else []))
-    console.print(table)
+    print_table(console, table)
     settling, rates = document["settling"], document["rates"]
     share = f"{100 * settling['fraction']:g} %"
     facts = fact_table(console, "Steady state and rates")
@@ -120,7 +120,7 @@ def _print_lemmas(facts: list[dict[str, Any]], console: Console) -> None:
     for fact in facts:
         holds = Text("holds", style="green") if fact["holds"] else Text("does not hold", style="bold red")
         table.add_row(fact["name"], fact["statement"], str(fact["multiplicity"]), number_text(fact["others"]), holds)
-    console.print(table)
+    print_table(console, table)
 
 
 def _print_graphs(document: dict[str, Any], console: Console) -> None:
@@ -134,7 +134,7 @@ def _print_graphs(document: dict[str, Any], console: Console) -> None:
         centrality = entry["information_centrality"]
         values = listed([number_text(value) for value in centrality])
         table.add_row(Text(entry["name"]), number_text(entry["kirchhoff_index"]), values)
-    console.print(table)
+    print_table(console, table)
 
 
 def _print_form(law: str, form: dict[str, Any], console: Console) -> None:
@@ -149,4 +149,4 @@ def _print_form(law: str, form: dict[str, Any], console: Console) -> None:
     ]
     for agent, row in enumerate(first_rows(table, rows, "agents"), start=1):
         table.add_row(f"agent {agent}", *map(number_text, row))
-    console.print(table)
+    print_table(console, table)
