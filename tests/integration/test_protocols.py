@@ -19,6 +19,16 @@ from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
 EXPERIMENTS = Path(__file__).parents[2] / "ros_ws/src/msg_agents_example_protocols/experiments"
+LEAVING = """
+import os
+from msg_analysis.protocol import Protocol
+
+class Broken(Protocol):
+    def step(self, k, mode, state, heard, noise):
+        if k == 17 and self.agent == 2:
+            os._exit(0)
+        return state
+"""
 BROKEN = """
 from msg_analysis.protocol import Protocol
 
@@ -69,14 +79,30 @@ def test_noise_and_loss_and_killed_agents(network: Any) -> None:
     assert check(trajectory).difference is None
 
 
-def test_a_protocol_that_fails(network: Any) -> None:
-    """Said in a line with protocol, package, agent and step; in full in the log."""
-    packages = network.directory / "packages"
+def _install(network: Any, code: str) -> Path:
+    """A package with a protocol named "broken"; where it is."""
+    packages: Path = network.directory / "packages"
     info = packages / "broken_package-0.3.dist-info"
     info.mkdir(parents=True)
-    (packages / "broken_module.py").write_text(BROKEN)
+    (packages / "broken_module.py").write_text(code)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken_package\nVersion: 0.3\n")
     (info / "entry_points.txt").write_text("[msg_agents.protocols]\nbroken = broken_module:Broken\n")
+    return packages
+
+
+def test_a_protocol_that_ends_its_process(network: Any) -> None:
+    """With the exit code of success: the others do not wait for its agents for ever."""
+    packages = _install(network, LEAVING)
+    file = network.file(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
+    process = network.start("run", file, "--out", network.directory / "runs", PYTHONPATH=str(packages))
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 3, stderr
+    assert "failed: agents_3_to_5: exit code 0 before its last step" in stderr
+
+
+def test_a_protocol_that_fails(network: Any) -> None:
+    """Said in a line with protocol, package, agent and step; in full in the log."""
+    packages = _install(network, BROKEN)
     run = {"duration": 60, "start": "zero", "processes": 2}
     file = network.file(protocol={"name": "broken"}, run=run)
     process = network.start("run", file, "--out", network.directory / "runs", PYTHONPATH=str(packages))

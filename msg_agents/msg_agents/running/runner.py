@@ -207,7 +207,7 @@ def run_network(
                 with (
                     workshop(experiment.agents * room_for(longest)) if restarts else nullcontext() as checkpoints,
                     Interruption() as interruption,
-                    Supervisor(folder, variables, fork_server=fork_server) as supervisor,
+                    Supervisor(folder, variables, last_step=experiment.steps, fork_server=fork_server) as supervisor,
                 ):
                     plans = plan_network(
                         experiment,

@@ -25,6 +25,7 @@ ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0)
 
 POLL = 0.02  # s
 SILENCE = 3.0  # s; accounts are written once a second
+EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
 CRASHED = 1  # exit code of Python after an uncaught exception
 ACCOUNTS, STEPS = "accounts", "steps.json"
 
@@ -45,6 +46,8 @@ class Child:
     process: Process
     log: Path  # file of what it printed
     number: int = 1  # of this start; 2: restarted once
+    ended: float | None = None  # when it was first seen to have ended with exit code 0 [s]
+    early: bool = False  # whether it did so before its last step
 
     @property
     def running(self) -> bool:
@@ -69,6 +72,8 @@ class Child:
     def failure(self) -> str | None:
         """How it failed, in words; None if it is running or has ended well."""
         code = self.process.poll()
+        if self.early:
+            return f"exit code {code} before its last step"
         return None if code is None else failure_of(code)
 
     @property
@@ -103,6 +108,7 @@ class Supervisor:
     children: list[Child] = field(default_factory=list)  # as started; a restarted one keeps its place
     steps: list[int] = field(default_factory=list)  # newest step of every agent, as reported
     cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
+    last_step: int = 0  # of the run
     fork_server: ForkServer | None = None  # without one, or when it has ended, every child starts on its own
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
@@ -150,8 +156,15 @@ class Supervisor:
         return process
 
     def read_status(self) -> None:
-        """Read what the switcher has reported."""
+        """Read what the switcher has reported, and note agents that have ended too early: their code may end Python."""
         self.steps = read_steps(self.logs / STEPS) or self.steps
+        switching = any(child.running for child in self.children if child.plan.name == SWITCHER)
+        for child in self.children:
+            if not self.steps or not switching or not child.plan.agents or child.process.poll() != 0:
+                continue
+            child.ended = child.ended or time.monotonic()
+            behind = min(self.steps[agent] for agent in child.plan.agents) < self.last_step
+            child.early = behind and time.monotonic() > child.ended + EARLY
 
     @property
     def running(self) -> list[Child]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -137,6 +138,9 @@ def test_mistakes_of_protocols(kind: Any, expected: str, offer: Callable[..., No
     [
         (lambda k, state: 1 / (k - 17) + state, "ZeroDivisionError: division by zero"),
         (lambda k, state: state * (np.nan if k == 17 else 1), "the result is not finite"),
+        (lambda k, state: state * (1e200 if k == 17 else 1) + 1e200, "the result is not finite"),
+        (lambda k, state: state * (1j if k == 17 else 1), "the result is complex, expected real numbers"),
+        (lambda k, state: sys.exit(0) if k == 17 else state, "SystemExit: 0"),
         (lambda k, state: state[0] if k == 17 else state, "result of shape (3,), expected (1, 3)"),
         (lambda k, state: None if k == 17 else state, "result of shape (), expected (1, 3)"),
         (lambda k, state: state.__imul__(2) if k == 17 else state, "output array is read-only"),
@@ -148,7 +152,7 @@ def test_steps_that_fail(step: Any, expected: str, offer: Callable[..., None], t
     with pytest.raises(InputError) as caught:
         simulate(experiment({"name": "mine"}))
     assert str(caught.value) == f"protocol mine (pack 1.2), agent 3, step 17: {expected}"
-    assert isinstance(caught.value.__cause__, Exception)
+    assert isinstance(caught.value.__cause__, BaseException)
     file = tmp_path / "net.json"
     file.write_text(json.dumps(document({"name": "mine"})))
     outcome = CliRunner().invoke(main, ["simulate", str(file), "--out", str(tmp_path / "bag")])

@@ -131,10 +131,14 @@ class ChosenProtocol:
             raise ProtocolError(f"{self.info}, {where}: weights: row of agent {i + 1} sums to {total:.12g}, expected 1")
 
     def guard(self, where: str, call: Callable[[], Result]) -> Result:
-        """The result of a call of the protocol's code; what it raises becomes a ProtocolError that says ``where``."""
+        """The result of a call of the protocol's code; what it raises becomes a ProtocolError that says ``where``.
+
+        Results are checked, so that numpy need not warn of an overflow, too.
+        """
         try:
-            return call()
-        except Exception as error:  # of code that we know nothing about
+            with np.errstate(all="ignore"):
+                return call()
+        except (Exception, SystemExit) as error:  # of code that we know nothing about
             text = str(error) if isinstance(error, ValueError) and str(error) else f"{type(error).__name__}: {error}"
             place = f", {where}" if where else ""
             raise ProtocolError(f"{self.info}{place}: {text}") from error
@@ -182,6 +186,8 @@ def _states(protocol: Protocol) -> int:
 
 
 def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
+    if np.iscomplexobj(value):
+        raise ValueError("the result is complex, expected real numbers")
     array = np.asarray(value, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"result of shape {array.shape}, expected {shape}")
