@@ -8,7 +8,11 @@ INTERFACES := ros_ws/src/msg_agents_interfaces
 EXAMPLES := ros_ws/src/msg_agents_example_protocols
 EXPERIMENTS := ros_ws/src/msg_agents_bringup/experiments
 RUNS := runs
-PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+LOUD_PIP := $(BIN)/python -m pip --disable-pip-version-check
+PIP := $(LOUD_PIP) --quiet
+# A line for every twenty packages that pip looks for; its errors are on stderr.
+PROGRESS := awk -v all="$$(grep -c == requirements/lock.txt)" '/^Collecting/ && ++n % 20 == 0 \
+  { printf "  %d of %d packages found\n", n, all; fflush() } /^Installing/ { print "  installing them"; fflush() }'
 LOCAL := --no-index --no-deps --no-build-isolation
 
 # Some container images set it. Every process of a network, and every worker of the tests, would compile all modules.
@@ -25,7 +29,9 @@ $(VENV)/.locked: requirements/lock.txt
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("error: %s is Python %d.%d: need 3.11 or newer, give PYTHON=..." % (sys.executable, *sys.version_info[:2]))'
 	@echo "Setting up $(VENV) (about two minutes, once)" >&2
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) install --require-hashes --requirement requirements/lock.txt
+	@echo "Installing the packages of requirements/lock.txt" >&2
+	@{ $(LOUD_PIP) install --progress-bar off --require-hashes --requirement requirements/lock.txt; \
+	   echo $$? > $(VENV)/.status; } | $(PROGRESS) >&2; exit $$(cat $(VENV)/.status)
 	@touch $@
 
 $(VENV)/.interfaces: $(VENV)/.locked $(wildcard $(INTERFACES)/msg/*) $(INTERFACES)/CMakeLists.txt $(INTERFACES)/package.xml $(INTERFACES)/pyproject.toml

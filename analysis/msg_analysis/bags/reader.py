@@ -75,6 +75,8 @@ def bag_files(path: Path) -> list[Path]:
     if information is None:
         files = [file for suffix in ("mcap", "mcap.zstd") for file in path.glob(f"*.{suffix}")]
         if not files:
+            if {entry.name for entry in path.iterdir()} <= {"log"}:  # a run makes its directory before anything else
+                raise BagError(f"{path}: empty: its run ended before anything was recorded: delete it")
             raise BagError(f"{path}: not a bag: expected metadata.yaml or .mcap files in this directory")
         return sorted(files, key=_file_number)
     storage = information.get("storage_identifier")

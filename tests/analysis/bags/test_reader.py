@@ -17,6 +17,7 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.run.trajectory import Trajectory
@@ -299,6 +300,12 @@ def test_no_bag(tmp_path: Path, make_run: MakeRun) -> None:
     run = make_run()
     with pytest.raises(BagError, match="not found"):
         read_bag(tmp_path / "nowhere")
+    with pytest.raises(BagError, match="empty: its run ended before anything was recorded: delete it"):
+        read_bag(tmp_path)
+    (tmp_path / "log").mkdir()
+    with pytest.raises(BagError, match="empty: its run ended before anything was recorded"):
+        salvage(tmp_path, tmp_path / "saved")
+    (tmp_path / "notes.txt").touch()
     with pytest.raises(BagError, match="not a bag"):
         read_bag(tmp_path)
     (tmp_path / "empty.mcap").touch()
