@@ -22,6 +22,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 
 BIN = Path(sys.executable).parent
+COMMANDS = {"player": "play"}  # whose executable, where colcon has installed it, has another name
 ROOT = Path(__file__).parents[2]
 
 
@@ -35,8 +36,11 @@ def domain(network: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 
 
 def start(executable: str, *arguments: Any, **options: Any) -> subprocess.Popen[str]:
+    """A command of ``msg-agents``, or another program."""
+    ours = executable not in ("python", "msg-analysis")
+    command = ["msg-agents", COMMANDS.get(executable, executable)] if ours else [executable]
     return subprocess.Popen(
-        [str(BIN / executable), *(str(argument) for argument in arguments)],
+        [str(BIN / command[0]), *command[1:], *(str(argument) for argument in arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -38,7 +38,7 @@ def start(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
     with free_domain() as domain:
         environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain)}
         environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        command = [str(BIN / executable), *(str(argument) for argument in arguments)]
+        command = [str(BIN / "msg-agents"), executable, *(str(argument) for argument in arguments)]
         return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
 
 
