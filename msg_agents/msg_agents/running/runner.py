@@ -95,7 +95,15 @@ class RunResult:
         return self.bag is not None and any(self.bag.glob("*.mcap"))
 
     def interrupt(self, by: int, during: str) -> None:
-        """Note that the signal ``by`` has ended the run or the comparison."""
+        """Note that a signal has ended the run or the comparison.
+
+        Parameters
+        ----------
+        by
+            number of the signal
+        during
+            when, in words; may be empty
+        """
         self.interrupted = True
         name = "Ctrl-C" if by == signal.SIGINT else signal.Signals(by).name
         self.failures.insert(0, f"stopped by {name} {during}".rstrip())
