@@ -90,7 +90,7 @@ bench: setup ## Measure speed side by side with the bare middleware, other solve
 	$(BIN)/python benchmarks/reading.py
 	$(BIN)/python benchmarks/sweep.py
 
-calibrate: setup ## Measure error rates and power of the verdict into docs/calibration.md: some 10 minutes on two CPUs
+calibrate: setup ## Measure error rates and power of the verdict into docs/calibration.md: half an hour on two CPUs
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --write
 
 docs: setup ## Build the documentation into site/
