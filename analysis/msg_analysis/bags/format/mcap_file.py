@@ -32,6 +32,11 @@ from msg_analysis.errors import BagError
 from msg_analysis.types import AnyArray, BoolArray, IntArray
 
 MAGIC = b"\x89MCAP0\r\n"
+# Bytes of chunks for every byte of their file, at most, and those that any file may have. States shrink to two thirds,
+# those of a run without noise to a two hundredth.
+MOST_EXPANSION = 1000
+FREE_EXPANSION = 2**26
+MOST_OTHERS = 2**18  # records of a chunk that are no messages: two for every number of a channel
 _LOOSE = 2**18  # bytes of a batch of messages that are not in chunks
 _ZSTD = ".zstd"  # suffix of rosbag2's compression mode `file`
 
@@ -145,6 +150,7 @@ class McapFile:
     torn: str | None = None  # what is there instead of the end of the file, known when all is read
     damaged_chunks: int = 0  # chunks that are left out
     false_indexes: int = 0  # chunks whose index is wrong: here the records decide, other programs use the index
+    _expanded: int = 0  # bytes of all chunks so far
 
     def batches(self) -> Iterator[Batch]:
         """The messages of all whole records; BagError: not an MCAP file, empty, or one that cannot be read."""
@@ -245,29 +251,44 @@ class McapFile:
     def _chunk(self, chunk: _Chunk, zstd: zstandard.ZstdDecompressor) -> Iterator[Batch]:
         try:
             data = unpack(chunk.content, zstd)
+        except Exception:  # decompressors raise many kinds of errors on damage
+            self.damaged_chunks += 1
+            return
+        self._expanded += len(data)
+        if self._expanded > MOST_EXPANSION * chunk.end + FREE_EXPANSION:
+            raise BagError(
+                f"{self.path}: {self._expanded >> 20} MB in chunks of {chunk.end >> 10} kB: expected at most "
+                f"{MOST_EXPANSION} times as much: the file is damaged, or made to fill the memory"
+            )
+        try:
             places = locate(data, chunk.index)
             if places is None:
-                walked = np.array(list(self._walk(data)), dtype=np.int64).reshape(-1, 2)
-                places = walked[:, 0], walked[:, 1]
+                places = self._walk(data)
                 self.false_indexes += bool(chunk.index) and not indexed(places[0], chunk.index)
             batch = Batch.of_contents(data, *places, chunk.end)
-        except Exception:  # decompressors and the library raise many kinds of errors on damage
+        except Exception:  # the library raises many kinds of errors on damage
             self.damaged_chunks += 1
             return
         yield batch
 
-    def _walk(self, data: bytes) -> Iterator[tuple[int, int]]:
-        at, end = 0, len(data)
-        while at < end:
+    def _walk(self, data: bytes) -> tuple[IntArray, IntArray]:
+        """(messages,) content offsets and sizes of all message records of a chunk; other records are noted."""
+        starts, sizes, at, others = [], [], 0, 0
+        while at < len(data):
+            start, size, at = run_of_messages(data, at)
+            starts.append(start)
+            sizes.append(size)
+            if at == len(data):
+                break
             opcode, length = RECORD.unpack_from(data, at)
             at += RECORD.size
-            if length > end - at or not opcode:
+            others += 1
+            if length > len(data) - at or opcode in (0, Opcode.MESSAGE) or others > MOST_OTHERS:
                 raise DamageError
-            if opcode == Opcode.MESSAGE:
-                yield at, length
-            else:
-                self.note(opcode, data[at : at + length])
+            self.note(opcode, data[at : at + length])
             at += length
+        none = np.empty(0, dtype=np.int64)
+        return np.concatenate([none, *starts]), np.concatenate([none, *sizes])
 
 
 def _keep_memory() -> None:
