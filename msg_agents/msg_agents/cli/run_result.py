@@ -1,0 +1,107 @@
+"""The end of a run on the command line: verdict, output, exit code."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from msg_analysis.cli.console import complain, print_json, result_console
+from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.common.files import RESULT_FILE, write_whole
+from msg_analysis.common.text.json_numbers import json_text
+
+if TYPE_CHECKING:
+    from msg_agents.running.runner import RunResult
+    from msg_analysis.model.experiment.experiment import ValidExperiment
+
+
+def finish(
+    result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None] = lambda _: None, *, analyse: bool = True
+) -> None:
+    """Print the failures, judge what was recorded, show the result, and exit with its code."""
+    from msg_agents.running.runner import conclude
+
+    for line in result.failures:
+        complain(line, "failed:")
+    if analyse and not result.interrupted:
+        try:
+            conclude(result)
+        except KeyboardInterrupt:
+            result.interrupt(signal.SIGINT, "while the run was compared with the prediction")
+            complain(result.failures[0], "failed:")
+    say(_ending(result))
+    _show(result, as_json)
+    if _incomplete(result) or (analyse and result.bag is not None and result.comparison is None):
+        sys.exit(ExitCode.INCOMPLETE)
+    if result.comparison is not None:
+        sys.exit(result.comparison.exit_code)
+
+
+def _incomplete(result: RunResult) -> bool:
+    """Whether a process failed, or states are missing."""
+    return bool(result.failures) or (result.trajectory is not None and not result.trajectory.completeness.complete)
+
+
+def _ending(result: RunResult) -> dict[str, Any]:
+    """Text and verdict of the end of a run, for the live page."""
+    if result.failures:
+        return {"text": f"The run has ended early: {result.failures[0]}", "verdict": "incomplete"}
+    if result.comparison is None:
+        return {"text": "The run has ended.", "verdict": None}
+    verdict = result.comparison.verdict
+    words = {"incomplete": "the data are incomplete", "unpredicted": "there is no prediction"}
+    outcome = words.get(verdict, f"it {verdict} with the prediction")
+    return {"text": f"The run has ended; {outcome}.", "verdict": verdict}
+
+
+def _show(result: RunResult, as_json: bool) -> None:
+    """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
+    from msg_agents.running.runner import REPORT_FILE
+
+    document: dict[str, Any] = {"verdict": "incomplete" if _incomplete(result) else None}  # None: nothing to judge
+    if result.comparison is not None:
+        document = dict(result.comparison.to_json())
+    elif result.interrupted:
+        document |= _without_comparison(result.experiment)
+    document |= {
+        "bag": str(result.bag) if result.recorded else None,
+        "report": str(result.bag / REPORT_FILE) if result.bag and result.comparison else None,
+        "rate": result.rate,
+        "wall_time": result.wall_time,
+        "restarts": result.restarts,
+        "strangers": result.strangers,
+        "failures": result.failures,
+    }
+    if result.bag is not None and (result.comparison is not None or (result.interrupted and result.recorded)):
+        write_whole(result.bag / RESULT_FILE, json_text(document, 1).encode() + b"\n")
+    if as_json:
+        print_json(document)
+        return
+    if result.comparison is not None:
+        from msg_analysis.report.terminal.comparison_text import print_comparison
+
+        print_comparison(document, result_console())
+        click.echo(f"bag:    {document['bag']}\nreport: {document['report']}")
+    elif document["bag"]:
+        click.echo(f"bag: {document['bag']}")
+        if result.interrupted and result.reached > 0:
+            click.echo(f"To compare what it holds with the prediction: msg-analysis compare {document['bag']}")
+    if result.rate:
+        click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
+
+
+def _without_comparison(experiment: ValidExperiment) -> dict[str, Any]:
+    """What `msg-analysis tabulate` reads of a result, without numbers."""
+    from msg_analysis.inference.errors.estimates import Estimate
+
+    return {
+        "experiment": experiment.name,
+        "leaders": (experiment.leader_gains.nonzero()[0] + 1).tolist(),
+        "seed": experiment.run.seed,
+        "simulated_time": 0.0,
+        "system_error": Estimate().to_json(),
+    }
