@@ -95,6 +95,9 @@ def test_power(truth, found_by):
     result = compare(dataclasses.replace(trajectory, record=record))
     assert result.verdict == "disagrees"
     assert found_by in [test.name for test in result.tests if test.rejected]
+    # Apart from the errors, which show every fault: the test that is made for it is the clearest.
+    special = [test for test in result.tests if "error" not in test.name and test.name != "covariance"]
+    assert min(special, key=lambda test: test.p).name == found_by
 
 
 def observe(what):

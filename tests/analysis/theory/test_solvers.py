@@ -73,7 +73,7 @@ def agree(model, rtol=1e-9):
     solver, dense = MomentSolver(model, method="krylov"), MomentSolver(model, method="dense")
     expected = dense.steady()
     np.testing.assert_allclose(solver.steady(), expected, rtol=rtol, atol=rtol * np.abs(expected).max())
-    assert solver.report.error <= 1e-8
+    assert solver._solver.report.error <= 1e-12  # of the iterations alone, without the rounding of the law
     forms = np.stack([np.eye(model.dimension), np.diag(np.arange(model.dimension) == 0).astype(float)])
     expected = dense.dual(forms)
     np.testing.assert_allclose(solver.dual(forms), expected, rtol=rtol, atol=rtol * np.abs(expected).max())

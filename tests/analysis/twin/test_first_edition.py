@@ -43,6 +43,8 @@ def test_equal_to_the_last_bit(name: str) -> None:
         assert now[key] == approximately(then[key]), key
     for key in ("measured", "predicted"):
         assert now["system_error"][key] == approximately(then["system_error"][key]), key
+        nodes, before = ([node[key] for node in each["node_errors"]] for each in (now, then))
+        assert nodes == approximately(before), key
 
 
 def test_in_discrete_time() -> None:
