@@ -22,6 +22,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import fuzz_bombs
 import yaml
 from fuzz_bags import make_bags, mutate_bag
 from fuzz_documents import BOMB, mutate_document, mutate_text
@@ -180,6 +181,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--bags", type=int, default=20_000)
     parser.add_argument("--experiments", type=int, default=20_000)
+    parser.add_argument("--bombs", action=argparse.BooleanOptionalAction, default=True, help="also fuzz_bombs.py")
     parser.add_argument("--seed", type=int, default=0, help="of the first case of each kind")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--findings", type=Path, default=Path("build/fuzz"), help="where they are kept")
@@ -191,6 +193,8 @@ def main() -> None:
         total = run("bags", arguments.bags, arguments.seed, bags, *common) if bags else 0
         if arguments.experiments:
             total += run("experiments", arguments.experiments, arguments.seed, files, *common)
+        if arguments.bombs:
+            total += fuzz_bombs.run(Path(place))
     sys.exit(1 if total else 0)
 
 

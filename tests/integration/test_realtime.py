@@ -185,6 +185,18 @@ def test_killed_and_back(network: Any, repetition: int) -> None:
     assert_possible(result.trajectory)
 
 
+def test_an_overloaded_network(network: Any) -> None:
+    """A hundred times too fast for any machine: it says so, keeps in bounds, and its log is possible all the same."""
+    file = network.file(run=REALTIME | {"speed": 2000, "duration": 500, "processes": 5})
+    run = network.start("run", file, "--out", network.directory / "runs")
+    _, stderr = run.communicate(timeout=120)
+    assert run.returncode in (0, 1), stderr
+    assert "note: the network cannot keep up: it is" in stderr
+    assert "s behind the 40000 steps/s of real time: lower `run: speed: 2000`" in stderr
+    (bag,) = (network.directory / "runs").iterdir()
+    assert_possible(read_bag(bag))
+
+
 def test_two_runs_at_the_same_time(network: Any) -> None:
     """They neither hear nor overwrite each other."""
     file, out = network.file(run={**REALTIME, "processes": 1}), network.directory / "runs"

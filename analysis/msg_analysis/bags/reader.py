@@ -5,6 +5,7 @@ The run record comes from the topic `experiment`, or from the metadata of files 
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable
@@ -21,7 +22,7 @@ from msg_analysis.bags.writer import RECORD_NAME, recording_pid
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.types import IntArray
+from msg_analysis.types import AnyArray, IntArray
 from msg_analysis.wire.cdr_fields import CdrError
 from msg_analysis.wire.messages import ActiveGraph, decode_string
 from msg_analysis.wire.refusals import Refusal
@@ -35,6 +36,7 @@ _TOPICS = {
     ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
     STRING.full_name: re.compile(r"(?:^|/)(experiment)$"),
 }
+MOST_RECORDS = 100  # different run records that a bag may have: reading each takes milliseconds
 _ZSTD_FRAME = b"\x28\xb5\x2f\xfd"
 _EACH_COMPRESSED = (
     "every message in it is compressed by itself, which cannot be read: convert it, or record with "
@@ -117,32 +119,28 @@ class _Contents:
     refused: Counter[str] = field(default_factory=Counter)
 
     def read(self, file: McapFile, batches: Iterable[Batch]) -> None:
-        kinds: dict[int, str | None] = {}
+        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: not a topic of the network
+        known = 0
         for batch in batches:
-            for number, channel in file.channels.items():
-                if number not in kinds:
-                    schema = file.schemas.get(channel.schema_id)
-                    pattern = _TOPICS.get(schema.name if schema else "")
-                    found = pattern.search(channel.topic) if pattern else None
-                    kinds[number] = found[1] if found else None
-            self._add(batch, kinds)
-        self.metadata.update(
-            (record.metadata["record"], None)
-            for record in file.metadata
-            if record.name == RECORD_NAME and "record" in record.metadata
-        )
+            for number, channel in itertools.islice(file.channels.items(), known, None):
+                schema = file.schemas.get(channel.schema_id)
+                pattern = _TOPICS.get(schema.name if schema else "")
+                found = pattern.search(channel.topic) if pattern else None
+                kind_of[number] = _NUMBERS[found[1] if found else None]
+            known = len(file.channels)
+            self._add(batch, kind_of[batch.channel])
+        for record in file.metadata:
+            if record.name == RECORD_NAME and "record" in record.metadata and len(self.metadata) < MOST_RECORDS:
+                self.metadata[record.metadata["record"]] = None
         self.refused[Refusal.TORN_FILE] += file.torn is not None
         self.refused[Refusal.DAMAGED_CHUNK] += file.damaged_chunks
 
-    def _add(self, batch: Batch, kinds: dict[int, str | None]) -> None:
-        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: not a topic of the network
-        kind_of[list(kinds)] = [_NUMBERS[kind] for kind in kinds.values()]
-        kind = kind_of[batch.channel]
+    def _add(self, batch: Batch, kind: AnyArray) -> None:
         # Records first: states of a known run are put in their places at once.
         for index in np.flatnonzero(kind >= _NUMBERS[_GRAPH]).tolist():
             data = batch.message(index)
             try:
-                if kinds[int(batch.channel[index])] == _GRAPH:
+                if kind[index] == _NUMBERS[_GRAPH]:
                     self.graphs.append(ActiveGraph.decode(data))
                 else:
                     self._learn(decode_string(data))
@@ -156,6 +154,11 @@ class _Contents:
     def _learn(self, text: str) -> None:
         if text in self.experiments:
             return
+        if len(self.experiments) >= MOST_RECORDS:
+            raise BagError(
+                f"{self.path}: more than {MOST_RECORDS} different messages on the topic `experiment`: expected the one "
+                "record of a run: record each run into a bag of its own"
+            )
         self.experiments[text] = record = self.parsed(text)
         if isinstance(record, RunRecord):
             for collector, width in zip((self.states, self.truths), _widths(record), strict=True):
@@ -182,6 +185,11 @@ def _choose(contents: _Contents) -> RunRecord:
     found = [*contents.experiments.values(), *map(contents.parsed, later)]
     if not found and contents.refused[Refusal.COMPRESSED]:
         raise BagError(f"{path}: {_EACH_COMPRESSED}")
+    if not found and contents.refused[Refusal.DAMAGED_CHUNK]:
+        raise BagError(
+            f"{path}: {contents.refused[Refusal.DAMAGED_CHUNK]} chunks are damaged (wrong checksums, or times that no "
+            "clock shows), and no record of the run is in what is left: copy the bag again, or record the run again"
+        )
     if not found:
         pid = recording_pid(path)
         hint = f" (process {pid} is still recording it)" if pid else ""

@@ -18,7 +18,14 @@ from mcap.writer import CompressionType, Writer
 
 from msg_analysis.bags.format.inventory import FileInventory, channel_count
 from msg_analysis.bags.format.mcap_file import Batch, McapFile
-from msg_analysis.bags.format.metadata import METADATA_FILE, FileCount, bag_information, dump, write_metadata
+from msg_analysis.bags.format.metadata import (
+    METADATA_FILE,
+    ChannelCount,
+    FileCount,
+    bag_information,
+    dump,
+    write_metadata,
+)
 from msg_analysis.bags.reader import bag_files
 from msg_analysis.bags.writer import (
     CHUNK_SIZE,
@@ -29,6 +36,9 @@ from msg_analysis.bags.writer import (
     recording_pid,
 )
 from msg_analysis.errors import BagError
+
+LONGEST_LIST = 500  # characters of what is said of torn files
+_MORE = "; ..."
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +62,7 @@ class SalvageReport:
     dropped_files
         files of which nothing can be read
     torn
-        what was there instead of the end of each torn file; None where all were whole
+        what was there instead of the end of the torn files, of many only the first; None where all were whole
     """
 
     kept_messages: int
@@ -72,8 +82,15 @@ class SalvageReport:
             self.lost_messages + other.lost_messages,
             self.damaged_chunks + other.damaged_chunks,
             self.dropped_files + other.dropped_files,
-            "; ".join(filter(None, (self.torn, other.torn))) or None,
+            _joined(self.torn, other.torn),
         )
+
+
+def _joined(first: str | None, second: str | None) -> str | None:
+    """Both texts; of many, only the beginning."""
+    if first is None or second is None or first.endswith(_MORE):
+        return first or second
+    return f"{first}; {second}" if len(first) < LONGEST_LIST else first + _MORE
 
 
 def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
@@ -240,13 +257,15 @@ class _Channels:
     def __init__(self, writer: Writer, source: McapFile, count: FileCount) -> None:
         self._writer, self._source, self._count = writer, source, count
         self._schemas: dict[int, int] = {0: 0}  # number in the source: number in the copy; 0 means none
-        self._channels: dict[int, int] = {}
+        # Number in the copy, and the count, of every number in the source; a topic that takes an old number later
+        # counts as the old one, as for other readers.
+        self._channels: dict[int, tuple[int, ChannelCount]] = {}
 
     def register_all(self) -> None:
         for number in self._source.channels:
             self._register(number)
 
-    def _register(self, number: int) -> int:
+    def _register(self, number: int) -> tuple[int, ChannelCount]:
         if number in self._channels:
             return self._channels[number]
         channel = self._source.channels[number]
@@ -258,10 +277,9 @@ class _Channels:
         else:
             copied = self._writer.register_schema(schema.name, schema.encoding, schema.data)
             self._schemas[schema.id] = copied
-        self._channels[number] = self._writer.register_channel(
-            channel.topic, channel.message_encoding, copied, channel.metadata
-        )
-        self._count.channels.setdefault(channel.topic, channel_count(channel, schema.name if schema else ""))
+        copy = self._writer.register_channel(channel.topic, channel.message_encoding, copied, channel.metadata)
+        count = self._count.channels.setdefault(channel.topic, channel_count(channel, schema.name if schema else ""))
+        self._channels[number] = copy, count
         return self._channels[number]
 
     def write(self, batch: Batch) -> None:
@@ -270,6 +288,7 @@ class _Channels:
             if number not in self._source.channels:
                 continue  # its channel was in a chunk that is lost
             data = batch.data[start : start + size]
-            self._writer.add_message(self._register(number), log_time, data, publish_time, sequence)
+            channel, count = self._register(number)
+            self._writer.add_message(channel, log_time, data, publish_time, sequence)
             file.start, file.end = min(file.start, log_time), max(file.end, log_time)
-            file.channels[self._source.channels[number].topic].messages += 1
+            count.messages += 1

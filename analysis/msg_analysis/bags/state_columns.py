@@ -33,14 +33,14 @@ class States:
     def __len__(self) -> int:
         return len(self.start)
 
-    def __getitem__(self, index: AnyArray) -> States:
-        """Some of them, by an array of indices or of bools."""
+    def __getitem__(self, index: AnyArray | slice) -> States:
+        """Some of them, by an array of indices or of bools, or by a slice."""
         return States(self.data, self.start[index], self.head[index], self.replicas[index], self.position[index])
 
-    @property
-    def run(self) -> AnyArray:
-        """(messages, 2) run id as two numbers: see :func:`run_number`."""
-        return np.asarray(self.head["run"])
+    def of_run(self, run: tuple[int, int]) -> BoolArray:
+        """(messages,) whether they are of the run with this :func:`run_number`."""
+        found = self.head["run"]
+        return np.asarray((found[:, 0] == run[0]) & (found[:, 1] == run[1]))
 
     @property
     def agent(self) -> IntArray:

@@ -33,68 +33,60 @@ class Collector:
     def __init__(self) -> None:
         self._undecodable = 0
         self._position = 0
-        self._counts: Counter[tuple[int, int]] = Counter()
         self._expected: dict[tuple[int, int], tuple[RunRecord, int]] = {}
+        self._counts: Counter[tuple[int, int]] = Counter()  # of the expected runs
         self._collected: dict[tuple[int, int], Collected] = {}
-        self._waiting: list[tuple[tuple[int, int], States]] = []
+        self._waiting: list[States] = []
 
     def add(self, batch: Batch, chosen: IntArray) -> None:
         """Take from a batch the states: the messages with the indices ``chosen``, (k,)."""
         states, undecodable = decode_states(batch, chosen, self._position)
         self._undecodable += undecodable
         self._position += len(chosen)
-        for run, part in _by_run(states):
-            self._counts[run] += len(part)
-            if run in self._expected:
-                self._of(run).add(part)
-            else:
-                self._waiting.append((run, part.alone()))
+        for run in self._expected:
+            states = self._take(run, states)
+        if len(states):
+            self._waiting.append(states.alone())
+
+    def _take(self, run: tuple[int, int], states: States) -> States:
+        """Take those of a run; the others."""
+        its = states.of_run(run)
+        if not its.any():
+            return states
+        self._counts[run] += int(its.sum())
+        if run not in self._collected:  # made for its first state: a bag may have records of runs without states
+            self._collected[run] = Collected(*self._expected[run])
+        self._collected[run].add(states if its.all() else states[its])
+        return states[:0] if its.all() else states[~its]
 
     def expect(self, record: RunRecord, width: int) -> None:
         """From now on collect the states, of length ``width``, of this run; nothing where it is expected already.
 
         BagError where the result does not fit into the memory of this machine.
         """
-        expected = run_number(record.run.bytes)
-        if expected in self._expected:
+        run = run_number(record.run.bytes)
+        if run in self._expected:
             return
-        self._expected[expected] = record, width
+        self._expected[run] = record, width
         waiting, self._waiting = self._waiting, []
-        for run, part in waiting:
-            if run == expected:
-                self._of(run).add(part)
-            else:
-                self._waiting.append((run, part))
-
-    def _of(self, run: tuple[int, int]) -> Collected:
-        """The result of a run, made for its first state: a bag may have records of runs without states."""
-        if run not in self._collected:
-            self._collected[run] = Collected(*self._expected[run])
-        return self._collected[run]
+        for states in waiting:
+            others = self._take(run, states)
+            if len(others):
+                self._waiting.append(others)
 
     def count(self, run: bytes) -> int:
-        """Number of states of a run, given the 16 bytes of its id."""
+        """Number of states of an expected run, given the 16 bytes of its id."""
         return self._counts[run_number(run)]
 
     def finish(self, record: RunRecord, width: int) -> Collected:
         """All that was collected of a run; call it after the last batch. Arguments and errors as of ``expect``."""
         self.expect(record, width)
-        collected = self._of(run_number(record.run.bytes))
+        run = run_number(record.run.bytes)
+        collected = self._collected.get(run) or Collected(record, width)
         collected.refused[Refusal.UNDECODABLE] += self._undecodable
-        collected.refused[Refusal.OTHER_RUN] += self._counts.total() - self.count(record.run.bytes)
+        collected.refused[Refusal.OTHER_RUN] += self._position - self._undecodable - self._counts[run]
         collected.finish()
         return collected
-
-
-def _by_run(states: States) -> list[tuple[tuple[int, int], States]]:
-    """The states of each run."""
-    run = states.run
-    if not len(run):
-        return []
-    if (run == run[0]).all():
-        return [(run_number(run[0].tobytes()), states)]
-    runs, owner = np.unique(run, axis=0, return_inverse=True)
-    return [(run_number(one.tobytes()), states[owner.ravel() == i]) for i, one in enumerate(runs)]
 
 
 class Collected:

@@ -17,14 +17,19 @@ SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # in C, where 
 
 
 def read_text(path: Path, longest: int = LONGEST_FILE) -> str:
-    """The text of a file in UTF-8; OSError (EFBIG) where it has more bytes than that, endless ones included."""
+    """The text of a file in UTF-8; errors as of ``read_bytes``."""
+    return read_bytes(path, longest).decode("utf-8")
+
+
+def read_bytes(path: Path, longest: int = LONGEST_FILE) -> bytes:
+    """The bytes of a file; OSError (EFBIG) where it has more than that, endless ones included."""
     data = bytearray()
     with path.open("rb") as stream:
         while part := stream.read(PART):
             data += part
             if len(data) > longest:
                 raise OSError(errno.EFBIG, f"longer than {longest >> 20} MB")
-    return data.decode("utf-8")
+    return bytes(data)
 
 
 def load_yaml(text: str, loader: Any = SAFE_LOADER) -> Any:

@@ -58,7 +58,8 @@ NEWEST = Qos(1, latched=True)
 """Values that replace earlier ones: the writer never waits, and a late reader gets the newest."""
 RECENT = Qos(10)
 PASSIVE, PASSIVE_NEWEST = Qos(5000, reliable=False), Qos(1, reliable=False)
-"""Of readers that no writer waits for: they miss messages if they are too slow."""
+"""Of readers that no writer waits for: they miss messages if they are too slow. PASSIVE_NEWEST: what such a reader has
+not read yet is replaced, and nothing is kept for it."""
 
 
 @dataclass(frozen=True, slots=True)

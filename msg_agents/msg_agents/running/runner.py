@@ -21,7 +21,7 @@ from msg_agents.processes.ros_domain import free_domain
 from msg_agents.recovery.checkpoint import room_for
 from msg_agents.running.run_folder import workshop
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, STEPS, Supervisor
-from msg_agents.stepping.stall_detection import StallDetector
+from msg_agents.stepping.stall_detection import LagDetector, StallDetector
 from msg_agents.terminal.interruption import Interruption
 from msg_agents.watching.view import View
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
@@ -230,7 +230,7 @@ def run_network(
                         supervisor.cores = place(plans, available_cores(), first=chosen)
                     supervisor.start(plans)
                     view.begin(record, checkpoints if share is None else None)
-                    _watch(supervisor, experiment.steps, result, restarts, interruption, view)
+                    _watch(supervisor, experiment, result, restarts, interruption, view, follow_clock=not use_sim_time)
                     view.end()
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
                     _collect_failures(supervisor, result, interruption, restarts)
@@ -251,15 +251,19 @@ def run_network(
 
 def _watch(
     supervisor: Supervisor,
-    steps: int,
+    experiment: ValidExperiment,
     result: RunResult,
     restarts: int,
     interruption: Interruption,
     view: View,
+    *,
+    follow_clock: bool,  # whether the nodes' clock is that of this machine
 ) -> None:
     """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
     began: float | None = None
-    stall = StallDetector()
+    stall, steps, run = StallDetector(), experiment.steps, experiment.run
+    due = run.speed / experiment.step_length  # steps per second in real time
+    lag = LagDetector(due) if run.pace == "realtime" and follow_clock else None
     while interruption.caught is None and _revive(supervisor, result, restarts, view) and supervisor.awaited:
         time.sleep(POLL)
         supervisor.read_status()
@@ -269,6 +273,11 @@ def _watch(
             view.note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor)}")
         if reached < 0:
             continue
+        if lag and reached < steps and (behind := lag.update(reached)):
+            view.note(
+                f"the network cannot keep up: it is {behind:.1f} s behind the {due:g} steps/s of real time: lower "
+                f"`run: speed: {run.speed:g}`, or give several agents to one process (`run: processes`)"
+            )
         now = time.monotonic()
         began = began or now
         if reached < steps or not result.wall_time:

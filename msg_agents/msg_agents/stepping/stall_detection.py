@@ -1,10 +1,12 @@
-"""Stall detection: steps per second, and when to warn that there are none."""
+"""Stalls and lags: steps per second, and when to warn that there are none, or fewer than in real time."""
 
 from __future__ import annotations
 
 import time
 
 STALL_TIME = 5.0  # s without a step, after which an agent counts as stalled
+LAG_TIME = 2.0
+"""s by which a run in real time is behind its clock after which it counts as too slow; agents report every 0.2 s."""
 
 
 class StallDetector:
@@ -29,3 +31,25 @@ class StallDetector:
             return False
         self._next_warning = 2.0 * self.stalled
         return True
+
+
+class LagDetector:
+    """Notices that a run in real time falls behind its clock; ``rate``: steps that are due per second."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._began: float | None = None
+        self._first = 0
+        self._next_warning = LAG_TIME
+
+    def update(self, step: int) -> float | None:
+        """After each look at the newest step of all agents: s behind, if to warn now, and again when it has doubled."""
+        now = time.monotonic()
+        if self._began is None or step == self._first:  # waiting for the epoch
+            self._began, self._first = now, step
+            return None
+        behind = now - self._began - (step - self._first) / self._rate
+        if behind < self._next_warning:
+            return None
+        self._next_warning = 2.0 * behind
+        return behind

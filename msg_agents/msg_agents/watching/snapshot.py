@@ -41,6 +41,16 @@ class StepRates:
         (then, before), (now, after) = self._seen[0], self._seen[-1]
         return [(b - a) / (now - then) for a, b in zip(before, after, strict=True)]
 
+    def rate(self) -> float | None:
+        """By how many steps per second the step that all agents have reached has moved; None where not known.
+
+        Not the least of ``rates``: in an overloaded network agents step in bursts, and one is always between two.
+        """
+        if len(self._seen) < 2:
+            return None
+        (then, before), (now, after) = self._seen[0], self._seen[-1]
+        return (min(after) - min(before)) / (now - then)
+
 
 class SojournFinder:
     """Finds the sojourn of a step of a run."""
@@ -66,8 +76,9 @@ class Snapshot:
     # Newest step of every agent, -1: none; empty before the start; a single one for all where only that is known.
     steps: list[int]
     rates: list[float] = field(default_factory=list)  # steps per second, as ``steps``; empty where not known
+    rate: float | None = None  # steps per second of all agents together; None where not known
     sojourn: Sojourn | None = None  # of the slowest agent's next step; None before the start
-    left: float | None = None  # s until the end at the speed of the slowest agent; None where not known
+    left: float | None = None  # s until the end at this ``rate``; None where not known
     report: LiveReport | None = None  # the errors up to now
     note: str | None = None  # about the errors
 
@@ -75,11 +86,6 @@ class Snapshot:
     def reached(self) -> int:
         """The step that every agent has reached; -1: none."""
         return min(self.steps, default=-1)
-
-    @property
-    def rate(self) -> float:
-        """Steps per second of the slowest agent."""
-        return min(self.rates, default=0.0)
 
 
 class SnapshotSource:
@@ -95,8 +101,8 @@ class SnapshotSource:
         if now.reached < 0:
             return now
         self._rates.add(steps)
-        now = replace(now, rates=self._rates.rates())
-        left = (self._steps - now.reached) / now.rate if now.rate > 0 else None
+        now = replace(now, rates=self._rates.rates(), rate=self._rates.rate())
+        left = (self._steps - now.reached) / now.rate if now.rate else None
         return replace(now, left=left, sojourn=self._sojourns.at(min(now.reached, self._steps - 1)))
 
 
@@ -133,7 +139,7 @@ def snapshot_document(snapshot: Snapshot) -> dict[str, Any]:
     return {
         "steps": snapshot.steps if len(snapshot.steps) > 1 else [],
         "reached": snapshot.reached,
-        "rate": snapshot.rate,
+        "rate": snapshot.rate or 0.0,
         "left": snapshot.left,
         "graph": None if sojourn is None else sojourn.mode,
         "sojourn": None if sojourn is None else [sojourn.sequence + 1, sojourn.first_step, sojourn.last_step],

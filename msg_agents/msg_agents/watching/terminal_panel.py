@@ -53,7 +53,7 @@ def panel_of(snapshot: Snapshot, experiment: ValidExperiment, *, width: int, hei
 
 def plain_line(snapshot: Snapshot, experiment: ValidExperiment) -> str:
     """The same as one line of text."""
-    parts = [f"step {snapshot.reached} of {experiment.steps}", f"{snapshot.rate:.0f} steps/s"]
+    parts = [f"step {snapshot.reached} of {experiment.steps}", *_speed(snapshot)]
     if snapshot.sojourn is not None:
         parts.append(f"graph {experiment.graph_list[snapshot.sojourn.mode].name}")
     if snapshot.left is not None:
@@ -61,11 +61,17 @@ def plain_line(snapshot: Snapshot, experiment: ValidExperiment) -> str:
     return ", ".join(parts)
 
 
+def _speed(snapshot: Snapshot) -> list[str]:
+    """The speed, where it is known."""
+    return [] if snapshot.rate is None else [f"{snapshot.rate:.0f} steps/s"]
+
+
 def _progress(snapshot: Snapshot, experiment: ValidExperiment, width: int) -> RenderableType:
     share = snapshot.reached / experiment.steps
-    text = f"step {snapshot.reached} of {experiment.steps}  {100 * share:.0f} %  {snapshot.rate:.0f} steps/s"
+    parts = [f"step {snapshot.reached} of {experiment.steps}", f"{100 * share:.0f} %", *_speed(snapshot)]
     if snapshot.left is not None:
-        text += f"  {_duration(snapshot.left)} left"
+        parts.append(f"{_duration(snapshot.left)} left")
+    text = "  ".join(parts)
     bar = ProgressBar(
         total=1.0, completed=share, width=max(width - len(text) - 2, 4), complete_style="cyan", finished_style="green"
     )

@@ -5,11 +5,20 @@ from __future__ import annotations
 import io
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
-from msg_agents.watching.snapshot import Snapshot, SnapshotSource, SojournFinder, run_description, snapshot_document
+from msg_agents.watching import snapshot
+from msg_agents.watching.snapshot import (
+    Snapshot,
+    SnapshotSource,
+    SojournFinder,
+    StepRates,
+    run_description,
+    snapshot_document,
+)
 from msg_agents.watching.terminal_panel import gauge, panel_of, plain_line
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.online.running_errors import LiveReport
@@ -40,6 +49,7 @@ def _snapshot(agents: int, **changes: object) -> Snapshot:
     values: dict[str, object] = {
         "steps": [4000 + i % 7 for i in range(agents)],
         "rates": [500.0 + i for i in range(agents)],
+        "rate": 500.0,
         "sojourn": Sojourn(41, 1, 3990, 4010),
         "left": 61.2,
         "report": _report(agents),
@@ -80,12 +90,12 @@ def test_says_how_it_stands() -> None:
 def test_a_watched_network_has_one_step_for_all() -> None:
     """Then no agent has a step of its own, in the panel and on the page; missing steps and refusals are told."""
     report = replace(_report(5), last=4099, first=1, refused={"not finite": 3})
-    snapshot = _snapshot(5, steps=[4000], rates=[500.0], report=report)
-    text = "\n".join(_lines(snapshot, _experiment(), 120, 24))
+    found = _snapshot(5, steps=[4000], rates=[500.0], report=report)
+    text = "\n".join(_lines(found, _experiment(), 120, 24))
     assert "step 4000 of 8000  50 %  500 steps/s  1:02 left" in text
     assert "errors of 4001 steps since step 1, 98 missing, not finite: 3" in text
     assert re.search(r"│ +5 +1\.08 +0\.098 +1 +\+1\.6", text)
-    assert snapshot_document(snapshot)["steps"] == []
+    assert snapshot_document(found)["steps"] == []
     many = "\n".join(_lines(_snapshot(100, steps=[4000], rates=[500.0]), _experiment(100), 80, 24))
     assert "100 agents at step 4000" in many
 
@@ -144,7 +154,20 @@ def test_documents_for_the_page() -> None:
     assert [graph["name"] for graph in found["graphs"]] == [graph.name for graph in experiment.graph_list]
     assert found["graphs"][0]["links"] == [[0, 1], [1, 2], [2, 3], [3, 4]]
     assert len(found["places"]) == 5
-    snapshot = snapshot_document(_snapshot(5))
-    assert snapshot["system"]["measured"] == 1.45
-    assert snapshot["sojourn"] == [42, 3990, 4010]
+    found = snapshot_document(_snapshot(5))
+    assert found["system"]["measured"] == 1.45
+    assert found["sojourn"] == [42, 3990, 4010]
     assert SnapshotSource(experiment).snapshot([]).reached == -1
+
+
+def test_the_speed_of_agents_that_step_in_bursts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two agents make 64 steps every 4 s, in turn: one of them has made none in the last 3 s."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(snapshot, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    rates = StepRates()
+    assert rates.rate() is None
+    for tick in range(88):
+        clock.now = 0.25 * tick
+        rates.add([64 * (tick // 16), 64 * ((tick + 8) // 16)])
+    assert rates.rates() == [pytest.approx(64 / 3.25), 0.0]
+    assert rates.rate() == pytest.approx(64 / 3.25)

@@ -360,6 +360,11 @@ def test_graphml_that_is_none(tmp_path: Path, content: str) -> None:
         ValidExperiment.parse(changed({"graphs.ring": {"graphml": "net.graphml"}}), directory=tmp_path)
 
 
+def test_graphml_without_an_end() -> None:
+    with pytest.raises(ExperimentError, match=r"graphs\.ring\.graphml: /dev/zero: cannot be read: longer than 64 MB"):
+        ValidExperiment.parse(changed({"graphs.ring": {"graphml": "/dev/zero"}}))
+
+
 def test_graphml_weights_must_be_positive(tmp_path: Path) -> None:
     import networkx as nx
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -141,6 +142,7 @@ def test_mistakes_of_protocols(kind: Any, expected: str, offer: Callable[..., No
         (lambda k, state: state * (1e200 if k == 17 else 1) + 1e200, "the result is not finite"),
         (lambda k, state: state * (1j if k == 17 else 1), "the result is complex, expected real numbers"),
         (lambda k, state: sys.exit(0) if k == 17 else state, "SystemExit: 0"),
+        (lambda k, state: os._exit(0) if k == 17 else state, "SystemExit: os._exit(0)"),
         (lambda k, state: state[0] if k == 17 else state, "result of shape (3,), expected (1, 3)"),
         (lambda k, state: None if k == 17 else state, "result of shape (), expected (1, 3)"),
         (lambda k, state: state.__imul__(2) if k == 17 else state, "output array is read-only"),

@@ -37,6 +37,8 @@ MAGIC = b"\x89MCAP0\r\n"
 MOST_EXPANSION = 1000
 FREE_EXPANSION = 2**26
 MOST_OTHERS = 2**18  # records of a chunk that are no messages: two for every number of a channel
+MOST_CHANNELS = 2**13  # of a file: writing the metadata of each topic takes a tenth of a millisecond
+MOST_DESCRIBED = 2**26  # bytes of the schemas and channels in the chunks of a file: what they describe is kept
 _LOOSE = 2**18  # bytes of a batch of messages that are not in chunks
 _ZSTD = ".zstd"  # suffix of rosbag2's compression mode `file`
 
@@ -151,6 +153,7 @@ class McapFile:
     damaged_chunks: int = 0  # chunks that are left out
     false_indexes: int = 0  # chunks whose index is wrong: here the records decide, other programs use the index
     _expanded: int = 0  # bytes of all chunks so far
+    _described: int = 0  # bytes of the schemas and channels in them
 
     def batches(self) -> Iterator[Batch]:
         """The messages of all whole records; BagError: not an MCAP file, empty, or one that cannot be read."""
@@ -227,7 +230,10 @@ class McapFile:
             yield opcode, content, (np.array([0]), np.array([length]))
 
     def note(self, opcode: int, content: bytes) -> None:
-        """Keep the content of a record that is not a message; DamageError where it does not fit its type."""
+        """Keep the content of a record that is not a message; DamageError where it does not fit its type.
+
+        BagError where there are too many channels.
+        """
         stream = ReadDataStream(io.BytesIO(content))
         try:
             if opcode == Opcode.HEADER:
@@ -239,12 +245,16 @@ class McapFile:
             elif opcode == Opcode.CHANNEL:
                 channel = Channel.read(stream)
                 self.channels[channel.id] = channel
+                if len(self.channels) > MOST_CHANNELS:
+                    raise BagError(f"{self.path}: more than {MOST_CHANNELS} topics: record the topics of the run alone")
             elif opcode == Opcode.METADATA:
                 self.metadata.append(Metadata.read(stream))
             elif opcode == Opcode.STATISTICS:
                 self.statistics = Statistics.read(stream)
             elif opcode == Opcode.ATTACHMENT:
                 self.attachments.append(Attachment.read(stream))
+        except BagError:
+            raise
         except Exception as error:  # the library raises many kinds of errors on damage
             raise DamageError from error
 
@@ -266,6 +276,8 @@ class McapFile:
                 places = self._walk(data)
                 self.false_indexes += bool(chunk.index) and not indexed(places[0], chunk.index)
             batch = Batch.of_contents(data, *places, chunk.end)
+        except BagError:
+            raise
         except Exception:  # the library raises many kinds of errors on damage
             self.damaged_chunks += 1
             return
@@ -285,7 +297,11 @@ class McapFile:
             others += 1
             if length > len(data) - at or opcode in (0, Opcode.MESSAGE) or others > MOST_OTHERS:
                 raise DamageError
-            self.note(opcode, data[at : at + length])
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):  # nothing else belongs into a chunk
+                self._described += length
+                if self._described > MOST_DESCRIBED:
+                    raise DamageError
+                self.note(opcode, data[at : at + length])
             at += length
         none = np.empty(0, dtype=np.int64)
         return np.concatenate([none, *starts]), np.concatenate([none, *sizes])

@@ -5,10 +5,13 @@ Whatever a protocol raises or returns wrongly becomes an error that names the pr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import EntryPoint, entry_points
-from typing import TYPE_CHECKING, Any, TypeVar
+from threading import get_ident
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -136,12 +139,29 @@ class ChosenProtocol:
         Results are checked, so that numpy need not warn of an overflow, too.
         """
         try:
-            with np.errstate(all="ignore"):
+            with np.errstate(all="ignore"), _kept_alive():
                 return call()
         except (Exception, SystemExit) as error:  # of code that we know nothing about
             text = str(error) if isinstance(error, ValueError) and str(error) else f"{type(error).__name__}: {error}"
             place = f", {where}" if where else ""
             raise ProtocolError(f"{self.info}{place}: {text}") from error
+
+
+@contextmanager
+def _kept_alive() -> Iterator[None]:
+    """``os._exit`` raises SystemExit in this thread: it would end the program without a word."""
+    leave, thread = os._exit, get_ident()
+
+    def stay(status: int) -> NoReturn:
+        if get_ident() == thread:
+            raise SystemExit(f"os._exit({status})")
+        leave(status)
+
+    os._exit = stay
+    try:
+        yield
+    finally:
+        os._exit = leave
 
 
 class AgentProtocol:

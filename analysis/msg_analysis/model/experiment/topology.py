@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from itertools import combinations, pairwise
 from pathlib import Path
 from xml.etree.ElementTree import ParseError
 
 import numpy as np
 
+from msg_analysis.common.bounded_input import read_bytes
 from msg_analysis.model.experiment.problems import problem, show
 from msg_analysis.model.experiment.spec import GraphSpec, Link, is_number
 from msg_analysis.model.network.graphs import Graph
@@ -87,7 +89,7 @@ def read_graphml(name: str, file: Path) -> tuple[GraphSpec, int, list[str]]:
     key = f"graphs.{name}.graphml"
     empty = GraphSpec(edges=[])
     try:
-        graph = nx.read_graphml(file)
+        graph = nx.read_graphml(io.BytesIO(read_bytes(file)))
     except FileNotFoundError:
         return (
             empty,

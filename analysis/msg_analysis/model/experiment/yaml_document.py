@@ -9,11 +9,11 @@ from typing import Any
 
 import yaml
 
-from msg_analysis.common.bounded_input import load_yaml, read_text
+from msg_analysis.common.bounded_input import SAFE_LOADER, load_yaml, read_text
 from msg_analysis.errors import InputError
 
 
-class _StrictLoader(yaml.SafeLoader):
+class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: see there
     """The safe loader with the scalars of YAML 1.2 (1e-3 is a number, not a text), without duplicate keys."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 (of PyYAML)
@@ -27,7 +27,7 @@ class _StrictLoader(yaml.SafeLoader):
                         None, None, f"key '{key.value}' appears twice: remove one", key.start_mark
                     )
                 seen.add(key.value)
-        return super().construct_mapping(node, deep)
+        return dict(super().construct_mapping(node, deep))
 
 
 for _tag, _pattern, _first in (

@@ -22,7 +22,7 @@ from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.wire import topics
 from msg_analysis.wire.messages import ActiveGraph, StateCodec, with_state
 from msg_analysis.wire.receiving import state_frame, state_receiver
-from msg_analysis.wire.topics import agent_name
+from msg_analysis.wire.topics import Qos, agent_name
 
 
 class Group(Protocol):
@@ -47,6 +47,8 @@ class Agent(NetworkNode):
     Other agents read ``state``. Where that is not the exact state (broadcast noise, or a protocol that publishes only a
     part of it), the exact one is published on ``truth``, for the log and the live node.
     """
+
+    hears: Qos | None = None  # of its subscriptions to the states of others; None: that of the topic
 
     def __init__(
         self,
@@ -93,7 +95,7 @@ class Agent(NetworkNode):
         """Connect to the peers: agents of this process (by index) by direct calls, the others by topics."""
         self._listeners = [colleagues[j].hear for j in self._near]
         for j in self._far:
-            self.subscribe(topics.STATE, self._receiver(j), agent=j)
+            self.subscribe(topics.STATE, self._receiver(j), agent=j, qos=self.hears)
 
     def create_shared(self, agents: Sequence[Agent]) -> None:
         """Create what a process needs only once. Called on its first agent, with all its agents."""

@@ -28,6 +28,8 @@ Value = tuple[bytes, int]  # a state, and the simulated time [ns] at which it wa
 class RealtimeAgent(Agent):
     """An agent that steps by a timer on the clock of its node; parameters as in ``Agent``."""
 
+    hears = topics.PASSIVE_NEWEST  # only the newest value is of use; an overloaded network keeps none of the others
+
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         experiment = self.record.experiment

@@ -1,0 +1,118 @@
+"""Files that are small, and are meant to take long or to fill the memory. All of `make fuzz` has more of them."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import zstandard
+from mcap.reader import make_reader
+
+from msg_analysis.bags.format.inventory import Inventory
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.salvage import salvage
+from msg_analysis.errors import BagError
+
+STATE = "msg_agents_interfaces/msg/AgentState"
+
+
+def _record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def _text(value: str) -> bytes:
+    return struct.pack("<I", len(value)) + value.encode()
+
+
+def _schema(number: int, name: str) -> bytes:
+    return _record(3, struct.pack("<H", number) + _text(name) + _text("ros2msg") + struct.pack("<I", 0))
+
+
+def _channel(number: int, topic: str, schema: int = 1) -> bytes:
+    return _record(4, struct.pack("<HH", number, schema) + _text(topic) + _text("cdr") + struct.pack("<I", 0))
+
+
+def _message(channel: int, data: bytes = b"", time: int = 0) -> bytes:
+    return _record(5, struct.pack("<HIQQ", channel, 0, time, time) + data)
+
+
+def _chunk(records: bytes) -> bytes:
+    packed = zstandard.ZstdCompressor(3).compress(records)
+    head = struct.pack("<QQQI", 0, 1, len(records), 0) + _text("zstd") + struct.pack("<Q", len(packed))
+    return _record(6, head + packed)
+
+
+def _file(path: Path, records: bytes) -> Path:
+    path.write_bytes(b"\x89MCAP0\r\n" + _record(1, _text("ros2") + _text("x")) + _schema(1, STATE) + records)
+    return path
+
+
+def _string(text: str) -> bytes:
+    return b"\x00\x01\x00\x00" + struct.pack("<I", len(text) + 1) + text.encode() + b"\0"
+
+
+def test_chunks_that_expand_to_fill_the_memory(tmp_path: Path) -> None:
+    """A file of 20 kB whose only chunk has 250 MB, all of it messages: one error, before they are looked at."""
+    message = _message(1)
+    file = _file(tmp_path / "bomb.mcap", _chunk(message * (250_000_000 // len(message))))
+    assert file.stat().st_size < 50_000
+    with pytest.raises(BagError, match=r"bomb.mcap: 238 MB in chunks of \d+ kB: expected at most 1000 times as much"):
+        read_bag(file)
+
+
+def test_too_many_topics(tmp_path: Path) -> None:
+    topics = [_channel(number, f"/t{number}") for number in range(1, 10_000)]
+    for name, records in (("loose", b"".join(topics)), ("chunk", _chunk(b"".join(topics)))):
+        file = _file(tmp_path / f"{name}.mcap", records)
+        for read in (read_bag, lambda file: salvage(file, tmp_path / "out")):
+            with pytest.raises(BagError, match=f"{name}.mcap: more than 8192 topics"):
+                read(file)
+
+
+def test_too_many_run_records(tmp_path: Path) -> None:
+    records = b"".join(_message(2, _string(f'{{"run": "{i}"}}')) for i in range(101))
+    file = _file(tmp_path / "x.mcap", _schema(2, "std_msgs/msg/String") + _channel(2, "/experiment", 2) + records)
+    with pytest.raises(BagError, match="more than 100 different messages on the topic `experiment`"):
+        read_bag(file)
+
+
+def test_metadata_in_a_chunk_is_not_kept(tmp_path: Path) -> None:
+    """Chunks have messages, channels and schemas; the others could be a thousand times as large as the file."""
+    metadata = _record(12, _text("msg_agents") + struct.pack("<I", 0))
+    inventory = Inventory()
+    with pytest.raises(BagError, match="`experiment` is missing"):
+        read_bag(_file(tmp_path / "x.mcap", _chunk(metadata * 1000 + _channel(1, "/t") + _message(1))), inventory)
+    assert inventory.files[0].file.metadata == []
+    assert inventory.files[0].count.messages == 1
+
+
+def test_times_that_no_clock_shows(tmp_path: Path) -> None:
+    """The error names the damage; before, it said that a topic had not been recorded."""
+    file = _file(tmp_path / "x.mcap", _chunk(_channel(1, "/agent_1/state") + _message(1, time=2**64 - 1)) * 2)
+    with pytest.raises(BagError, match=r"x.mcap: 2 chunks are damaged \(wrong checksums, or times that no clock shows"):
+        read_bag(file)
+
+
+def test_a_number_that_two_topics_share(tmp_path: Path) -> None:
+    """The messages behind the second channel record still count as those of the first topic."""
+    records = _channel(1, "/a") + _message(1, b"x") + _channel(1, "/b") + _message(1, b"y")
+    report = salvage(_file(tmp_path / "x.mcap", records), tmp_path / "out")
+    assert report.kept_messages == 2
+    with (tmp_path / "out/out_0.mcap").open("rb") as stream:
+        topics = Counter(channel.topic for _, channel, _ in make_reader(stream).iter_messages())
+    assert topics == {"/a": 2}
+
+
+def test_many_torn_files(tmp_path: Path) -> None:
+    """What is said of them stays short."""
+    (tmp_path / "bag").mkdir()
+    for number in range(50):
+        _file(tmp_path / f"bag/bag_{number}.mcap", _channel(1, "/a") + _message(1, bytes(number)))
+    report = salvage(tmp_path / "bag", tmp_path / "out")
+    assert report.kept_messages == 50
+    assert report.torn is not None
+    assert report.torn.startswith("ends after")
+    assert report.torn.endswith("; ...")
+    assert len(report.torn) < 600
