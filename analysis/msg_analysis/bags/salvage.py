@@ -14,10 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.writer import CompressionType, Writer
+import numpy as np
 
 from msg_analysis.bags.format.inventory import FileInventory, channel_count
 from msg_analysis.bags.format.mcap_file import Batch, McapFile
+from msg_analysis.bags.format.mcap_writer import McapWriter
 from msg_analysis.bags.format.metadata import (
     METADATA_FILE,
     ChannelCount,
@@ -230,10 +231,15 @@ def _copy(file: Path, copy: Path) -> FileCount:
     source = McapFile(file)
     count = FileCount(copy.name)
     with copy.open("wb") as stream:
-        writer = Writer(stream, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD)
         batches = source.batches()
         first = next(batches, None)  # reads the header
-        writer.start(profile=source.profile or "ros2", library=source.library or "mcap")
+        writer = McapWriter(
+            stream,
+            chunk_size=CHUNK_SIZE,
+            compression="zstd",
+            profile=source.profile or "ros2",
+            library=source.library or "mcap",
+        )
         channels = _Channels(writer, source, count)
         for batch in itertools.chain([first] if first else [], batches):
             channels.write(batch)
@@ -241,7 +247,7 @@ def _copy(file: Path, copy: Path) -> FileCount:
         for record in source.metadata:
             writer.add_metadata(record.name, record.metadata)
         for item in source.attachments:
-            writer.add_attachment(item.create_time, item.log_time, item.name, item.media_type, item.data)
+            writer.add_attachment(item)
         writer.add_metadata(
             ROSBAG2_RECORD, {"serialized_metadata": dump(bag_information([count], {"salvaged": "true"}))}
         )
@@ -254,7 +260,7 @@ def _copy(file: Path, copy: Path) -> FileCount:
 class _Channels:
     """Copies messages; registers their channels and schemas in the new file when they first appear."""
 
-    def __init__(self, writer: Writer, source: McapFile, count: FileCount) -> None:
+    def __init__(self, writer: McapWriter, source: McapFile, count: FileCount) -> None:
         self._writer, self._source, self._count = writer, source, count
         self._schemas: dict[int, int] = {0: 0}  # number in the source: number in the copy; 0 means none
         # Number in the copy, and the count, of every number in the source; a topic that takes an old number later
@@ -283,12 +289,19 @@ class _Channels:
         return self._channels[number]
 
     def write(self, batch: Batch) -> None:
+        # The channel of a message may have been in a chunk that is lost.
+        known = np.flatnonzero(np.isin(batch.channel, list(self._source.channels)))
+        if not len(known):
+            return
+        head = batch.head[known]
+        numbers, first, counts = np.unique(head["channel"], return_index=True, return_counts=True)
+        renumbered = np.zeros(2**16, dtype=np.uint16)
+        for index in np.argsort(first).tolist():
+            number = int(numbers[index])
+            renumbered[number], count = self._register(number)
+            count.messages += int(counts[index])
+        head["channel"] = renumbered[head["channel"]]
+        self._writer.add_messages(head, batch.data, batch.start[known], batch.size[known])
         file = self._count
-        for number, sequence, log_time, publish_time, start, size in batch.table.tolist():
-            if number not in self._source.channels:
-                continue  # its channel was in a chunk that is lost
-            data = batch.data[start : start + size]
-            channel, count = self._register(number)
-            self._writer.add_message(channel, log_time, data, publish_time, sequence)
-            file.start, file.end = min(file.start, log_time), max(file.end, log_time)
-            count.messages += 1
+        file.start = min(file.start, int(head["log_time"].min()))
+        file.end = max(file.end, int(head["log_time"].max()))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import io
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
+from msg_analysis.bags.format.mcap_chunks import MESSAGE_HEAD
 from msg_analysis.bags.format.mcap_writer import McapWriter
 from msg_analysis.bags.format.storage_options import Compression
 
@@ -61,4 +64,56 @@ def test_without_a_message(size: int) -> None:
     for each in (writer, library):
         each.register_schema("one", "ros2msg", b"x" * size)
         each.finish()
+    assert ours.getvalue() == theirs.getvalue()
+
+
+BATCHES = st.lists(
+    st.one_of(
+        st.lists(
+            st.tuples(
+                st.integers(1, 4),
+                st.integers(0, 2**32 - 1),
+                st.integers(0, 2**64 - 1),
+                st.integers(0, 2**64 - 1),
+                st.binary(max_size=90),
+            ),
+            max_size=40,
+        ),
+        st.sampled_from(["flush", "attachment", "one"]),
+    ),
+    max_size=12,
+)
+
+
+@given(BATCHES, st.sampled_from([100, 2000, 10**6]))
+def test_many_messages_at_once(actions: list[list[tuple[int, int, int, int, bytes]] | str], chunk_size: int) -> None:
+    """The same bytes as one by one, chunks, indexes, attachments and all."""
+    ours, theirs = io.BytesIO(), io.BytesIO()
+    writer = McapWriter(ours, chunk_size=chunk_size, compression="zstd", profile="x", library="y")
+    library = Writer(theirs, chunk_size=chunk_size, compression=CompressionType.ZSTD)
+    library.start(profile="x", library="y")
+    for each in (writer, library):
+        schema = each.register_schema("one", "ros2msg", b"float64 x")
+        for topic in "abcd":
+            each.register_channel(topic, "cdr", schema, {})
+    for action in actions:
+        if action == "flush":
+            writer.flush()
+            library.flush()
+        elif action == "attachment":
+            writer.add_attachment(Attachment(3, 4, "é", "text/plain", b"data"))
+            library.add_attachment(3, 4, "é", "text/plain", b"data")
+        elif action == "one":
+            writer.add_message(3, 17, b"single", 5)
+            library.add_message(3, 17, b"single", 17, 5)
+        else:
+            head = np.array([message[:4] for message in action], dtype=MESSAGE_HEAD)
+            data = b"-" + b"-".join(message[4] for message in action)
+            size = np.array([len(message[4]) for message in action], dtype=np.int64)
+            writer.add_messages(head, data, np.cumsum(size + 1) - size, size)
+            for channel, sequence, log_time, publish_time, content in action:
+                library.add_message(channel, log_time, content, publish_time, sequence)
+    assert ours.getvalue() == theirs.getvalue()
+    writer.finish()
+    library.finish()
     assert ours.getvalue() == theirs.getvalue()

@@ -303,7 +303,7 @@ def test_failing_salvage_loses_nothing(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as context:
-        context.setattr(salvage_module.Writer, "finish", full)
+        context.setattr(salvage_module.McapWriter, "finish", full)
         with pytest.raises(BagError, match="nothing was lost"):
             salvage_in_place(directory)
     assert {file.name: file.read_bytes() for file in directory.iterdir()} == before

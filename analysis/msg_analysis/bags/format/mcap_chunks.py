@@ -48,6 +48,13 @@ def gather(data: bytes, start: IntArray, size: int) -> AnyArray:
     return np.asarray(windows[start])
 
 
+def scatter(data: AnyArray, start: IntArray, pieces: AnyArray) -> None:
+    """Copy (pieces,) of type ``V<size>`` to the offsets ``start`` of a buffer, (bytes,) uint8, where none overlap."""
+    size = pieces.itemsize
+    windows: AnyArray = np.ndarray(len(data) - size + 1, f"V{size}", data, strides=(1,))
+    windows[start] = pieces
+
+
 def chunk_head(index: ChunkIndex) -> bytes:
     """The first bytes of the record of a chunk, before its data, as its index describes it; with 0 as CRC."""
     name = index.compression.encode()
