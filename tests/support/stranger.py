@@ -21,6 +21,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.wire.messages import ActiveGraph, AgentState
+from msg_analysis.wire.state_batches import encode_batch
 
 STEPS = 300
 # Waits for every reader of the run, publishes, waits until they have everything, and only then appears as the node that
@@ -30,7 +31,7 @@ import sys, time
 from pathlib import Path
 import rclpy
 from rclpy.duration import Duration
-from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress
+from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress, StateBatch
 from std_msgs.msg import String
 from msg_agents.nodes.ros.qos import ros_profile
 from msg_analysis.wire.topics import LATCHED, STREAM
@@ -39,11 +40,12 @@ AGENTS, PROCESSES = 5, 2
 latched, stream = ros_profile(LATCHED), ros_profile(STREAM)
 rclpy.init()
 node = rclpy.create_node("stranger", enable_rosout=False)
-kinds = dict.fromkeys(("progress", "end", "epoch", "resend"), Progress) | {"graph": ActiveGraph, "experiment": String}
+kinds = dict.fromkeys(("progress", "end", "epoch", "resend"), Progress)
+kinds |= {"graph": ActiveGraph, "experiment": String, "states": StateBatch}
 readers = {"graph": PROCESSES + 1, "progress": 1, "end": PROCESSES + 1, "epoch": PROCESSES, "experiment": 1}
-readers |= {"resend": PROCESSES}
-readers |= {f"agent_{i}/state": 2 for i in (1, 2, 3, 5)}  # the recorder and the neighbour in the other process
-readers["agent_4/state"] = 1
+readers |= {"resend": PROCESSES, "states": 1}
+readers |= {f"agent_{i}/state": 1 for i in (1, 2, 3, 5)}  # the neighbour in the other process
+readers["agent_4/state"] = 0
 messages = [line.split() for line in Path(sys.argv[1]).read_text().splitlines()]
 publishers = {
     topic: node.create_publisher(kinds.get(topic, AgentState), topic, latched) for topic in dict(messages)
@@ -104,6 +106,11 @@ def _stranger(file: Path, early: int, environment: dict[str, str]) -> Iterator[N
             yield
         finally:
             process.kill()
+
+
+def batch(run: bytes, forged: Sequence[Forgery]) -> Forgery:
+    """Messages on their way to the recorder."""
+    return "states", encode_batch(run, [data for _, data in forged])
 
 
 def states(run: bytes, agent: int, *, replicas: int = 2, value: float = 9.0) -> list[Forgery]:

@@ -105,7 +105,7 @@ def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States
     """
     start, size = batch.start[chosen], batch.size[chosen]
     place = position + np.arange(len(chosen))
-    states, fixed = _fixed(batch.data, start, size, place)
+    states, fixed = own_layout(batch.data, start, size, place)
     if fixed.all():
         return states, 0
     data, pieces, end = batch.data, [], len(batch.data)
@@ -117,12 +117,15 @@ def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States
         fixed[index], start[index], size[index] = True, end, len(piece)
         pieces.append(piece)
         end += len(piece)
-    states, _ = _fixed(b"".join((data, *pieces)), start[fixed], size[fixed], place[fixed])
+    states, _ = own_layout(b"".join((data, *pieces)), start[fixed], size[fixed], place[fixed])
     return states, len(chosen) - len(states)
 
 
-def _fixed(data: bytes, start: IntArray, size: IntArray, position: IntArray) -> tuple[States, BoolArray]:
-    """The messages that have the agents' own layout, and (messages,) which ones have it."""
+def own_layout(data: bytes, start: IntArray, size: IntArray, position: IntArray) -> tuple[States, BoolArray]:
+    """The messages that have the agents' own layout, and (messages,) which ones have it.
+
+    Their offsets and sizes in ``data``, and their places in the bag, are (messages,) each.
+    """
     fixed = size >= STATE_SIZE
     long = start if fixed.all() else np.where(fixed, start, 0)
     if len(data) < STATE_SIZE:

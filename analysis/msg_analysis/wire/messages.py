@@ -94,7 +94,7 @@ class StateFrame:
 
     def __init__(self, run: bytes, replicas: int, most_heard: int = 0) -> None:
         self._fixed = b"\x01\x00\x00\x00\x00" + bytes(run)
-        self.replicas = replicas
+        self.replicas, self.most_heard = replicas, most_heard
         self._least = _STATE.size + 8 * replicas
         self.size = self._least + 8 * most_heard
 

@@ -119,8 +119,8 @@ def state_frame(record: RunRecord, *, whole: bool) -> StateFrame:
     return StateFrame(record.run.bytes, width, experiment.agents - 1 if lists_heard else 0)
 
 
-def why_refused(data: bytes, record: RunRecord, agent: int, frame: StateFrame) -> str:
-    """The ``Refusal`` of bytes that are not a state of this agent (index from 0)."""
+def why_refused(data: bytes, record: RunRecord, agent: int | None, frame: StateFrame) -> str:
+    """The ``Refusal`` of bytes that are not a state of this agent (index from 0; None: of any agent)."""
     try:
         message = AgentState.decode(data)
     except CdrError:
@@ -129,7 +129,7 @@ def why_refused(data: bytes, record: RunRecord, agent: int, frame: StateFrame) -
         return Refusal.OTHER_RUN
     if not 1 <= message.agent <= record.experiment.agents:
         return Refusal.UNKNOWN_AGENT
-    if message.agent != agent + 1:
+    if agent is not None and message.agent != agent + 1:
         return Refusal.OTHER_AGENT
     return Refusal.WRONG_LENGTH if len(message.state) != frame.replicas else Refusal.OTHER_LAYOUT
 

@@ -56,4 +56,5 @@ PROGRESS = MessageType(
 ESTIMATE = MessageType(
     _INTERFACES, "Estimate", "RIHS01_115be21e1cecad98ff8eecdcae1ab03d2a324db256d5b58f8060f94cb918c9df"
 )
+STATE_BATCH = MessageType(_INTERFACES, "StateBatch")
 STRING = MessageType("std_msgs", "String", "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18")

@@ -86,9 +86,13 @@ def agent_name(agent: int) -> str:
 EXPERIMENT = Topic("experiment", schemas.STRING, LATCHED, "switcher", "recorder, live, markers", recorded=True)
 GRAPH = Topic("graph", schemas.ACTIVE_GRAPH, LATCHED, "switcher", "agents, recorder", recorded=True)
 STATE = Topic(
-    f"agent_{_NUMBER}/state", schemas.AGENT_STATE, STREAM, "agent", "neighbours, recorder, live, markers", recorded=True
+    f"agent_{_NUMBER}/state", schemas.AGENT_STATE, STREAM, "agent", "neighbours, live, markers", recorded=True
 )
-TRUTH = Topic(f"agent_{_NUMBER}/truth", schemas.AGENT_STATE, STREAM, "agent", "recorder, live", recorded=True)
+TRUTH = Topic(f"agent_{_NUMBER}/truth", schemas.AGENT_STATE, STREAM, "agent", "live", recorded=True)
+# The same messages for the recorder, which records them under the topics above: many in one message, since each message
+# costs a reader as much as recording a hundred states. The first agent of every process publishes them.
+STATES = Topic("states", schemas.STATE_BATCH, STREAM, "agent", "recorder")
+TRUTHS = Topic("truths", schemas.STATE_BATCH, STREAM, "agent", "recorder")
 PROGRESS = Topic("progress", schemas.PROGRESS, LATCHED, "agents, recorder", "switcher")
 RESEND = Topic("resend", schemas.PROGRESS, LATCHED, "agents", "agents")
 EPOCH = Topic("epoch", schemas.PROGRESS, LATCHED, "switcher", "agents")
@@ -97,7 +101,22 @@ ESTIMATE = Topic("estimate", schemas.ESTIMATE, NEWEST, "live", "")
 MARKERS = Topic("markers", MessageType("visualization_msgs", "MarkerArray"), NEWEST, "markers", "")
 DIAGNOSTICS = Topic("/diagnostics", MessageType("diagnostic_msgs", "DiagnosticArray"), RECENT, "every process", "")
 CLOCK = Topic("/clock", MessageType("rosgraph_msgs", "Clock"), RECENT, "player", "nodes with use_sim_time")
-TOPICS = (EXPERIMENT, GRAPH, STATE, TRUTH, PROGRESS, RESEND, EPOCH, END, ESTIMATE, MARKERS, DIAGNOSTICS, CLOCK)
+TOPICS = (
+    EXPERIMENT,
+    GRAPH,
+    STATE,
+    TRUTH,
+    STATES,
+    TRUTHS,
+    PROGRESS,
+    RESEND,
+    EPOCH,
+    END,
+    ESTIMATE,
+    MARKERS,
+    DIAGNOSTICS,
+    CLOCK,
+)
 
 
 def network_topics(agents: int, namespace: str = "", *, truth: bool = False) -> Sequence[Topic]:

@@ -41,9 +41,9 @@ def _import_all() -> None:
     for name in MODULES:
         importlib.import_module(name)
     from msg_agents.nodes.ros.lean_node import load_type_support
-    from msg_analysis.wire.topics import DIAGNOSTICS, EXPERIMENT, GRAPH, PROGRESS, STATE
+    from msg_analysis.wire.topics import DIAGNOSTICS, EXPERIMENT, GRAPH, PROGRESS, STATE, STATES
 
-    load_type_support((DIAGNOSTICS, EXPERIMENT, GRAPH, PROGRESS, STATE))
+    load_type_support((DIAGNOSTICS, EXPERIMENT, GRAPH, PROGRESS, STATE, STATES))
 
 
 if __name__ == "__main__":

@@ -8,18 +8,16 @@ from pathlib import Path
 from msg_agents.nodes.diagnostics import Health
 from msg_agents.nodes.network_node import NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.ros.timers import every
-from msg_agents.stepping.received_steps import ReceivedSteps
+from msg_agents.stepping.state_receiver import StateReceiver
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.errors import BagError
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.wire import topics
-from msg_analysis.wire.messages import stamp_ns
-from msg_analysis.wire.receiving import fault_of, state_frame, why_refused
 from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.topics import Topic, network_topics
 
-BATCH = 16  # states collected before they are written: cheaper than one by one, and the core is not held for long
+WRITE_SIZE = 2**18  # bytes of states after which they are written: many at once cost a fraction of one by one
 WRITE_PERIOD = 0.1  # s of wall time after which fewer are written, in slow runs and at the end
 FLUSH_PERIOD = 1.0
 """s of wall time: a killed recorder loses at most so much, even if a chunk takes longer to fill."""
@@ -37,24 +35,18 @@ class Recorder(NetworkNode):
         # In the bag topics keep their own names, even if they are remapped: readers of bags look for these.
         self._root = self.get_namespace().rstrip("/") + "/"
         recorded = network_topics(experiment.agents, self._root, truth=experiment.truth)
-        self._last, self._graphs = experiment.steps, len(experiment.graph_list)
-        kinds = [(topics.STATE, state_frame(record, whole=False))]
+        self._last = experiment.steps
+        self._kinds = [StateReceiver(record, topics.STATES, topics.STATE, self._root)]
         if experiment.truth:
-            kinds.append((topics.TRUTH, state_frame(record, whole=True)))
-        self._sources = [  # of states: agent (from 0), topic in the bag, layout of its messages
-            (agent, self._root + topic.of(agent), frame) for topic, frame in kinds for agent in range(experiment.agents)
-        ]
-        self._received = [ReceivedSteps(experiment.steps) for _ in self._sources]
+            self._kinds.append(StateReceiver(record, topics.TRUTHS, topics.TRUTH, self._root))
         self._next_sojourn = 0  # the first one that has not been written
         self._sojourns: dict[int, int] = {}  # of those written after it: last step by number
-        self._pending: list[tuple[int, bytes]] = []  # source and bytes of states not yet written
         # Topics whose last message (last state, last sojourn, experiment) has not arrived.
         self._awaiting = {topic.name for topic in recorded}
         self.subscribe(topics.EXPERIMENT, self._record_experiment)
         self.subscribe(topics.GRAPH, self._record_graph)
-        for kind, (topic, _) in enumerate(kinds):
-            for agent in range(experiment.agents):
-                self.subscribe(topic, self._collector(kind * experiment.agents + agent), agent=agent)
+        for kind in self._kinds:
+            self.subscribe(kind.topic, self._collector(kind))
         self._progress = self.publisher_of(topics.PROGRESS)
         self.finish_at_end()
         self.bag = BagWriter(directory, recorded, record=record.to_json(), storage=storage)
@@ -71,35 +63,25 @@ class Recorder(NetworkNode):
         self._guarded(self._write_states)()
         self.bag.close(complete=not self._awaiting)
 
-    def _collector(self, source: int) -> Callable[[bytes], None]:
-        """The callback for one topic of states. Hot path."""
-        pending, write_states = self._pending, self._guarded(self._write_states)
+    def _collector(self, kind: StateReceiver) -> Callable[[bytes], None]:
+        """The callback for the batches of a kind of states."""
+        write_states = self._guarded(self._write_states)
 
         def collect(data: bytes) -> None:
-            pending.append((source, data))
-            if len(pending) >= BATCH:
+            if kind.add(data) >= WRITE_SIZE:
                 write_states()
 
         return collect
 
     def _write_states(self) -> None:
-        """Write the collected states, many at once: a fraction of the time of writing each on arrival."""
-        write, last, received = self.bag.write, self._last, self._received
-        for source, data in self._pending:
-            agent, topic, layout = self._sources[source]
-            frame = layout.unwrap(data)
-            if frame is None or frame[0] != agent + 1:  # not what the agents of this run send: find out why
-                self.refuse(why_refused(data, self.record, agent, layout), topic)
-                continue
-            step, mode, state = frame[1:]
-            if refusal := fault_of(step, mode, state, self._graphs) or received[source].take(step, hash(data)):
-                self.refuse(refusal, topic)
-                if refusal != Refusal.CONTRADICTION:  # one of the two is forged: the reader of the bag takes neither
-                    continue
-            write(topic, data, max(0, stamp_ns(data)))
-            if step == last:
-                self._received_last(topic)
-        self._pending.clear()
+        for kind in self._kinds:
+            found = kind.take()
+            for topic, reason in found.refused:
+                self.refuse(reason, topic)
+            if len(found.agent):
+                self.bag.write_many(kind.names, found.agent, found.time, found.data, found.start, found.size)
+            for agent in found.agent[found.step == self._last].tolist():
+                self._received_last(kind.names[agent])
 
     def _record_graph(self, data: bytes) -> None:
         graph = self.decode_graph(data)

@@ -44,12 +44,17 @@ class NewestValues(AgentInputs[Value]):
         if newest is None:
             return Refusal.NOT_A_PEER
         if step <= newest:
-            return Refusal.REPEATED
+            differs = step == newest and self._values.get(agent, value) != value
+            return Refusal.CONTRADICTION if differs else Refusal.REPEATED
         if step > self.steps or step > self._reach():
             return Refusal.TOO_NEW
         self._newest[agent] = step
         self._values[agent] = value
         return None
+
+    def known(self, agent: int) -> Value:
+        """The newest value of an agent."""
+        return self._values[agent]
 
     def review(self) -> None:
         """Drop what is beyond ``reach``: it was taken before the epoch was known."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.wire.refusals import Refusal
@@ -53,10 +54,27 @@ class ReceivedSteps:
         self._marks[slot] = -known
         return Refusal.CONTRADICTION
 
+    def take_row(self, first: int, contents: Sequence[int]) -> bool:
+        """Take the steps from ``first`` on at once, if they follow ``row`` and all are new; else False, and none."""
+        size, last = len(self._marks), first + len(contents) - 1
+        slot = first % size
+        end = slot + len(contents)
+        if first != self.row + 1 or last > self._last or end > size or any(self._marks[slot:end]):
+            return False
+        self._marks[slot:end] = array("i", [(content & 0x3FFFFFFF) + 1 for content in contents])
+        self._move(last)
+        while self.row < self._last and self._marks[(self.row + 1) % size]:
+            self._move(self.row + 1)
+        return True
+
     def _move(self, row: int) -> None:
         """Set ``row``; the steps that are then within reach take the places of old ones."""
         size = len(self._marks)
-        first = max(self.row, row - size) + RESEND_LIMIT + 1
-        for step in range(first, min(row + RESEND_LIMIT, self._last) + 1):
-            self._marks[step % size] = 0
+        step = max(self.row, row - size) + RESEND_LIMIT + 1
+        end = min(row + RESEND_LIMIT, self._last) + 1
+        while step < end:
+            slot = step % size
+            count = min(end - step, size - slot)
+            self._marks[slot : slot + count] = array("i", bytes(4 * count))
+            step += count
         self.row = row

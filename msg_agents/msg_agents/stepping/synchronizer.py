@@ -95,6 +95,10 @@ class Synchronizer(AgentInputs[Value]):
             self._missing -= 1
         return None
 
+    def known(self, agent: int, step: int) -> Value:
+        """x_agent(step), which was taken not long ago."""
+        return self._buffers[agent][step]
+
     def ready(self) -> bool:
         """Whether the next step can be made now."""
         return not self._missing and (self.step <= self._limit or self._within_window())

@@ -125,14 +125,18 @@ class McapWriter:
 
         The same bytes as by ``add_message`` for each, in a fraction of the time.
         """
-        end = np.cumsum(size + MESSAGE.size)
         done = 0
         while done < len(head):
-            room = self._chunk_size - self._size + (int(end[done - 1]) if done else 0)
-            stop = min(int(np.searchsorted(end, room, side="right")) + 1, len(head))  # one beyond the room
-            piece = slice(done, stop)
+            piece = slice(done, done + self.fitting(size[done:]))
             self._add_piece(head[piece], data, start[piece], size[piece])
-            done = stop
+            done = piece.stop
+
+    def fitting(self, size: IntArray) -> int:
+        """How many of the messages with these sizes, (messages,), go into the chunk in progress."""
+        end = np.cumsum(size + MESSAGE.size)
+        return min(
+            int(np.searchsorted(end, self._chunk_size - self._size, side="right")) + 1, len(size)
+        )  # one too many
 
     def _add_piece(self, head: AnyArray, data: bytes, start: IntArray, size: IntArray) -> None:
         """Append messages to one chunk, and finish that when it is full."""
@@ -147,10 +151,13 @@ class McapWriter:
             if length:
                 scatter(records, place[of_it], gather(data, start[of_it], length))
         self._chunk.append(records.tobytes())
+        order = np.argsort(head["channel"], kind="stable")
         entries = np.column_stack((head["log_time"], (place - MESSAGE.size + self._size).astype(np.uint64)))
-        channels, first = np.unique(head["channel"], return_index=True)
-        for channel in channels[np.argsort(first)].tolist():
-            self._index[channel] += entries[head["channel"] == channel].ravel().tolist()
+        flat = entries[order].ravel().tolist()
+        channels, first, counts = np.unique(head["channel"][order], return_index=True, return_counts=True)
+        for number in np.argsort(order[first]).tolist():  # as they come
+            begin = int(first[number])
+            self._index[int(channels[number])] += flat[2 * begin : 2 * (begin + int(counts[number]))]
         self._size += total
         if self._size > self._chunk_size:
             self._finish_chunk()

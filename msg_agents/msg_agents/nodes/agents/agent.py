@@ -31,6 +31,21 @@ class Group(Protocol):
     turns: TurnQueue
     progress_period: float
 
+    def record_state(self, message: bytes) -> None:
+        """See AgentGroup."""
+
+    def record_truth(self, message: bytes) -> None:
+        """See AgentGroup."""
+
+    def record_contradiction(self, message: bytes, state: bytes) -> None:
+        """See AgentGroup."""
+
+    def send_batches(self) -> None:
+        """See AgentGroup."""
+
+    def missing_recorder(self) -> list[str]:
+        """See AgentGroup."""
+
     def report(self, agent: int, step: int) -> None:
         """See AgentGroup."""
 
@@ -65,6 +80,7 @@ class Agent(NetworkNode):
         super().__init__(agent_name(agent), record=record)
         experiment = record.experiment
         self._law = agent_law(record, model, agent)
+        self._last = experiment.steps
         self._codec = StateCodec(self.run, agent + 1, experiment.width, experiment.step_length)
         self._frame = state_frame(record, whole=False)
         self._whole = state_frame(record, whole=True)
@@ -77,14 +93,14 @@ class Agent(NetworkNode):
         self._far = [j for j in peers if j not in near]
         self._near = [j for j in peers if j in near]
         self._listeners: list[Callable[[int, int, int, bytes, bytes], str | None]] = []
-        self._expected = [*map(agent_name, self._far), *readers]
+        # The recorder reads the batches of the process instead.
+        self._expected = [*map(agent_name, self._far), *(name for name in readers if name != RECORDER)]
         self._next_progress = 0.0
         self._stall = StallDetector()
         self._states = self.publisher_of(topics.STATE, agent)
         self._truth: Publisher | None = None
         if experiment.truth:
             self._truth = self.publisher_of(topics.TRUTH, agent)
-            self._awaits_truth = [name for name in readers if name == RECORDER]  # others need only what agents hear
 
     @property
     def step(self) -> int:
@@ -102,19 +118,15 @@ class Agent(NetworkNode):
 
     def discovered_all(self) -> bool:
         """See NetworkNode."""
-        return self.has_readers(self._states, self._expected) and (
-            self._truth is None or self.has_readers(self._truth, self._awaits_truth)
-        )
+        return self.has_readers(self._states, self._expected) and not self._group.missing_recorder()
 
     def missing_nodes(self) -> list[str]:
         """See NetworkNode."""
-        missing = self.missing_readers(self._states, self._expected)
-        if self._truth is not None:
-            missing += self.missing_readers(self._truth, self._awaits_truth)
-        return missing
+        return self.missing_readers(self._states, self._expected) + self._group.missing_recorder()
 
     def finish(self, *, complete: bool, deadline: float) -> None:
         """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""
+        self._group.send_batches()
         for writer in (self._states, self._truth):
             if complete and writer is not None and self.has_other_readers(writer):
                 writer.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
@@ -153,11 +165,15 @@ class Agent(NetworkNode):
         """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it."""
         if self._truth is not None:
             self.publish(self._truth, message)
+            self._group.record_truth(message)
             whole, state = state, self._law.published(step, state)
             message = with_state(message, state, len(whole))
         self.publish(self._states, message)
+        self._group.record_state(message)
         for hear in self._listeners:
             hear(self._law.agent, step, mode, state, message)
+        if step == self._last:
+            self._group.send_batches()
 
     def send_again(self, since: int) -> None:
         """Repeat the states from step ``since`` on, for a reader that may have missed them."""
@@ -169,6 +185,7 @@ class Agent(NetworkNode):
             frame = self._whole.unwrap(message)
             assert frame is not None, "written by this software"
             self._send(step, frame[2], frame[3], message)
+        self._group.send_batches()
 
     def _ask_again(self) -> None:
         """Ask the peers in other processes for states that may have been missed."""

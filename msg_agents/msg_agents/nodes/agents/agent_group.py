@@ -10,10 +10,13 @@ from rclpy.publisher import Publisher
 from msg_agents.nodes.agents.agent import Agent
 from msg_agents.nodes.agents.lockstep_agent import LockstepAgent
 from msg_agents.nodes.agents.realtime_agent import RealtimeAgent
+from msg_agents.nodes.agents.state_batches import StateBatches
+from msg_agents.processes.process_plan import RECORDER
 from msg_agents.stepping.turn_queue import TurnQueue
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.wire import topics
+from msg_analysis.wire.messages import with_state
 
 AGENTS: dict[str, type[Agent]] = {"lockstep": LockstepAgent, "realtime": RealtimeAgent}  # by pace
 PROGRESS_PERIOD = 0.2  # s of wall time between two Progress messages of an agent, in a small network
@@ -58,6 +61,9 @@ class AgentGroup:
         self._host = self.nodes[0]
         self._host.create_shared(self.nodes)
         self._progress = self._host.publisher_of(topics.PROGRESS)
+        self._awaits_recorder = RECORDER in readers
+        self._states = StateBatches(self._host, topics.STATES)
+        self._truths = StateBatches(self._host, topics.TRUTHS) if record.experiment.truth else None
         self._resend: Publisher | None = None
         self._host.subscribe(topics.GRAPH, self._receive_graph)
         self._host.subscribe(topics.RESEND, self._receive_resend)
@@ -70,6 +76,35 @@ class AgentGroup:
         """End the process with the error of an agent."""
         for agent in self.nodes:
             agent.fail(error)
+
+    def record_state(self, message: bytes) -> None:
+        """Send a state as other agents hear it to the recorder."""
+        self._states.add(message)
+
+    def record_truth(self, message: bytes) -> None:
+        """Send the exact state, where that is another one."""
+        assert self._truths is not None
+        self._truths.add(message)
+
+    def record_contradiction(self, message: bytes, state: bytes) -> None:
+        """Tell the recorder that an agent has heard two states of one step, this message and another ``state``.
+
+        One of them is forged, and nobody can know which: in the bag are both, so that nothing is concluded from them.
+        """
+        self._states.add(with_state(message, state))
+        self._states.add(message)
+
+    def send_batches(self) -> None:
+        """Send to the recorder at once what has been collected for it."""
+        for batches in (self._states, self._truths):
+            if batches is not None:
+                batches.send()
+
+    def missing_recorder(self) -> list[str]:
+        """The recorder, if it is awaited and has not been discovered."""
+        if not self._awaits_recorder:
+            return []
+        return self._states.missing_nodes() + (self._truths.missing_nodes() if self._truths else [])
 
     def report(self, agent: int, step: int) -> None:
         """Tell the switcher which step an agent (index from 0) has reached."""

@@ -12,6 +12,7 @@ from msg_agents.nodes.diagnostics import Health
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, Synchronizer
 from msg_analysis.model.experiment.protocol_binding import ProtocolError
 from msg_analysis.wire.messages import ActiveGraph
+from msg_analysis.wire.refusals import Refusal
 
 
 class LockstepAgent(Agent):
@@ -61,6 +62,8 @@ class LockstepAgent(Agent):
     def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002
         """See Agent."""
         reason = self._synchronizer.offer(peer, step, state)
+        if reason == Refusal.CONTRADICTION:
+            self._group.record_contradiction(message, self._synchronizer.known(peer, step))
         if not reason and self._synchronizer.ready():
             self._turns.ask(self)
         return reason

@@ -131,7 +131,10 @@ class RealtimeAgent(Agent):
 
     def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002
         """See Agent."""
-        return self._newest.offer(peer, step, (state, stamp_ns(message)))
+        reason = self._newest.offer(peer, step, (state, stamp_ns(message)))
+        if reason == Refusal.CONTRADICTION:
+            self._group.record_contradiction(message, self._newest.known(peer)[0])
+        return reason
 
     def learn(self, graph: ActiveGraph) -> str | None:
         """See Agent."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from msg_agents_interfaces.msg import ActiveGraph, AgentState, Estimate, Progress
+from msg_agents_interfaces.msg import ActiveGraph, AgentState, Estimate, Progress, StateBatch
 from rclpy.serialization import deserialize_message, serialize_message
 
 
-@pytest.mark.parametrize("kind", [ActiveGraph, AgentState, Estimate, Progress])
+@pytest.mark.parametrize("kind", [ActiveGraph, AgentState, Estimate, Progress, StateBatch])
 def test_there_and_back(kind: type) -> None:
     message = kind()
     message.run = list(range(16))

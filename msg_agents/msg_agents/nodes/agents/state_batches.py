@@ -1,0 +1,54 @@
+"""The states of the agents of a process on their way to the recorder: few messages with many states each."""
+
+from __future__ import annotations
+
+import time
+
+from rclpy.publisher import Publisher
+
+from msg_agents.nodes.network_node import NetworkNode
+from msg_agents.nodes.ros.timers import every
+from msg_agents.processes.process_plan import RECORDER
+from msg_analysis.wire.state_batches import encode_batch
+from msg_analysis.wire.topics import Topic
+
+BATCH_SIZE = 8192
+"""Bytes after which a batch is sent. Before the agents wait for a recorder that has stopped, the middleware keeps 5,000
+batches for it: with larger ones they need too much memory."""
+
+BATCH_TIME = 0.1  # s of wall time after which a batch is sent with the next state, however small it is
+SEND_PERIOD = 0.5  # s of wall time after which it is sent in any case
+
+
+class StateBatches:
+    """Collects the messages of a kind of states (``topic``: STATES or TRUTHS), and sends them from ``node``."""
+
+    def __init__(self, node: NetworkNode, topic: Topic) -> None:
+        self._node = node
+        self._publisher: Publisher = node.publisher_of(topic)
+        self._messages: list[bytes] = []
+        self._size, self._due = 0, 0.0
+        self._found = False
+        every(node, SEND_PERIOD, self.send)
+
+    def add(self, message: bytes) -> None:
+        """Send a message, later and with others. Hot path."""
+        if not self._messages:
+            self._due = time.monotonic() + BATCH_TIME
+        self._messages.append(message)
+        self._size += len(message)
+        if self._size >= BATCH_SIZE or time.monotonic() >= self._due:
+            self.send()
+
+    def send(self) -> None:
+        """Send what is there now."""
+        if self._messages:
+            batch = encode_batch(self._node.run, self._messages)
+            self._messages.clear()
+            self._size = 0
+            self._node.publish(self._publisher, batch)
+
+    def missing_nodes(self) -> list[str]:
+        """The recorder, until it has been discovered."""
+        self._found = self._found or self._node.has_readers(self._publisher, [RECORDER])
+        return [] if self._found else [RECORDER]

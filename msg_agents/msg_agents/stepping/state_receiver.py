@@ -1,0 +1,143 @@
+"""What a recorder does with batches of states: the states of the run, each once, or why they are refused. No ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_agents.stepping.received_steps import ReceivedSteps
+from msg_analysis.bags.format.mcap_chunks import gather
+from msg_analysis.bags.state_columns import States, own_layout, run_number
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.types import AnyArray, BoolArray, IntArray
+from msg_analysis.wire.cdr_fields import CdrError
+from msg_analysis.wire.receiving import fault_of, state_frame, why_refused
+from msg_analysis.wire.refusals import Refusal
+from msg_analysis.wire.state_batches import decode_batch
+from msg_analysis.wire.topics import TRUTHS, Topic
+
+_WORD = 4  # bytes; every message in the agents' layout is a multiple of it
+_MARK_SHIFT = np.uint64(34)  # the 30 highest bits of a sum are the mark of a message
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Received:
+    """States to be written, in the order in which they came, and what was refused."""
+
+    data: bytes  # in which their messages are
+    start: IntArray  # (states,) offsets
+    size: IntArray  # (states,) bytes
+    agent: IntArray  # (states,) from 0
+    step: IntArray  # (states,)
+    time: IntArray  # (states,) stamp [ns], at least 0
+    refused: list[tuple[str, str]]  # topic and ``Refusal``
+
+
+class StateReceiver:
+    """Takes the batches of a topic (STATES or TRUTHS); ``of``: the topic of the same states, one for each agent.
+
+    ``root``: namespace of the network, with a slash at its end.
+    """
+
+    def __init__(self, record: RunRecord, topic: Topic, of: Topic, root: str) -> None:
+        experiment = record.experiment
+        self.topic = topic
+        self.names = [root + of.of(agent) for agent in range(experiment.agents)]  # by agent
+        self._record, self._run = record, run_number(record.run.bytes)
+        self._frame = state_frame(record, whole=topic is TRUTHS)
+        self._graphs = len(experiment.graph_list)
+        self._received = [ReceivedSteps(experiment.steps) for _ in range(experiment.agents)]
+        self._batches: list[bytes] = []
+        self._filled = 0
+        # Odd numbers, the same in every run: two messages have the same mark with probability 2^-30.
+        words = -(-self._frame.size // _WORD)
+        self._weights = np.random.Generator(np.random.PCG64(0)).integers(0, 2**63, words, dtype=np.uint64) * 2 + 1
+
+    def add(self, data: bytes) -> int:
+        """Take a batch; the number of bytes that wait."""
+        self._batches.append(data)
+        self._filled += len(data)
+        return self._filled
+
+    def take(self) -> Received:
+        """What has come since the last call."""
+        refused: list[tuple[str, str]] = []
+        data, start, size = self._messages(refused)
+        states, _ = own_layout(data, start, size, np.arange(len(start)))
+        good = self._possible(states)
+        kept = np.zeros(len(start), np.bool_)
+        kept[states.position[good]] = True
+        for index in np.flatnonzero(~kept).tolist():
+            refused.append(self._fault(data[start[index] : start[index] + size[index]]))
+        states = states[good]
+        agent, step = states.agent - 1, states.step
+        new = self._take(agent, step, self._marks(data, states.start, size[states.position]), refused)
+        states = states[new]
+        time = np.maximum(states.stamp, 0)
+        return Received(data, states.start, size[states.position], agent[new], step[new], time, refused)
+
+    def _take(self, agent: IntArray, step: IntArray, marks: AnyArray, refused: list[tuple[str, str]]) -> BoolArray:
+        """(states,) which of them to write: those that have not come before, and of contradicting ones two."""
+        new = np.ones(len(agent), np.bool_)
+        if not len(agent):
+            return new
+        order = np.argsort(agent, kind="stable")
+        present, first = np.unique(agent[order], return_index=True)
+        for i, its in zip(present.tolist(), np.split(order, first[1:]), strict=True):
+            received, steps = self._received[i], step[its]
+            if (np.diff(steps) == 1).all() and received.take_row(int(steps[0]), marks[its].tolist()):
+                continue  # as nearly always
+            for index, k, mark in zip(its.tolist(), steps.tolist(), marks[its].tolist(), strict=True):
+                refusal = received.take(k, mark)
+                if refusal:
+                    refused.append((self.names[i], refusal))
+                    # Of a contradiction one is forged: the reader of the bag takes neither.
+                    new[index] = refusal == Refusal.CONTRADICTION
+        return new
+
+    def _messages(self, refused: list[tuple[str, str]]) -> tuple[bytes, IntArray, IntArray]:
+        """The messages of all batches: their bytes, (messages,) offsets, and (messages,) sizes."""
+        parts, sizes = [], [np.empty(0, np.int64)]
+        for batch in self._batches:
+            try:
+                run, size, messages = decode_batch(batch)
+            except CdrError:
+                refused.append((self.topic.name, Refusal.UNDECODABLE))
+                continue
+            if run != self._record.run.bytes:
+                refused.append((self.topic.name, Refusal.OTHER_RUN))
+                continue
+            parts.append(messages)
+            sizes.append(size)
+        self._batches.clear()
+        self._filled = 0
+        size = np.concatenate(sizes)
+        return b"".join(parts), np.cumsum(size) - size, size
+
+    def _possible(self, states: States) -> BoolArray:
+        """(states,) whether an agent of this run can have sent them."""
+        frame, step, mode = self._frame, states.step, states.mode
+        good = states.of_run(self._run)
+        good &= (states.replicas == frame.replicas) & (states.heard_count <= frame.most_heard)
+        good &= (states.agent >= 1) & (states.agent <= len(self.names))
+        good &= (mode <= self._graphs) & ((mode == 0) == (step == 0))
+        found = np.flatnonzero(good)
+        good[found] = np.isfinite(states[found].state(frame.replicas)).all(axis=1)
+        return good
+
+    def _fault(self, data: bytes) -> tuple[str, str]:
+        """Topic and ``Refusal`` of a message that is not possible."""
+        frame = self._frame.unwrap(data)
+        if frame is None or not 1 <= frame[0] <= len(self.names):
+            return self.topic.name, why_refused(data, self._record, None, self._frame)
+        return self.names[frame[0] - 1], fault_of(*frame[1:], self._graphs) or Refusal.OTHER_LAYOUT
+
+    def _marks(self, data: bytes, start: IntArray, size: IntArray) -> AnyArray:
+        """(states,) a mark of every message: messages with different marks differ."""
+        marks = np.zeros(len(start), np.uint64)
+        for length in np.unique(size).tolist():
+            alike = np.flatnonzero(size == length)
+            words = gather(data, start[alike], length).view("<u4").reshape(len(alike), -1)
+            marks[alike] = words.astype(np.uint64) @ self._weights[: words.shape[1]]
+        return marks >> _MARK_SHIFT
