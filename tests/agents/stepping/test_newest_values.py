@@ -131,3 +131,13 @@ def test_the_end() -> None:
 def test_inputs_must_be_peers() -> None:
     with pytest.raises(ValueError, match="agent 0 uses"):
         NewestValues(agent=0, steps=STEPS, inputs=[[2]], peers=[1], reach=Clock())
+
+
+def test_another_value_of_the_newest_step() -> None:
+    """One of the two is forged; the first is used."""
+    node = newest(Clock())
+    assert node.offer(1, 5, "first") is None
+    assert node.offer(1, 5, "first") == Refusal.REPEATED
+    assert node.offer(1, 5, "second") == Refusal.CONTRADICTION
+    assert node.known(1) == "first"
+    assert node.offer(1, 4, "older") == Refusal.REPEATED

@@ -94,3 +94,32 @@ def test_memory_does_not_grow() -> None:
     grown, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert grown < 10_000
+
+
+@given(st.integers(0, 2**32), st.sampled_from([3, 50, 7_000, 13_000, LONG]))
+def test_rows_at_once_are_the_same_as_one_by_one(seed: int, last: int) -> None:
+    """Rows that follow, repeat, overlap or leave gaps: what one by one says, and the same marks afterwards."""
+    chance = random.Random(seed)
+    rows, singles = ReceivedSteps(last), ReceivedSteps(last)
+    step = 0
+    for _ in range(30):
+        first = max(0, step + chance.choice([0, 0, 0, 0, 1, -3, 100, -RESEND_LIMIT]))
+        contents = [hash((k, chance.random() < 0.01)) for k in range(first, first + chance.randrange(1, 900))]
+        one_by_one = [singles.take(k, content) for k, content in enumerate(contents, start=first)]
+        if rows.take_row(first, contents):
+            assert one_by_one == [None] * len(contents)
+        else:
+            assert [rows.take(k, content) for k, content in enumerate(contents, start=first)] == one_by_one
+        assert rows.row == singles.row
+        step = min(first + len(contents), last + 1)
+    for k in range(max(0, step - 2 * RESEND_LIMIT), min(step + RESEND_LIMIT, last) + 1, 7):
+        assert rows.take(k, k) == singles.take(k, k)
+
+
+def test_a_row_beyond_the_end() -> None:
+    steps = ReceivedSteps(5)
+    assert not steps.take_row(0, range(7))
+    assert not steps.take_row(1, range(3))
+    assert steps.take_row(0, range(6))
+    assert steps.row == 5
+    assert not steps.take_row(6, [1])
