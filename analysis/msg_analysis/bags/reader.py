@@ -19,6 +19,7 @@ from msg_analysis.bags.format.mcap_file import Batch, McapFile
 from msg_analysis.bags.format.metadata import METADATA_FILE, read_metadata
 from msg_analysis.bags.trajectory_builder import Collector
 from msg_analysis.bags.writer import RECORD_NAME, recording_pid
+from msg_analysis.common.long_work import tell
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
@@ -54,7 +55,8 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
     contents = _Contents(path)
     unreadable: list[BagError] = []
     files = bag_files(path)
-    for file in files:
+    for number, file in enumerate(files):
+        tell(f"reading {path.name}", number, len(files))
         entry = (inventory or Inventory()).add(McapFile(file))
         try:
             contents.read(entry.file, entry.watch() if inventory else entry.file.batches())
@@ -121,7 +123,9 @@ class _Contents:
     def read(self, file: McapFile, batches: Iterable[Batch]) -> None:
         kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: not a topic of the network
         known = 0
+        size = file.path.stat().st_size
         for batch in batches:
+            tell(f"reading {file.path.name}", min(batch.end, size), size)
             for number, channel in itertools.islice(file.channels.items(), known, None):
                 schema = file.schemas.get(channel.schema_id)
                 pattern = _TOPICS.get(schema.name if schema else "")

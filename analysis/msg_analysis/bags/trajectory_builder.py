@@ -12,6 +12,7 @@ import numpy as np
 
 from msg_analysis.bags.format.mcap_file import Batch
 from msg_analysis.bags.state_columns import States, decode_states, run_number
+from msg_analysis.common.large_arrays import in_file, large_zeros, release
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment.memory import amount, available_memory
 from msg_analysis.model.run.record import RunRecord
@@ -21,6 +22,8 @@ from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.wire.refusals import Refusal
 
 _NEVER = np.zeros(1, dtype=np.bool_)
+RELEASED_AT_ONCE = 2**22  # numbers of states after which the memory of large arrays is given back
+_CELLS = 2**20  # states that are looked at together at the end
 _OTHER_COLUMNS = 4  # numbers of 8 bytes per state beside its own values, some only while it is processed
 
 
@@ -108,23 +111,28 @@ class Collected:
         cells = self._shape[0] * self._shape[1]
         # The result has the size that the record states, however little of it the bag holds.
         needed, available = 8 * cells * (width + _OTHER_COLUMNS + most), available_memory()
+
+        def zeros(shape: tuple[int, ...], dtype: type[np.generic]) -> AnyArray:
+            return large_zeros(shape, dtype, total=needed)
+
         try:
-            if needed > available:
+            # 0 means missing: position, modes, used and made are kept plus one until `finish`. The position is that of
+            # the copy that was kept.
+            self._states: FloatArray = zeros((cells, width), np.float64)
+            if not in_file(self._states) and needed > available:
                 raise MemoryError
-            # Zeros cost no memory before they are written, so 0 means missing: position, modes, used and made are
-            # kept plus one until `finish`. The position is that of the copy that was kept.
-            self._position = np.zeros(cells, dtype=np.int64)
-            self._states: FloatArray = np.zeros((cells, width))
-            self._modes = np.zeros(cells, dtype=np.int64)
-            self._used = np.zeros((cells, most if self._realtime else 0), dtype=np.int64)
-            self._made = np.zeros(cells if self._realtime else 0, dtype=np.int64)
-            self._lost = np.zeros((cells, 0 if self._realtime else most), dtype=np.bool_)
+            self._position = zeros((cells,), np.int64)
+            self._modes = zeros((cells,), np.int64)
+            self._used = zeros((cells, most if self._realtime else 0), np.int64)
+            self._made = zeros((cells if self._realtime else 0,), np.int64)
+            self._lost = zeros((cells, 0 if self._realtime else most), np.bool_)
             self._listed = np.zeros(cells if self._lossy else 0, dtype=np.bool_)  # whether ``heard`` was not empty
         except (MemoryError, ValueError) as error:
             raise BagError(
                 f"run {record.run}: {experiment.steps} steps of {experiment.agents} agents need {amount(needed)}, "
                 f"expected at most {amount(available)}, the memory available: read it on a larger machine"
             ) from error
+        self._unreleased = 0  # states since the last release
         self._contradicted: list[IntArray] = []
         self.lost: BoolArray | None = None
         self.used: IntArray | None = None
@@ -134,6 +142,17 @@ class Collected:
 
     def add(self, states: States) -> None:
         """Put states of this run in their places; they come in the order of the bag, from call to call too."""
+        self._add(states)
+        self._unreleased += len(states)
+        if self._unreleased * self._width > RELEASED_AT_ONCE:
+            self._release()
+
+    def _release(self) -> None:
+        self._unreleased = 0
+        for array in (self._states, self._position, self._modes, self._used, self._made, self._lost):
+            release(array)
+
+    def _add(self, states: States) -> None:
         states, values = self._good(states)
         cell = states.step * self._shape[1] + states.agent - 1
         place = states.position + 1
@@ -228,16 +247,20 @@ class Collected:
             for array in (self._position, self._modes, self._used, self._made, self._lost):
                 if len(array):
                     array[cells] = 0
-        missing = self._position == 0
-        self._states[missing] = np.nan
-        self.received = len(missing) - int(missing.sum())
+        self.received = 0
+        for first in range(0, len(self._position), _CELLS):  # in pieces: a run may be long
+            piece = slice(first, first + _CELLS)
+            missing = self._position[piece] == 0
+            self._states[piece][missing] = np.nan
+            self._modes[piece] -= 1
+            self._used[piece] -= 1
+            self._made[piece] -= 1
+            self.received += len(missing) - int(missing.sum())
+            self._release()
         self.out_of_order = _out_of_order(self._position.reshape(self._shape))
-        self._modes -= 1
         self.states = self._states.reshape(*self._shape, self._width)
         self.modes = self._modes.reshape(self._shape)
         if self._realtime:
-            self._used -= 1
-            self._made -= 1
             self.used = self._used.reshape(*self._shape, self._used.shape[1])[1:]
             self.made = self._made.reshape(self._shape)
         elif self._lossy:

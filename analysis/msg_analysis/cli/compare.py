@@ -9,6 +9,7 @@ import click
 from msg_analysis.cli.console import examples, print_json, print_text, result_console
 from msg_analysis.cli.options import BAG, FILE, RESULT, json_option, level_option
 from msg_analysis.common.files import require_place
+from msg_analysis.common.long_work import watched
 
 
 @click.command(
@@ -31,11 +32,13 @@ def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level
     Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
     """
     from msg_analysis import api
+    from msg_analysis.cli.progress import WorkProgress
 
     require_place(report)
-    comparison = api.compare(*bags, level=level)
-    if report:
-        api.write_report(comparison, report)
+    with WorkProgress() as progress, watched(progress):
+        comparison = api.compare(*bags, level=level)
+        if report:
+            api.write_report(comparison, report)
     if as_json:
         print_json(comparison.to_json())
     else:

@@ -7,6 +7,8 @@ from types import TracebackType
 from typing import Self
 
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal
+_SHORT = 2.0  # s of work of which nothing is shown
+_REFRESH = 0.1  # s between two updates of a bar
 
 
 class _Progress:
@@ -40,6 +42,7 @@ class _Progress:
         self._title = title
         self._task = self._bar.add_task(title, total=None, words="")
         self._told = time.monotonic()
+        self._shown = 0.0
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -49,7 +52,10 @@ class _Progress:
         self._bar.update(self._task, completed=done, total=total, description=title, words=in_short)
         if not self._console.is_terminal and time.monotonic() - self._told >= _LINE_PERIOD:
             self._told = time.monotonic()
-            self._console.print(f"{title}: {done} of {total}{', ' if words else ''}{words}")
+            self._console.print(self._line(title, done, total, words))
+
+    def _line(self, title: str, done: int, total: int, words: str) -> str:
+        return f"{title}: {done} of {total}{', ' if words else ''}{words}"
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -83,3 +89,26 @@ class SolveProgress(_Progress):
         """Show stage, evaluations done and to do, and the smallest system error so far; see ``SearchProgress``."""
         found = f"{best:.6g}"
         self._show(f"{self._title}: {stage}", done, total, f"smallest system error {found}", f"E {found}")
+
+
+class WorkProgress(_Progress):
+    """How far long work is, in percent: a ``common.long_work.Watch``, and a context manager; nothing in short work."""
+
+    def __init__(self) -> None:
+        super().__init__("", time_left=False)
+        self._begun = time.monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        """Show what is being done, and how much of it is done."""
+        now = time.monotonic()
+        if now - self._begun < _SHORT or now - self._shown < _REFRESH:
+            return
+        self._shown = now
+        self._bar.start()
+        self._show(what, 100 * done // max(total, 1), 100, "%", "%")
+
+    def _line(self, title: str, done: int, total: int, words: str) -> str:  # noqa: ARG002  always of 100
+        return f"{title}: {done} {words}"

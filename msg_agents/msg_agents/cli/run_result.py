@@ -12,6 +12,7 @@ import click
 from msg_analysis.cli.console import complain, print_json, result_console
 from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.files import RESULT_FILE, write_whole
+from msg_analysis.common.long_work import watched
 from msg_analysis.common.text.json_numbers import json_text
 
 if TYPE_CHECKING:
@@ -24,12 +25,14 @@ def finish(
 ) -> None:
     """Print the failures, judge what was recorded, show the result, and exit with its code."""
     from msg_agents.running.runner import conclude
+    from msg_analysis.cli.progress import WorkProgress
 
     for line in result.failures:
         complain(line, "failed:")
     if analyse and not result.interrupted:
         try:
-            conclude(result)
+            with WorkProgress() as progress, watched(progress):
+                conclude(result)
         except KeyboardInterrupt:
             result.interrupt(signal.SIGINT, "while the run was compared with the prediction")
             complain(result.failures[0], "failed:")

@@ -21,9 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS
+from msg_analysis.common.long_work import tell
 from msg_analysis.inference.errors.estimates import Estimate, estimate
 from msg_analysis.inference.errors.time_means import TimeMeans, forms_of, moments, without_rounding
-from msg_analysis.inference.observed.observation import BLOCK_NUMBERS, Observation
+from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.theory.system import packed_symmetric
@@ -142,6 +144,7 @@ def _backwards(
     dual = lifted  # Y(last + 1) of the block
     for first in reversed(range(0, steps, length)):
         last = min(first + length, steps)
+        tell("errors given the path", steps - last, steps)
         found = moments(observation, first, last, observation.states)
         seen += found.sum(axis=0)
         series[first:last] = found @ (trace @ forms)
@@ -160,6 +163,7 @@ def _backwards(
         covariance += left.transpose(1, 0, 2, 3).reshape(q, -1) @ right.transpose(1, 0, 2, 3).reshape(q, -1).T
         total = np.tensordot(duals, trace, axes=(1, 0))
         variances[first:last] = np.einsum("kij,kij->k", total @ added, spread @ total)
+        observation.release()
     return seen, covariance, series, variances
 
 

@@ -189,7 +189,7 @@ def time_means(observation: Observation) -> TimeMeans:
     totals = np.zeros((system.modes, p + 1))
     covariance = np.zeros((len(forms), len(forms)))
     series, variances = np.empty(steps), np.empty(steps)
-    for first, last in observation.blocks(max(p, observation.states[0].size)):
+    for first, last in observation.blocks(max(p, observation.states[0].size), "errors"):
         a = np.ones((last + 1 - first, p + 1))
         a[:, :p] = moments(observation, first, last + 1, observation.states)
         series[first:last] = a[:-1, :p] @ (trace @ forms)

@@ -141,7 +141,9 @@ class InnovationSums:
     def _add(self, observation: Observation, regression: StateRegression | HeardRegression) -> None:
         """One pass over the run."""
         m = observation.step.agents
-        for first, last in observation.blocks(max(observation.states[0].size, regression.numbers_per_step)):
+        for first, last in observation.blocks(
+            max(observation.states[0].size, regression.numbers_per_step), "innovations"
+        ):
             modes = observation.modes[first:last]
             if isinstance(regression, HeardRegression):
                 reception = HeardValues.of(observation, first, last)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -55,7 +56,7 @@ class LossTally:
             receiver, sender, which = mode_links(step, mode)
             graphs.append((numbers[receiver, sender], receiver, which))
         before = np.zeros((1, links), np.bool_), np.zeros((1, links))
-        for first, last in observation.blocks(4 * links):
+        for first, last in observation.blocks(4 * links, "loss"):
             before = self._add(*_block(observation, graphs, links, first, last), before)
 
     @classmethod
@@ -136,7 +137,9 @@ class BroadcastSums:
         self.scatter = np.zeros((agents, agents))  # sum of the products of the agents' noise
         length = observation.steps + 1
         self.samples = length * observation.replicas  # published values of each agent
-        for first, last in [*observation.blocks(observation.states[0].size), (length - 1, length)]:
+        for first, last in chain(
+            observation.blocks(observation.states[0].size, "broadcast noise"), [(length - 1, length)]
+        ):
             noise = (observation.published[first:last] - observation.states[first:last]) / deviation
             flat = noise.transpose(1, 0, 2).reshape(agents, -1)
             self.scatter += flat @ flat.T

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.inference.observed.observation import BLOCK_NUMBERS
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS
+from msg_analysis.common.long_work import tell
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.types import BoolArray, FloatArray, IntArray
@@ -58,10 +59,11 @@ class Measurement:
         """(N - first,): system error of every step, replicas averaged."""
         return _system_errors(self.deviations)
 
-    def blocks(self, numbers_per_step: int) -> Iterator[tuple[int, int]]:
+    def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
         """See ``Observation.blocks``."""
         length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
         for first in range(0, self.steps, length):
+            tell(what, first, self.steps)
             yield first, min(first + length, self.steps)
 
 

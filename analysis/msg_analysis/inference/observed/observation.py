@@ -8,6 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS, release
+from msg_analysis.common.long_work import tell
 from msg_analysis.errors import InputError
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.step_model import StepModel
@@ -16,7 +18,6 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 # States are clipped to this: fourth powers of much larger numbers overflow, and no test could be computed
 LARGEST = 1e60
-BLOCK_NUMBERS = 2_000_000  # numbers in temporary arrays per block of steps: 16 MB each, for runs of any length
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,25 +81,45 @@ class Observation:
     @cached_property
     def largest(self) -> float:
         """Size of the largest state."""
-        return float(max(self.states.max(), -self.states.min()))
+        return _largest(self.states)
 
     @property
     def replicas(self) -> int:
         """R."""
         return int(self.states.shape[2])
 
-    def blocks(self, numbers_per_step: int) -> Iterator[tuple[int, int]]:
-        """(first, last + 1) of blocks of steps that keep temporary arrays of so many numbers per step small."""
+    def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
+        """(first, last + 1) of blocks of steps that keep temporary arrays of so many numbers per step small.
+
+        ``what``: what is done with them, for those who watch.
+        """
         length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
         for first in range(0, self.steps, length):
+            tell(what, first, self.steps)
             yield first, min(first + length, self.steps)
+            self.release()
+
+    def release(self) -> None:
+        """Give back the memory of a long run, whose states are in a file: after every block."""
+        for array in (self.states, self.published, self.lost):
+            if array is not None:
+                release(array)
 
 
 def bounded(states: FloatArray) -> FloatArray:
     """The array, of any shape, clipped to ``LARGEST`` either way: such states are wrong, but can be computed with."""
-    if not states.size or (states.max() <= LARGEST and states.min() >= -LARGEST):
-        return states
-    return np.clip(states, -LARGEST, LARGEST)
+    return states if _largest(states) <= LARGEST else np.clip(states, -LARGEST, LARGEST)
+
+
+def _largest(states: FloatArray) -> float:
+    """Size of the largest number; 0 where there is none."""
+    largest = 0.0
+    length = max(1, BLOCK_NUMBERS // max(1, states[0].size)) if len(states) else 1
+    for first in range(0, len(states), length):
+        piece = states[first : first + length]
+        largest = max(largest, float(piece.max(initial=0.0)), -float(piece.min(initial=0.0)))
+        release(states)
+    return largest
 
 
 def _known_steps(trajectory: Trajectory) -> int:

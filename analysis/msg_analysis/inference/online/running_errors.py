@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS
 from msg_analysis.inference.errors.estimates import Estimate, beside
 from msg_analysis.inference.errors.time_means import Value, forms_of, packed_moments, values_of
-from msg_analysis.inference.observed.observation import BLOCK_NUMBERS, bounded
+from msg_analysis.inference.observed.observation import bounded
 from msg_analysis.inference.online.step_collector import StepCollector
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict

@@ -104,7 +104,7 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
     x = sampled(observation)
     seen = np.zeros(p)
     series = np.empty(steps)
-    for first, last in observation.blocks(max(p, observation.states[0].size)):
+    for first, last in observation.blocks(max(p, observation.states[0].size), "expected errors"):
         found = moments(observation, first, last, x)
         seen += found.sum(axis=0)
         series[first:last] = found @ (trace @ forms)

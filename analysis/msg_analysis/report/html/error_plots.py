@@ -24,6 +24,7 @@ from bokeh.models import (
 from bokeh.palettes import PuOr, interp_palette
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS, release
 from msg_analysis.report.documents.comparison_words import TIMES
 from msg_analysis.report.figures.palette import (
     BLACK,
@@ -146,11 +147,15 @@ def agent_convergence(
         return None
     ends = np.unique(np.rint(np.geomspace(1, len(states), _POINTS)).astype(np.int64))
     sums, total, done = np.empty((len(ends), states.shape[1])), np.zeros(states.shape[1]), 0
-    for place, end in enumerate(ends.tolist()):  # in pieces: a run may be long
-        piece = states[done:end]
-        middle = piece.mean(axis=1, keepdims=True) if reference is None else reference
-        total = total + np.square(piece - middle).mean(axis=2).sum(axis=0)
-        sums[place], done = total, end
+    length = max(1, BLOCK_NUMBERS // max(1, states[0].size))
+    for place, end in enumerate(ends.tolist()):
+        while done < end:  # in pieces: a run may be long
+            piece = states[done : min(done + length, end)]
+            middle = piece.mean(axis=1, keepdims=True) if reference is None else reference
+            total = total + np.square(piece - middle).mean(axis=2).sum(axis=0)
+            done += len(piece)
+            release(states)
+        sums[place] = total
     scale = np.where(np.nan_to_num(predicted) > 0, predicted, np.nan)
     parts = (sums / ends[:, None] / scale).T
     everything = ColumnDataSource({"part": parts.ravel().astype(np.float32)}, name="all_agents")

@@ -1,0 +1,51 @@
+"""Arrays that may be larger than the memory: in a temporary file without a name, which ends with the process."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from msg_analysis.types import AnyArray
+
+LARGE = 2**27  # bytes from which an array is in a file
+BLOCK_NUMBERS = 2_000_000  # numbers of a large array that are looked at together: 16 MB
+
+
+def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:
+    """Zeros; in a file where it and what belongs to it has ``total`` >= ``LARGE`` bytes, if there is room for it.
+
+    MemoryError or ValueError: neither file nor memory is large enough.
+    """
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    if total >= LARGE and size:
+        with suppress(OSError), tempfile.TemporaryFile(prefix="msg_analysis.") as file:
+            os.posix_fallocate(file.fileno(), 0, size)  # a write to a full disk would end the process
+            return np.memmap(file, dtype=dtype, mode="r+", shape=shape)
+    return np.zeros(shape, dtype)
+
+
+def in_file(array: AnyArray) -> bool:
+    """Whether the array, or that of which it is a view, is in a file."""
+    return _mapping(array) is not None
+
+
+def release(array: AnyArray) -> None:
+    """Give the memory of an array in a file back to the system: it is read again when it is needed."""
+    mapping = _mapping(array)
+    if mapping is not None and hasattr(mmap, "MADV_DONTNEED"):
+        mapping.madvise(mmap.MADV_DONTNEED)
+
+
+def _mapping(array: Any) -> mmap.mmap | None:
+    while isinstance(array, np.ndarray):
+        if isinstance(array, np.memmap):
+            found: mmap.mmap | None = getattr(array, "_mmap", None)
+            if found is not None:
+                return found
+        array = array.base
+    return array if isinstance(array, mmap.mmap) else None

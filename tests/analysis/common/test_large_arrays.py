@@ -1,0 +1,120 @@
+"""Arrays in files: the same numbers as in memory, whatever becomes of the disk."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msg_analysis.bags import trajectory_builder
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.common import large_arrays
+from msg_analysis.common.large_arrays import LARGE, in_file, large_zeros, release
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.twin.simulate import simulate
+
+
+def test_small_ones_are_in_memory() -> None:
+    array = large_zeros((3, 4), np.int64, total=LARGE - 1)
+    assert not in_file(array)
+    assert array.shape == (3, 4)
+    release(array)
+    assert not array.any()
+
+
+def test_large_ones_keep_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Released and read again; views know that they are in a file; nothing is left in the folder."""
+    monkeypatch.setattr(large_arrays.tempfile, "tempdir", str(tmp_path))
+    array = large_zeros((1000, 40), np.float64, total=LARGE)
+    assert not array.any()
+    assert list(tmp_path.iterdir()) == []
+    view = array[10:900].reshape(-1, 20)[::2]
+    assert in_file(array)
+    assert in_file(view)
+    assert not in_file(view.copy())
+    array[:] = np.arange(40_000).reshape(1000, 40)
+    release(view)
+    assert np.array_equal(array, np.arange(40_000).reshape(1000, 40))
+    assert not in_file(large_zeros((0, 40), np.float64, total=LARGE))
+
+
+def test_released_memory_is_free() -> None:
+    """Of 200 MB that have been written, none is resident afterwards."""
+    script = """
+import numpy as np
+from msg_analysis.common.large_arrays import large_zeros, release
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096
+before = resident()
+array = large_zeros((25_000_000,), np.float64, total=2 * 10**8)
+array[:] = 1.0
+written = resident()
+release(array)
+assert written - before > 1.9e8, written - before
+assert resident() - before < 1e7, resident() - before
+assert array.sum() == 25_000_000
+"""
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("needs /proc")
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+
+
+def test_without_room_on_the_disk() -> None:
+    """Files of this process may have 1 MB: the array is in memory instead, and can be used."""
+    script = """
+import numpy as np
+from msg_analysis.common.large_arrays import in_file, large_zeros
+array = large_zeros((300_000,), np.float64, total=10**9)
+assert not in_file(array)
+array[:] = 1.0
+"""
+    subprocess.run(
+        [sys.executable, "-c", script],
+        check=True,
+        timeout=60,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (10**6, 10**6)),
+    )
+
+
+@pytest.mark.parametrize("changes", [{}, {"noise": {"process": 1.0, "broadcast": 0.2, "loss": 0.1}}])
+def test_a_run_that_is_read_into_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
+) -> None:
+    """Trajectory and comparison are the same as in memory, also of an incomplete bag."""
+    run = simulate(
+        ValidExperiment.parse(
+            {
+                "name": "net",
+                "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 1}}},
+                "agents": 3,
+                "switching": {"generator": [[-1, 1], [1, -1]]},
+                "run": {"dt": 0.1, "duration": 200, "replicas": 2},
+            }
+            | changes
+        )
+    )
+    run.states[1500, 1] = np.nan
+    write_trajectory(run, tmp_path / "bag")
+    one = read_bag(tmp_path / "bag")
+    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    monkeypatch.setattr(trajectory_builder, "RELEASED_AT_ONCE", 100)
+    monkeypatch.setattr(trajectory_builder, "_CELLS", 7)
+    other = read_bag(tmp_path / "bag")
+    assert in_file(other.states)
+    assert not in_file(one.states)
+    assert one.completeness == other.completeness
+    assert one.completeness.missing > 0
+    assert np.array_equal(one.states, other.states, equal_nan=True)
+    for name in ("modes", "agent_modes", "lost"):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+    if one.published is not None and other.published is not None:
+        assert np.array_equal(one.published, other.published, equal_nan=True)
+    assert (one.published is None) == (other.published is None) == (not changes)
+    assert compare(one).to_json() == compare(other).to_json()
