@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
+from msg_analysis.bags.format import mcap_writer
 from msg_analysis.bags.format.mcap_chunks import MESSAGE_HEAD
 from msg_analysis.bags.format.mcap_writer import McapWriter
 from msg_analysis.bags.format.storage_options import Compression
@@ -114,6 +115,22 @@ def test_many_messages_at_once(actions: list[list[tuple[int, int, int, int, byte
             for channel, sequence, log_time, publish_time, content in action:
                 library.add_message(channel, log_time, content, publish_time, sequence)
     assert ours.getvalue() == theirs.getvalue()
+    writer.finish()
+    library.finish()
+    assert ours.getvalue() == theirs.getvalue()
+
+
+def test_more_indexes_than_the_memory_is_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcap_writer, "INDEXES_IN_MEMORY", 1000)
+    ours, theirs = io.BytesIO(), io.BytesIO()
+    writer = McapWriter(ours, chunk_size=50, compression="none")
+    library = Writer(theirs, chunk_size=50, compression=CompressionType.NONE)
+    library.start(profile="ros2", library="mcap")
+    for each in (writer, library):
+        each.register_channel("/a", "cdr", each.register_schema("one", "ros2msg", b"float64 x"), {})
+    for time in range(200):
+        writer.add_message(1, time, bytes(40), time)
+        library.add_message(1, time, bytes(40), time, time)
     writer.finish()
     library.finish()
     assert ours.getvalue() == theirs.getvalue()

@@ -6,9 +6,10 @@ The records other than messages and their indexes are encoded by ``mcap``.
 from __future__ import annotations
 
 import struct
+import tempfile
 import zlib
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import BinaryIO
 
 import numpy as np
@@ -40,6 +41,7 @@ _MESSAGE_RECORD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("head", MESSAG
 MESSAGE_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries; then the entries
 CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the records
 FOOTER = struct.Struct("<BQQQ")  # what of it the checksum of the summary covers
+INDEXES_IN_MEMORY = 2**24  # bytes of the indexes of chunks; what is beyond is kept in a temporary file
 COMPRESSION_NAMES: dict[Compression, str] = {"none": "", "zstd": "zstd", "lz4": "lz4"}
 
 
@@ -58,7 +60,11 @@ class McapWriter:
         self._stream, self._chunk_size, self._compression = stream, chunk_size, compression
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
-        self._chunk_indexes: list[ChunkIndex] = []
+        # An index of a chunk has an entry for every channel: an hour of a thousand agents has gigabytes of them.
+        self._chunk_indexes = tempfile.SpooledTemporaryFile(INDEXES_IN_MEMORY, prefix="msg_analysis.")  # noqa: SIM115
+        self._chunks = 0
+        self._first: int | None = None  # log time [ns] of the first message
+        self._last = 0
         self._metadata_indexes: list[MetadataIndex] = []
         self._attachment_indexes: list[AttachmentIndex] = []
         self._counts: dict[int, int] = {}  # messages by channel, of the chunks that are finished
@@ -188,19 +194,21 @@ class McapWriter:
             indexes += index.tobytes()
         for part in (head, compressed, indexes):
             self._stream.write(part)
-        self._chunk_indexes.append(
-            ChunkIndex(
-                message_start_time=start,
-                message_end_time=end,
-                chunk_start_offset=place,
-                chunk_length=after - place,
-                message_index_offsets=offsets,
-                message_index_length=len(indexes),
-                compression=name.decode(),
-                compressed_size=len(compressed),
-                uncompressed_size=len(records),
-            )
+        chunk_index = ChunkIndex(
+            message_start_time=start,
+            message_end_time=end,
+            chunk_start_offset=place,
+            chunk_length=after - place,
+            message_index_offsets=offsets,
+            message_index_length=len(indexes),
+            compression=name.decode(),
+            compressed_size=len(compressed),
+            uncompressed_size=len(records),
         )
+        self._chunk_indexes.write(_encoded(chunk_index))
+        self._chunks += 1
+        self._first = start if self._first is None else min(self._first, start)
+        self._last = max(self._last, end)
 
     def flush(self) -> None:
         """Finish the chunk in progress and hand everything to the operating system."""
@@ -211,39 +219,45 @@ class McapWriter:
         """Write the summary; the stream stays open."""
         self._finish_chunk()
         self._stream.write(_encoded(DataEnd(0)))
-        start = self._stream.tell()
-        summary, offsets = b"", []
+        start, checksum = self._stream.tell(), 0
+        offsets = b""
+        for opcode, parts in self._groups():
+            begin = self._stream.tell()
+            for part in parts:
+                checksum = zlib.crc32(part, checksum)
+                self._stream.write(part)
+            length = self._stream.tell() - begin
+            offsets += _encoded(SummaryOffset(group_opcode=opcode, group_start=begin, group_length=length))
+        self._chunk_indexes.close()
+        offset_start = self._stream.tell()
+        checksum = zlib.crc32(FOOTER.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(offsets, checksum))
+        footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=checksum)
+        self._stream.write(offsets + _encoded(footer) + MAGIC)
+
+    def _groups(self) -> Iterator[tuple[Opcode, Iterable[bytes]]]:
+        """Opcode and bytes of the groups of the summary."""
         groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
             (Opcode.SCHEMA, self._schemas),
             (Opcode.CHANNEL, self._channels),
             (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self._chunk_indexes),
-            (Opcode.ATTACHMENT_INDEX, self._attachment_indexes),
-            (Opcode.METADATA_INDEX, self._metadata_indexes),
         ]
         for opcode, records in groups:
-            group = b"".join(map(_encoded, records))
-            offsets.append(
-                SummaryOffset(group_opcode=opcode, group_start=start + len(summary), group_length=len(group))
-            )
-            summary += group
-        offset_start = start + len(summary)
-        summary += b"".join(map(_encoded, offsets))
-        checksum = zlib.crc32(FOOTER.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(summary))
-        footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=checksum)
-        self._stream.write(summary + _encoded(footer) + MAGIC)
+            yield opcode, map(_encoded, records)
+        self._chunk_indexes.seek(0)
+        yield Opcode.CHUNK_INDEX, iter(lambda: self._chunk_indexes.read(2**20), b"")
+        yield Opcode.ATTACHMENT_INDEX, map(_encoded, self._attachment_indexes)
+        yield Opcode.METADATA_INDEX, map(_encoded, self._metadata_indexes)
 
     def _statistics(self) -> Statistics:
-        chunks = self._chunk_indexes
         return Statistics(
             attachment_count=len(self._attachment_indexes),
             channel_count=len(self._channels),
             channel_message_counts=self._counts,
-            chunk_count=len(chunks),
+            chunk_count=self._chunks,
             message_count=sum(self._counts.values()),
             metadata_count=len(self._metadata_indexes),
-            message_start_time=min((chunk.message_start_time for chunk in chunks), default=0),
-            message_end_time=max((chunk.message_end_time for chunk in chunks), default=0),
+            message_start_time=self._first or 0,
+            message_end_time=self._last,
             schema_count=len(self._schemas),
         )
 

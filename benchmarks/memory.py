@@ -1,0 +1,144 @@
+"""Memory over the length of a run: of the recorder, of agents and switcher, and of the comparison.
+
+The recorder gets batches of made-up states by hand, as fast as it takes them. Agents and switcher are those of a real
+network. The comparison reads bags of the offline twin. All values are resident memory [MB].
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from msg_agents.running.runner import run_network
+from msg_agents.stepping.state_receiver import StateReceiver
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.bags.writer import BagWriter
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.twin.simulate import new_record, simulate
+from msg_analysis.wire.messages import StateCodec
+from msg_analysis.wire.state_batches import encode_batch
+from msg_analysis.wire.topics import STATE, STATES, network_topics
+
+POINTS = 5
+
+
+def ring(agents: int, steps: int, **run: Any) -> ValidExperiment:
+    """Agents on a line and a ring."""
+    numbers = list(range(1, agents + 1))
+    return ValidExperiment.parse(
+        {
+            "name": "memory",
+            "graphs": {"line": {"path": numbers}, "ring": {"cycle": numbers}},
+            "switching": {"generator": [[-1, 1], [1, -1]]},
+            "run": {"dt": 0.05, "duration": steps * 0.05, "start": "zero", **run},
+        }
+    )
+
+
+def resident(process: int | str = "self") -> float:
+    """Resident memory [MB]."""
+    pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def recorder(agents: int, steps: int, rounds: int = 20) -> None:
+    """Record so many steps, ``rounds`` of each agent in a batch, and print the memory on the way."""
+    record = new_record(ring(agents, steps))
+    codecs = [StateCodec(record.run.bytes, i + 1, 1, 0.05) for i in range(agents)]
+    payloads = np.random.default_rng(0).random((agents, 8)).tobytes()
+    receiver = StateReceiver(record, STATES, STATE, "/")
+    shown = []
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        BagWriter(Path(folder) / "bag", network_topics(agents), record=record.to_json()) as bag,
+    ):
+        for first in range(0, steps, rounds):
+            receiver.add(
+                encode_batch(
+                    record.run.bytes,
+                    [
+                        codec.wrap(k, min(k, 1), payloads[8 * (i + k % 8) : 8 * (i + k % 8) + 8])
+                        for k in range(first, first + rounds)
+                        for i, codec in enumerate(codecs)
+                    ],
+                )
+            )
+            found = receiver.take()
+            bag.write_many(receiver.names, found.agent, found.time, found.data, found.start, found.size)
+            if (first + rounds) % (steps // POINTS) < rounds:
+                shown.append(f"{resident():.0f}")
+    print(f"| recorder, {agents} agents, {steps} steps | {' | '.join(shown)} |", flush=True)
+
+
+def network(steps: int) -> None:
+    """A real network of five agents in one process, not recorded."""
+    found: dict[str, list[tuple[float, float]]] = {"agent": [], "switcher": []}
+    done = threading.Event()
+
+    def watch() -> None:
+        while not done.wait(0.2):
+            for entry in Path("/proc").glob("[0-9]*"):
+                try:
+                    words = (entry / "cmdline").read_bytes().decode().replace("\0", " ").split()
+                    if words[:1] == ["msg-agents"] and words[1] in found:
+                        found[words[1]].append((time.monotonic(), resident(entry.name)))
+                except (OSError, ValueError, IndexError):
+                    continue
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    run_network(ring(5, steps, processes=1), None)
+    done.set()
+    thread.join()
+    for name, values in found.items():
+        chosen = [values[(len(values) - 1) * (i + 1) // POINTS][1] for i in range(POINTS)]
+        print(
+            f"| {name}, 5 agents in a process, {steps} steps | {' | '.join(f'{v:.0f}' for v in chosen)} |", flush=True
+        )
+
+
+def comparison(steps: int) -> None:
+    """`msg-analysis compare` with a report, of 20 agents with 16 replicas."""
+    with tempfile.TemporaryDirectory() as folder:
+        bag = Path(folder) / "bag"
+        write_trajectory(simulate(ring(20, steps, replicas=16)), bag)
+        size = sum(file.stat().st_size for file in bag.iterdir())
+        command = [sys.executable, "-m", "msg_analysis", "compare", str(bag), "--report", f"{folder}/report.html"]
+        begun = time.monotonic()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        _, _, usage = os.wait4(process.pid, 0)
+        process.returncode = 0
+        print(
+            f"| {steps} | {size / 1e6:.0f} MB | {time.monotonic() - begun:.1f} s | {usage.ru_maxrss / 1e3:.0f} MB |",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Print the tables of docs/performance.md."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--states", type=int, default=20_000_000, help="states that the recorder gets")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="of the network")
+    parser.add_argument("--longest", type=int, default=350_000, help="steps of the longest bag that is compared")
+    arguments = parser.parse_args()
+    print(f"| resident memory [MB] after | {' | '.join(f'{100 * (i + 1) // POINTS} %' for i in range(POINTS))} |")
+    print(f"|---|{'---:|' * POINTS}")
+    for agents in (10, 100, 1000):
+        recorder(agents, arguments.states // agents)
+    network(arguments.steps)
+    print("\n| steps | bag | time | most memory |\n|---:|---:|---:|---:|")
+    for share in (0.02, 0.1, 0.4, 1.0):
+        comparison(round(share * arguments.longest))
+
+
+if __name__ == "__main__":
+    main()
