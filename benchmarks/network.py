@@ -50,6 +50,11 @@ RATIOS = {
         "100 agents in 4 processes, network, recorded",
         "100 agents in 4 processes, bare loop, recorded",
     ),
+    "network, recorded / not recorded": ("network, recorded", "network"),
+    "100 agents in 4 processes, recorded / not recorded": (
+        "100 agents in 4 processes, network, recorded",
+        "100 agents in 4 processes, network",
+    ),
     "network / network on SingleThreadedExecutor": ("network", "network on SingleThreadedExecutor"),
 }
 

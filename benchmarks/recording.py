@@ -1,6 +1,6 @@
-"""What compression and splitting cost a recorder, and what they save: CPU time and bytes per message.
+"""What a state costs a recorder once its batch has arrived: CPU time and bytes, by compression and splitting.
 
-Five agents of the twin's line and ring, written over and over as the recorder writes them.
+Five agents of the twin's line and ring, received and written as the recorder does it.
 """
 
 from __future__ import annotations
@@ -10,52 +10,62 @@ import tempfile
 import time
 from pathlib import Path
 
+from msg_agents.nodes.agents.state_batches import BATCH_SIZE
+from msg_agents.nodes.recorder import write_size
+from msg_agents.stepping.state_receiver import StateReceiver
 from msg_analysis.bags.format.storage_options import COMPRESSIONS, Storage
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.record import RunRecord
 from msg_analysis.twin.simulate import simulate
-from msg_analysis.wire.messages import StateCodec, stamp_ns
-from msg_analysis.wire.topics import network_topics
+from msg_analysis.wire.messages import StateCodec
+from msg_analysis.wire.state_batches import encode_batch
+from msg_analysis.wire.topics import STATE, STATES, network_topics
 
 SPLITS = (None, 5_000_000)  # bytes
+DURATION = 2000.0  # 200,005 states
 
 
-def messages(replicas: int) -> list[tuple[str, bytes, int]]:
-    """States of a run: topic, CDR, stamp [ns]."""
+def run_of(replicas: int) -> tuple[RunRecord, list[bytes]]:
+    """A run, and the batches in which its states come to the recorder."""
     experiment = {
         "name": "recording",
         "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
         "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
-        "run": {"dt": 0.05, "duration": 200.0, "replicas": replicas},
+        "run": {"dt": 0.05, "duration": DURATION, "replicas": replicas},
     }
     run = simulate(ValidExperiment.parse(experiment))
     codecs = [StateCodec(run.record.run.bytes, i + 1, replicas, 0.05) for i in range(5)]
-    found = []
+    sent, found, size = [], [], 0
     for k, states in enumerate(run.states):
         for i, codec in enumerate(codecs):
-            data = codec.encode(k, 1 if k else 0, states[i].copy())
-            found.append((f"/agent_{i + 1}/state", data, stamp_ns(data)))
-    return found
+            sent.append(codec.encode(k, 1 if k else 0, states[i].copy()))
+            size += len(sent[-1])
+            if size >= BATCH_SIZE:
+                found.append(encode_batch(run.record.run.bytes, sent))
+                sent, size = [], 0
+    return run.record, [*found, encode_batch(run.record.run.bytes, sent)]
 
 
 def main() -> None:
     """Print the table of docs/messages.md."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--repeat", type=int, default=5, help="times that the run is written")
-    repeat = parser.parse_args().repeat
-    print("| replicas | compression | split | CPU per message | bytes per message |\n|---:|---|---|---:|---:|")
+    argparse.ArgumentParser(description=__doc__.partition("\n")[0]).parse_args()
+    print("| replicas | compression | split | CPU per state | bytes per state |\n|---:|---|---|---:|---:|")
     for replicas in (1, 16):
-        sent = messages(replicas) * repeat
+        record, batches = run_of(replicas)
         for compression in COMPRESSIONS:
             for split in SPLITS:
+                receiver = StateReceiver(record, STATES, STATE, "/")
                 with tempfile.TemporaryDirectory() as folder:
                     bag = BagWriter(Path(folder) / "bag", network_topics(5), storage=Storage(compression, split))
                     begun = time.process_time()
-                    for message in sent:
-                        bag.write(*message)
+                    for number, batch in enumerate(batches, start=1):
+                        if receiver.add(batch) >= write_size(5) or number == len(batches):
+                            found = receiver.take()
+                            bag.write_many(receiver.names, found.agent, found.time, found.data, found.start, found.size)
                     bag.close()
-                    spent = (time.process_time() - begun) / len(sent) * 1e6
-                    size = sum(file.stat().st_size for file in bag.directory.glob("*.mcap")) / len(sent)
+                    spent = (time.process_time() - begun) / bag.messages * 1e6
+                    size = sum(file.stat().st_size for file in bag.directory.glob("*.mcap")) / bag.messages
                     often = f"{split // 10**6} MB" if split else "no"
                     print(f"| {replicas} | {compression} | {often} | {spent:.1f} µs | {size:.0f} |")
 

@@ -17,7 +17,9 @@ from msg_analysis.wire import topics
 from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.topics import Topic, network_topics
 
-WRITE_SIZE = 2**18  # bytes of states after which they are written: many at once cost a fraction of one by one
+LEAST_WRITE, MOST_WRITE = 2**15, 2**18
+"""Bytes of states after which they are written: 4 kB for each agent, within these bounds. Many at once cost a fraction of
+one by one, but in longer turns the recorder delays agents on the same core."""
 WRITE_PERIOD = 0.1  # s of wall time after which fewer are written, in slow runs and at the end
 FLUSH_PERIOD = 1.0
 """s of wall time: a killed recorder loses at most so much, even if a chunk takes longer to fill."""
@@ -65,10 +67,10 @@ class Recorder(NetworkNode):
 
     def _collector(self, kind: StateReceiver) -> Callable[[bytes], None]:
         """The callback for the batches of a kind of states."""
-        write_states = self._guarded(self._write_states)
+        write_states, size = self._guarded(self._write_states), write_size(self.record.experiment.agents)
 
         def collect(data: bytes) -> None:
-            if kind.add(data) >= WRITE_SIZE:
+            if kind.add(data) >= size:
                 write_states()
 
         return collect
@@ -124,3 +126,8 @@ class Recorder(NetworkNode):
             self._awaiting.remove(topic)
             if not self._awaiting:
                 self.publish(self._progress, self.progress(topics.PROGRESS, NOT_AN_AGENT, self._last))
+
+
+def write_size(agents: int) -> int:
+    """Bytes of states after which the recorder of so many agents writes them."""
+    return min(max(2**12 * agents, LEAST_WRITE), MOST_WRITE)

@@ -15,7 +15,7 @@ pytest.importorskip("rclpy")
 
 import rclpy
 
-from msg_agents.nodes.recorder import WRITE_SIZE, Recorder
+from msg_agents.nodes.recorder import Recorder, write_size
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.ros_domain import free_domain
 from msg_agents.stepping.received_steps import ReceivedSteps
@@ -80,7 +80,9 @@ def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> 
         if step % 500 == 499:
             most = max(most, held(vars(recorder)))
     marks = 2 * AGENTS * RESEND_LIMIT
-    waiting = WRITE_SIZE // len(encode_batch(recorder.run, [bytes(76)]))  # batches that are not yet written, at most
+    waiting = write_size(AGENTS) // len(
+        encode_batch(recorder.run, [bytes(76)])
+    )  # batches that are not yet written, at most
     assert marks <= most <= marks + waiting + 1000
     newest = STEPS - 1
     for step in range(newest - RESEND_LIMIT + 1, newest + 1):
