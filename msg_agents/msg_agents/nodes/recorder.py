@@ -18,8 +18,8 @@ from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.topics import Topic, network_topics
 
 LEAST_WRITE, MOST_WRITE = 2**15, 2**18
-"""Bytes of states after which they are written: 4 kB for each agent, within these bounds. Many at once cost a fraction of
-one by one, but in longer turns the recorder delays agents on the same core."""
+"""Bytes of states after which they are written: 4 kB for each agent, within these bounds. Many at once cost a fraction
+of one by one, but in longer turns the recorder delays agents on the same core."""
 WRITE_PERIOD = 0.1  # s of wall time after which fewer are written, in slow runs and at the end
 FLUSH_PERIOD = 1.0
 """s of wall time: a killed recorder loses at most so much, even if a chunk takes longer to fill."""
