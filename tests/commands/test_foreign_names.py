@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import many_commands
@@ -48,12 +45,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def printed(folder: Path, *jobs: list[str]) -> list[str]:
     """On a terminal, and what goes to stderr."""
     lines = [["msg-analysis", job, "terminal"] for job in jobs]
-    environment = os.environ | {"COLUMNS": "200", "OPENBLAS_NUM_THREADS": "1", "TERM": "xterm-256color"}
-    command = [sys.executable, "-W", "ignore", many_commands.__file__]
-    done = subprocess.run(
-        command, input=json.dumps(lines), capture_output=True, text=True, env=environment, cwd=folder, check=True
-    )
-    return [OF_RICH.sub("", stdout + stderr) for _, stdout, stderr in json.loads(done.stdout)]
+    found = many_commands.outcomes(lines, folder, COLUMNS="200", TERM="xterm-256color")
+    return [OF_RICH.sub("", stdout + stderr) for _, stdout, stderr in found]
 
 
 def test_every_command_that_prints_names(folder: Path) -> None:

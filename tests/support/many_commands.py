@@ -1,34 +1,68 @@
-"""Runs command lines in processes of their own that have imported everything before: python many_commands.py < jobs
+"""Runs command lines in processes of their own, forked from one that has imported everything before.
 
 A job is a list: program, arguments, and what its stdout is: "pipe", "full" (a full disk), "closed", "gone" (a pipe that
-nobody reads), "terminal", or "limit" (files cannot grow beyond a few bytes). Prints a JSON list of exit code, stdout,
-stderr of each.
+nobody reads), "terminal", "ascii" (it has few characters), "limit" (files cannot grow beyond a few bytes), or "memory"
+(there is 1 GB of it, and a minute). ``outcomes`` gives exit code, stdout, stderr of each. As a program, this is the
+process that forks: it answers each line, a request, by a line.
 """
 
 from __future__ import annotations
 
+import atexit
+import contextlib
+import functools
 import gc
+import importlib
 import json
 import os
 import pty
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
 import traceback
+from pathlib import Path
 from typing import Any
 
-import matplotlib
-import scipy.stats  # noqa: F401
+PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.cli.main"}
+PREPARED = (
+    *PROGRAMS.values(),
+    "msg_analysis.api",
+    "msg_analysis.paper.figures",
+    "msg_analysis.report.terminal.comparison_text",
+    "msg_analysis.twin.check",
+    "scipy.stats",
+)
+MEMORY = 1 << 30  # bytes
+LONGEST = 60  # s, where memory is limited
 
-import msg_agents.cli.main
-import msg_analysis.api
-import msg_analysis.cli.main
-import msg_analysis.paper.figures
-import msg_analysis.report.terminal.comparison_text
-import msg_analysis.twin.check
 
-PROGRAMS = {"msg-analysis": msg_analysis.cli.main.main, "msg-agents": msg_agents.cli.main.main}
+def outcomes(jobs: list[list[Any]], folder: Path, **environment: str) -> list[list[Any]]:
+    """Exit code, stdout, stderr of each job, with this folder to work in and additions to the environment."""
+    server = _server()
+    assert server.stdin is not None
+    assert server.stdout is not None
+    request = {"jobs": jobs, "folder": str(folder), "environment": {**os.environ, **environment}}
+    server.stdin.write(f"{json.dumps(request)}\n")
+    server.stdin.flush()
+    found: list[list[Any]] = json.loads(server.stdout.readline())
+    return found
+
+
+@functools.cache
+def _server() -> subprocess.Popen[str]:
+    """It ends with this process, which holds the other end of its stdin."""
+    server = subprocess.Popen(
+        [sys.executable, "-W", "ignore", __file__],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+    )
+    atexit.register(server.wait)
+    atexit.register(server.terminate)
+    return server
 
 
 def child(program: str, arguments: list[str], kind: str, stdout: int, stderr: int) -> int:
@@ -36,13 +70,19 @@ def child(program: str, arguments: list[str], kind: str, stdout: int, stderr: in
     if kind == "limit":
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as Python has it at its start
         resource.setrlimit(resource.RLIMIT_FSIZE, (64, 64))
+    if kind == "memory":
+        signal.alarm(LONGEST)
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    if kind == "ascii":
+        sys.stdout.reconfigure(encoding="ascii", errors="strict")  # type: ignore[union-attr]
+        sys.stderr.reconfigure(encoding="ascii")  # type: ignore[union-attr]
     if kind == "closed":
         os.close(1)
         sys.stdout = None  # type: ignore[assignment]  # as Python has it at its start
     else:
         os.dup2(stdout, 1)
     try:
-        PROGRAMS[program](arguments, prog_name=program)
+        importlib.import_module(PROGRAMS[program]).main(arguments, prog_name=program)
     except SystemExit as end:
         code = int(end.code or 0)
     except BaseException:
@@ -77,11 +117,9 @@ def run(program: str, arguments: list[str], kind: str) -> list[Any]:
         text = b""
         if terminal is not None or kind == "limit":
             source = read if terminal is None else terminal
-            try:
+            with contextlib.suppress(OSError):  # a terminal that nobody writes to any more
                 while chunk := os.read(source, 65536):
                     text += chunk
-            except OSError:  # a terminal that nobody writes to any more
-                pass
             os.close(source)
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         out.seek(0)
@@ -89,8 +127,24 @@ def run(program: str, arguments: list[str], kind: str) -> list[Any]:
         return [code, (text or out.read()).decode(), err.read().decode()]
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Serve requests."""
+    requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
+    with Path(os.devnull).open() as nothing:
+        os.dup2(nothing.fileno(), 0)
+    matplotlib = importlib.import_module("matplotlib")
     matplotlib.use("Agg")
+    for name in PREPARED:
+        importlib.import_module(name)
     gc.collect()
     gc.freeze()  # the collector writes to what it looks at, and the memory would be copied
-    print(json.dumps([run(*job) for job in json.load(sys.stdin)]))
+    for line in requests:
+        request = json.loads(line)
+        os.chdir(request["folder"])
+        os.environ.clear()
+        os.environ.update(request["environment"])
+        print(json.dumps([run(*job) for job in request["jobs"]]), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import resource
-import subprocess
-import sys
 from pathlib import Path
 
+import many_commands
 import pytest
 import yaml
 
 from msg_analysis.common.bounded_input import DEEPEST, MOST_REPEATED, load_yaml, read_text
-
-ROOT = Path(__file__).parents[3]
-PROGRAM = Path(sys.executable).with_name("msg-analysis")
 
 
 def bomb(levels: int) -> str:
@@ -54,10 +49,6 @@ def test_length(tmp_path: Path) -> None:
         read_text(Path("/dev/zero"))
 
 
-def _little_memory() -> None:
-    resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
-
-
 @pytest.mark.parametrize("command", ["info", "predict", "simulate", "compare", "tabulate", "sweep"])
 @pytest.mark.parametrize("kind", ["bomb", "bomb of a bag", "endless"])
 def test_commands(command: str, kind: str, tmp_path: Path) -> None:
@@ -70,16 +61,10 @@ def test_commands(command: str, kind: str, tmp_path: Path) -> None:
     else:
         path.mkdir()
         (path / "metadata.yaml").write_text(f"{bomb(9)}\nrosbag2_bagfile_information: {{files: *q8}}\n")
-    out = ["--out", tmp_path / "out"] if command in ("simulate", "sweep") else []
-    done = subprocess.run(
-        [PROGRAM, command, path, *out],
-        capture_output=True,
-        text=True,
-        preexec_fn=_little_memory,
-        timeout=60,
-        env={"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1"},
-    )
-    assert (done.returncode, done.stdout) == (2, ""), done.stderr
-    assert done.stderr.startswith("error: ") or "Error: " in done.stderr
-    assert "Traceback" not in done.stderr
-    assert len(done.stderr) < 2000
+    out = ["--out", str(tmp_path / "out")] if command in ("simulate", "sweep") else []
+    job = ["msg-analysis", [command, str(path), *out], "memory"]
+    ((code, stdout, stderr),) = many_commands.outcomes([job], tmp_path, NO_COLOR="1")
+    assert (code, stdout) == (2, ""), stderr
+    assert stderr.startswith("error: ") or "Error: " in stderr
+    assert "Traceback" not in stderr
+    assert len(stderr) < 2000
