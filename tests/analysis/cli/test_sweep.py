@@ -9,17 +9,22 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet
 import pytest
 import yaml
+from click.testing import CliRunner
 
+from msg_analysis.cli.main import main
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.sweep.jobs.workers import ENDING
 from msg_analysis.twin.simulate import simulate
 
+Call = Callable[..., tuple[int, str, str]]
 PROGRAM = Path(sys.executable).with_name("msg-analysis")
 EXPERIMENT: dict[str, Any] = {
     "name": "two",
@@ -46,10 +51,20 @@ def start(*arguments: str | Path) -> subprocess.Popen[str]:
     )
 
 
-def call(*arguments: str | Path) -> tuple[int, str, str]:
-    process = start(*arguments)
-    stdout, stderr = process.communicate(timeout=100)
-    return process.returncode, stdout, stderr
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[Call]:
+    """The command in this process, in which the server that forks the workers stays."""
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    monkeypatch.setenv("NO_COLOR", "1")
+    before = {number: signal.getsignal(number) for number in ENDING}
+
+    def invoke(*arguments: str | Path) -> tuple[int, str, str]:
+        result = CliRunner().invoke(main, ["sweep", *map(str, arguments)])
+        return result.exit_code, result.stdout, result.stderr
+
+    yield invoke
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def closed_form(rate: float, agents: int = 5) -> float:
@@ -71,10 +86,10 @@ def closed_form(rate: float, agents: int = 5) -> float:
     return float(np.trace(projector @ solution @ projector))
 
 
-def test_tables_hold_what_theory_says_and_nothing_is_done_again(tmp_path: Path) -> None:
+def test_tables_hold_what_theory_says_and_nothing_is_done_again(tmp_path: Path, here: Call) -> None:
     over = {"switching.scale": {"from": 0.1, "to": 10, "count": 5, "spacing": "log"}, "run.dt": [0.05, 0.1]}
     path, out = file(tmp_path, over=over), tmp_path / "out"
-    code, stdout, stderr = call(path, "--out", out, "--json")
+    code, stdout, stderr = here(path, "--out", out, "--json")
     assert code == 0, stderr
     document = json.loads(stdout)
     assert (document["done"], document["failed"], document["kept"], document["verdict"]) == (10, 0, 0, None)
@@ -95,12 +110,12 @@ def test_tables_hold_what_theory_says_and_nothing_is_done_again(tmp_path: Path) 
     journal = (out / "points.jsonl").read_bytes()
     # A changed file: what is new is done, the rest kept.
     over["run.dt"] = [0.05, 0.1, 0.2]
-    code, stdout, stderr = call(file(tmp_path, over=over), "--out", out, "--workers", "1")
+    code, stdout, stderr = here(file(tmp_path, over=over), "--out", out, "--workers", "1")
     assert "15 predictions, 10 of them from an earlier sweep." in " ".join(stdout.split())
     assert (out / "points.jsonl").read_bytes().startswith(journal)
 
 
-def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path) -> None:
+def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path, here: Call) -> None:
     """Runs of a fixed seed: the same numbers to the last digit, and nothing computed twice."""
     over = {"switching.scale": {"from": 0.1, "to": 10, "count": 9, "spacing": "log"}}
     experiment = EXPERIMENT | {"run": {"dt": 0.05, "duration": 400}}
@@ -123,7 +138,7 @@ def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path) -> Non
     before = journal.read_bytes()
     kept = before.count(b"\n")
     assert f"interrupted: {kept} of 9 points are kept" in stderr
-    code, stdout, _ = call(path, "--out", out, "--json")
+    code, stdout, _ = here(path, "--out", out, "--json")
     document = json.loads(stdout)
     assert (code, document["kept"], document["done"], document["verdict"]) == (0, kept, 9, "agrees")
     assert journal.read_bytes().startswith(before)
@@ -135,11 +150,11 @@ def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path) -> Non
         assert row["system_error.measured"] == measured.system_error.measured
 
 
-def test_failures_are_told_and_the_exit_code_says_so(tmp_path: Path) -> None:
+def test_failures_are_told_and_the_exit_code_says_so(tmp_path: Path, here: Call) -> None:
     """With a delay, some steps are unstable, which only the prediction can find out."""
     experiment = EXPERIMENT | {"noise": {"delay": 3}, "run": {"duration": 55}}
     path = file(tmp_path, experiment=experiment, over={"run.dt": [0.05, 0.55]})
-    code, stdout, stderr = call(path, "--out", tmp_path / "out", "--workers", "1")
+    code, stdout, stderr = here(path, "--out", tmp_path / "out", "--workers", "1")
     assert code == 3, stderr
     assert "point 2: no result: " in stdout
     assert "2 predictions; 1 without a result." in " ".join(stdout.split())
@@ -154,17 +169,15 @@ def test_failures_are_told_and_the_exit_code_says_so(tmp_path: Path) -> None:
         (["--out", "/proc/nothing"], "choose another place with --out"),
     ],
 )
-def test_bad_usage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str) -> None:
-    monkeypatch.setattr("msg_analysis.sweep.jobs.workers._CONNECT", 1.0)
+def test_bad_usage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, here: Call, arguments: list[str], words: str
+) -> None:
+    monkeypatch.setattr("msg_analysis.sweep.jobs.workers._CONNECT", 0.2)
     monkeypatch.chdir(tmp_path)
-    from click.testing import CliRunner
-
-    from msg_analysis.cli.main import main
-
-    result = CliRunner().invoke(main, ["sweep", str(file(tmp_path, over={"run.dt": [0.05]})), *arguments])
-    assert result.exit_code == 2
-    assert words in result.stderr
-    assert "Traceback" not in result.stderr
+    code, _, stderr = here(file(tmp_path, over={"run.dt": [0.05]}), *arguments)
+    assert code == 2
+    assert words in stderr
+    assert "Traceback" not in stderr
 
 
 def test_without_msg_agents_networks_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
