@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import subprocess
 import sys
@@ -25,17 +26,35 @@ def modules(package: str, place: Path, folder: str = ".") -> list[str]:
     ]
 
 
-def loaded_by(names: list[str]) -> set[str]:
-    """Every module that importing these loads, whoever imports it."""
+def loaded_in_turn(lists: list[list[str]]) -> list[set[str]]:
+    """Of each list, every module that importing it loads, whoever imports it, and that was not there before."""
     code = (
         "import importlib, json, sys\n"
-        f"for name in {names!r}:\n"
-        "    importlib.import_module(name)\n"
-        "print(json.dumps(sorted(sys.modules)))"
+        "found, known = [], set()\n"
+        f"for names in {lists!r}:\n"
+        "    for name in names:\n"
+        "        importlib.import_module(name)\n"
+        "    found.append(sorted(set(sys.modules) - known))\n"
+        "    known.update(sys.modules)\n"
+        "print(json.dumps(found))"
     )
     process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
     assert process.returncode == 0, process.stderr
-    return set(json.loads(process.stdout))
+    return [set(names) for names in json.loads(process.stdout)]
+
+
+def loaded_by(names: list[str]) -> set[str]:
+    """Every module that importing these loads."""
+    (loaded,) = loaded_in_turn([names])
+    return loaded
+
+
+@functools.cache
+def loaded_without_ros() -> dict[str, set[str]]:
+    """What msg_analysis loads, and what the folders without ROS load after it and after those before them."""
+    lists = {"msg_analysis": modules("msg_analysis", ANALYSIS)}
+    lists |= {folder: modules("msg_agents", AGENTS, folder) for folder in folders_without_ros()}
+    return dict(zip(lists, loaded_in_turn(list(lists.values())), strict=True))
 
 
 def is_ros(name: str) -> bool:
@@ -51,7 +70,7 @@ def test_msg_analysis_brings_neither_ros_nor_msg_agents() -> None:
     """Also where a dependency would bring it."""
     names = modules("msg_analysis", ANALYSIS)
     assert len(names) > 100
-    loaded = loaded_by(names)
+    loaded = loaded_without_ros()["msg_analysis"]
     assert set(names) <= loaded
     assert not [name for name in loaded if is_ros(name) or name.startswith("msg_agents")]
 
@@ -61,9 +80,9 @@ def test_what_needs_no_ros_does_without(folder: str) -> None:
     """These can be tested, the plan printed and a command line parsed on a machine without ROS."""
     names = modules("msg_agents", AGENTS, folder)
     assert len(names) > 1
-    loaded = loaded_by(names)
-    assert set(names) <= loaded
-    assert not [name for name in loaded if is_ros(name)]
+    everything = loaded_without_ros()
+    assert set(names) <= set().union(*everything.values())
+    assert not [name for name in everything[folder] if is_ros(name)]
 
 
 def test_the_folders_without_ros() -> None:

@@ -191,7 +191,8 @@ def test_steps_that_the_switcher_reports(tmp_path: Path) -> None:
     with Supervisor(tmp_path, os.environ | {"PYTHONPATH": str(tmp_path)}) as supervisor:
         supervisor.read_status()
         assert supervisor.steps == []
-        reports = [[number, -1] * 500 for number in range(2000)]  # more than any pipe holds
+        reports = [[number, -1] * 500 for number in range(500)]  # more than any pipe holds
+        assert sum(len(json.dumps(steps)) for steps in reports) > 2 << 20
         orders.write_text("".join(f"{json.dumps(steps)}\n" for steps in reports))
         supervisor.start([ProcessPlan("switcher", ("switcher", str(orders)))])
         (child,) = supervisor.children

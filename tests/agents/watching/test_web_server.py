@@ -31,6 +31,13 @@ def web() -> Iterator[WebServer]:
         yield served
 
 
+@pytest.fixture(scope="module")
+def idle() -> Iterator[WebServer]:
+    """One to which no test shows anything."""
+    with WebServer("127.0.0.1", 0) as served:
+        yield served
+
+
 def _connection(web: WebServer) -> http.client.HTTPConnection:
     return http.client.HTTPConnection(web.address.removeprefix("http://").rstrip("/"), timeout=20)
 
@@ -60,16 +67,16 @@ class Events:
         return None
 
 
-def test_page(web: WebServer) -> None:
-    page = _get(web, "/")
+def test_page(idle: WebServer) -> None:
+    page = _get(idle, "/")
     text = page.read().decode()
     assert page.status == 200
     assert "default-src 'none'" in page.getheader("Content-Security-Policy", "")
     assert "<!DOCTYPE html>" in text
     for outside in ("http://", "https://", "//cdn"):
         assert outside not in text.replace("http://www.w3.org/2000/svg", "")
-    assert _get(web, "/etc/passwd").status == 404
-    assert _get(web, "/../setup.py").status == 404
+    assert _get(idle, "/etc/passwd").status == 404
+    assert _get(idle, "/../setup.py").status == 404
 
 
 @pytest.mark.parametrize(
@@ -86,9 +93,9 @@ def test_page(web: WebServer) -> None:
         ("localhost:", 403),
     ],
 )
-def test_only_under_our_own_name(web: WebServer, host: str, status: int) -> None:
+def test_only_under_our_own_name(idle: WebServer, host: str, status: int) -> None:
     """A page from elsewhere whose name points here all of a sudden (DNS rebinding) gets nothing."""
-    assert _get(web, "/", Host=host).status == status
+    assert _get(idle, "/", Host=host).status == status
 
 
 def test_events(web: WebServer) -> None:
@@ -161,8 +168,8 @@ def test_not_too_many(web: WebServer) -> None:
     assert _get(web, "/").status == 200
 
 
-def test_two_names(web: WebServer) -> None:
-    connection = _connection(web)
+def test_two_names(idle: WebServer) -> None:
+    connection = _connection(idle)
     connection.putrequest("GET", "/", skip_host=True)
     connection.putheader("Host", "localhost")
     connection.putheader("Host", "evil.example")
@@ -171,8 +178,8 @@ def test_two_names(web: WebServer) -> None:
 
 
 @pytest.mark.parametrize("request_line", [b"POST / HTTP/1.1", b"GET", b"GET / HTTP/9.9", b"\xff\xfe"])
-def test_errors_have_the_headers_of_the_page(web: WebServer, request_line: bytes) -> None:
-    with _dial(web) as browser:
+def test_errors_have_the_headers_of_the_page(idle: WebServer, request_line: bytes) -> None:
+    with _dial(idle) as browser:
         browser.sendall(request_line + b"\r\nHost: localhost\r\n\r\n")
         answer = browser.makefile("rb").read()
     assert re.match(rb"HTTP/1.0 (400|501|505) ", answer)
@@ -222,18 +229,18 @@ def test_the_end_reaches_who_watches() -> None:
     assert found[-1] == "end"
 
 
-def test_the_port_is_taken(web: WebServer) -> None:
-    port = int(web.address.rstrip("/").rpartition(":")[2])
+def test_the_port_is_taken(idle: WebServer) -> None:
+    port = int(idle.address.rstrip("/").rpartition(":")[2])
     with pytest.raises(InputError, match=f"--web: cannot serve at 127.0.0.1, port {port} .*in use.*another port"):
         WebServer("127.0.0.1", port)
     with pytest.raises(InputError, match="cannot serve at nosuchhost"):
         WebServer("nosuchhost.invalid", 0)
 
 
-def test_a_taken_port_ends_the_command_before_anything_starts(web: WebServer, tmp_path: Any) -> None:
+def test_a_taken_port_ends_the_command_before_anything_starts(idle: WebServer, tmp_path: Any) -> None:
     experiment = tmp_path / "net.yaml"
     experiment.write_text("name: net\ngraphs: {line: {path: [1, 2, 3]}}\nrun: {duration: 5}\n")
-    port = web.address.rstrip("/").rpartition(":")[2]
+    port = idle.address.rstrip("/").rpartition(":")[2]
     for command in (["run", str(experiment), "--out", str(tmp_path / "runs")], ["live", "--timeout", "1"]):
         result = CliRunner().invoke(main, [*command, "--web", port])
         assert result.exit_code == 2, result.output
