@@ -2,8 +2,8 @@
 
 A job is a list: program, arguments, and what its stdout is: "pipe", "full" (a full disk), "closed", "gone" (a pipe that
 nobody reads), "terminal", "ascii" (it has few characters), "limit" (files cannot grow beyond a few bytes), or "memory"
-(there is 1 GB of it, and a minute). ``outcomes`` gives exit code, stdout, stderr of each. As a program, this is the
-process that forks: it answers each line, a request, by a line.
+(there is 1 GB of it). A job is killed after a minute. ``outcomes`` gives exit code, stdout, stderr of each. As a
+program, this is the process that forks: it answers each line, a request, by a line.
 """
 
 from __future__ import annotations
@@ -35,18 +35,29 @@ PREPARED = (
     "scipy.stats",
 )
 MEMORY = 1 << 30  # bytes
-LONGEST = 60  # s, where memory is limited
+LONGEST = 60  # s of a job
 
 
-def outcomes(jobs: list[list[Any]], folder: Path, **environment: str) -> list[list[Any]]:
-    """Exit code, stdout, stderr of each job, with this folder to work in and additions to the environment."""
+def outcomes(
+    jobs: list[list[Any]], folder: Path, prepared: tuple[str, ...] = (), **environment: str
+) -> list[list[Any]]:
+    """Exit code, stdout, stderr of each job, with this folder to work in and additions to the environment.
+
+    ``prepared``: more modules that are to be imported before.
+    """
     server = _server()
     assert server.stdin is not None
     assert server.stdout is not None
-    request = {"jobs": jobs, "folder": str(folder), "environment": {**os.environ, **environment}}
-    server.stdin.write(f"{json.dumps(request)}\n")
-    server.stdin.flush()
-    found: list[list[Any]] = json.loads(server.stdout.readline())
+    all_of_it = {**os.environ, **environment}
+    request = {"jobs": jobs, "folder": str(folder), "environment": all_of_it, "prepared": prepared}
+    try:
+        server.stdin.write(f"{json.dumps(request)}\n")
+        server.stdin.flush()
+        found: list[list[Any]] = json.loads(server.stdout.readline())
+    except BaseException:  # its answer would be taken for that of the next request
+        server.kill()
+        _server.cache_clear()
+        raise
     return found
 
 
@@ -67,11 +78,12 @@ def _server() -> subprocess.Popen[str]:
 
 def child(program: str, arguments: list[str], kind: str, stdout: int, stderr: int) -> int:
     os.dup2(stderr, 2)
+    signal.alarm(LONGEST)
+    sys.argv = [program, *arguments]
     if kind == "limit":
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as Python has it at its start
         resource.setrlimit(resource.RLIMIT_FSIZE, (64, 64))
     if kind == "memory":
-        signal.alarm(LONGEST)
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     if kind == "ascii":
         sys.stdout.reconfigure(encoding="ascii", errors="strict")  # type: ignore[union-attr]
@@ -143,6 +155,8 @@ def main() -> None:
         os.chdir(request["folder"])
         os.environ.clear()
         os.environ.update(request["environment"])
+        for name in request["prepared"]:
+            importlib.import_module(name)
         print(json.dumps([run(*job) for job in request["jobs"]]), file=answers, flush=True)
 
 

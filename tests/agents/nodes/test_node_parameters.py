@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import many_commands
 import pytest
 import yaml
 
@@ -16,6 +18,7 @@ pytest.importorskip("rclpy")
 import click
 
 from msg_agents.cli.main import main
+from msg_agents.cli.node_server import MODULES as NODE_MODULES
 from msg_agents.cli.ros_command import RosCommand, split_arguments
 from msg_agents.nodes.ros.node_parameters import describe, name_of, options_of
 from msg_agents.processes.ros_domain import free_domain
@@ -34,7 +37,27 @@ def run_file(tmp_path: Path) -> Path:
     return file
 
 
-def start(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
+@dataclass
+class Ended:
+    """A process."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def start(executable: str, *arguments: Any) -> Ended:
+    words = [executable, *(str(argument) for argument in arguments)]
+    with free_domain() as domain:
+        environment = {"NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        ((code, stdout, stderr),) = many_commands.outcomes(
+            [["msg-agents", words, "pipe"]], Path.cwd(), NODE_MODULES, **environment
+        )
+    return Ended(code, stdout, stderr)
+
+
+def execute(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
+    """From its start to its end."""
     with free_domain() as domain:
         environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain)}
         environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -129,7 +152,7 @@ def test_the_command_line_wins_over_a_file_for_all_nodes(run_file: Path, tmp_pat
 
 @pytest.mark.parametrize("rule", ["__node:=other"])
 def test_nodes_keep_their_names(run_file: Path, tmp_path: Path, rule: str) -> None:
-    process = start("recorder", run_file, "--out", tmp_path / "bag", "--ros-args", "-r", rule)
+    process = execute("recorder", run_file, "--out", tmp_path / "bag", "--ros-args", "-r", rule)
     assert process.returncode == 2
     assert "the nodes of a run find each other by name" in process.stderr
     assert not (tmp_path / "bag").exists()
