@@ -1,16 +1,29 @@
-"""A small run."""
+"""A small run; rosbags parses what stands in every bag of ours once."""
 
 from __future__ import annotations
 
+import functools
 import uuid
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+from rosbags.highlevel import anyreader
+from rosbags.rosbag2 import storage_mcap
 
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
+
+_QOS = functools.cache(storage_mcap.get_qos)
+_TYPES = functools.cache(anyreader.get_types_from_msg)
+
+
+@pytest.fixture(autouse=True)
+def _parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each text of a quality of service or a definition: most of the time of rosbags, and of hundreds of small bags."""
+    monkeypatch.setattr(storage_mcap, "get_qos", _QOS)
+    monkeypatch.setattr(anyreader, "get_types_from_msg", _TYPES)
 
 
 @pytest.fixture
