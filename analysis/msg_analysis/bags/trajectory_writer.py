@@ -6,7 +6,8 @@ States that are missing in the trajectory are missing in the bag.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,8 @@ from msg_analysis.model.step.air import LOST
 from msg_analysis.types import IntArray
 from msg_analysis.wire.messages import ActiveGraph, StateCodec, encode_string
 from msg_analysis.wire.topics import EXPERIMENT, GRAPH, STATE, TRUTH, Topic, network_topics
+
+AT_ONCE = 4096  # messages
 
 
 def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT_STORAGE) -> None:
@@ -43,11 +46,21 @@ def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Sto
             topics = network_topics(trajectory.record.experiment.agents, truth=noisy)
             with BagWriter(unfinished, topics, record=record, storage=storage) as bag:
                 bag.write(f"/{EXPERIMENT.name}", encode_string(record), 0)
-                for topic, data, time in _messages(trajectory):
-                    bag.write(topic, data, time)
+                _write(bag, [topic.name for topic in topics], _messages(trajectory))
             unfinished.rename(directory)
     except OSError as error:
         raise BagError(f"{directory}: cannot be written ({error.strerror}): choose another place") from error
+
+
+def _write(bag: BagWriter, names: Sequence[str], messages: Iterator[tuple[str, bytes, int]]) -> None:
+    """Write many messages at once: a fraction of the time of writing each."""
+    number = {name: index for index, name in enumerate(names)}
+    while part := list(islice(messages, AT_ONCE)):
+        topics, contents, times = zip(*part, strict=True)
+        size = np.array([len(content) for content in contents], dtype=np.int64)
+        of = np.array([number[topic] for topic in topics], dtype=np.int64)
+        time = np.array(times, dtype=np.int64)
+        bag.write_many(names, of, time, b"".join(contents), np.cumsum(size) - size, size)
 
 
 def _messages(trajectory: Trajectory) -> Iterator[tuple[str, bytes, int]]:
