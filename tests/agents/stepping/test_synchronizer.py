@@ -12,6 +12,7 @@ import random
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import pytest
 from hypothesis import given, settings
@@ -35,9 +36,16 @@ class Case:
     inputs: Inputs
     path: list[Sojourn]
 
-    def peers(self, agent: int) -> set[int]:
-        heard = {j for mode in self.inputs for j in mode[agent]}
-        return heard | {j for mode in self.inputs for j in range(self.agents) if agent in mode[j]}
+    @cached_property
+    def peers(self) -> list[set[int]]:
+        """Of every agent: whom it hears, or who hears it, in any mode."""
+        found: list[set[int]] = [set() for _ in range(self.agents)]
+        for mode in self.inputs:
+            for agent, heard in enumerate(mode):
+                for j in heard:
+                    found[agent].add(j)
+                    found[j].add(agent)
+        return found
 
 
 def law(own: int, agent: int, mode: int, heard: list[tuple[int, int]]) -> int:
@@ -71,7 +79,7 @@ class Network:
     def __post_init__(self) -> None:
         case = self.case
         self.nodes = [self._node(i, 0) for i in range(case.agents)]
-        self.links = {(j, i): deque() for i in range(case.agents) for j in case.peers(i)}
+        self.links = {(j, i): deque() for i in range(case.agents) for j in case.peers[i]}
         self.graphs = [deque(case.path) for _ in range(case.agents)]
         self.states = [[] for _ in range(case.agents)]
         for i in range(case.agents):
@@ -81,7 +89,7 @@ class Network:
         case = self.case
         inputs = [mode[agent] for mode in case.inputs]
         return Synchronizer(
-            agent=agent, steps=case.steps, inputs=inputs, peers=case.peers(agent), window=case.window, start=start
+            agent=agent, steps=case.steps, inputs=inputs, peers=case.peers[agent], window=case.window, start=start
         )
 
     def _publish(self, agent: int, value: int) -> None:
@@ -101,6 +109,7 @@ class Network:
             elif target == agent:
                 self.links[source, target].clear()
                 self.unheard.add((source, target))
+        self.check_bounds(agent)
 
     def events(self) -> list[tuple[str, int, int]]:
         """Everything that can happen now."""
@@ -130,15 +139,15 @@ class Network:
             node.advance()
             assert node.step == step + 1
             self._publish(target, law(self.states[target][-1], target, mode, list(zip(used, values, strict=True))))
-        self.check_bounds()
+        self.check_bounds(target)
 
-    def check_bounds(self) -> None:
-        window = self.case.window
-        for i, node in enumerate(self.nodes):
-            assert node.buffered <= window + 2
-            assert len(self.states[i]) == node.step + 1
-            for j in self.case.peers(i):
-                assert len(self.states[i]) - len(self.states[j]) <= window + 1
+    def check_bounds(self, agent: int) -> None:
+        """Of the one agent that an event changes."""
+        window, node, made = self.case.window, self.nodes[agent], len(self.states[agent])
+        assert node.buffered <= window + 2
+        assert made == node.step + 1
+        for j in self.case.peers[agent]:
+            assert made - len(self.states[j]) <= window + 1
 
     def check_end(self, expected: list[list[int]]) -> None:
         texts = [f"agent {i + 1} waits for {node.waiting_for()}" for i, node in enumerate(self.nodes)]
@@ -220,8 +229,9 @@ def explore(case: Case) -> Iterator[Network]:
         for event in events:
             branch: Network = pickle.loads(frozen)
             branch.happen(event)
-            if branch.progress() not in seen:
-                seen.add(branch.progress())
+            progress = branch.progress()
+            if progress not in seen:
+                seen.add(progress)
                 pending.append(branch)
 
 
