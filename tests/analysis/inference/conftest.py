@@ -1,10 +1,15 @@
-"""Runs in real time with late agents, from the benchmarks."""
+"""Runs in real time with late agents, from the benchmarks; one prediction of many runs."""
 
+import dataclasses
 import importlib.util
+import json
 import sys
 from pathlib import Path
 
 import pytest
+
+from msg_analysis.inference.verdict import compare, pool
+from msg_analysis.theory.prediction import predict
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "late_timers.py"
 
@@ -18,3 +23,21 @@ def late_timers():
     sys.modules["late_timers"] = module
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def predicted_once(monkeypatch):
+    """Comparisons compute one prediction for all runs in lockstep that differ in nothing but their seeds."""
+    known = {}
+
+    def prediction(experiment, step=None):
+        document = experiment.to_document()
+        assert experiment.run.pace == "lockstep"
+        del document["run"]["seed"]
+        key = json.dumps(document)
+        if key not in known:
+            known[key] = predict(experiment, step)
+        return dataclasses.replace(known[key], experiment=experiment)
+
+    for module in (compare, pool):
+        monkeypatch.setattr(module, "predict", prediction)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 from scipy import stats
 
 from msg_analysis.inference.verdict.compare import compare
@@ -64,6 +65,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.usefixtures("predicted_once")
 def test_calibration(case):
     """p-values of 40 true runs are uniform, intervals cover, verdicts agree.
 
@@ -90,6 +92,7 @@ HARD = {
 
 
 @pytest.mark.parametrize("case", HARD)
+@pytest.mark.usefixtures("predicted_once")
 def test_the_level_holds_where_a_few_sojourns_decide(case):
     """60 correct runs of 10 units (rare: 100), 1,000 for the documentation: alarms at 1e-4 by the binomial law.
 
@@ -119,10 +122,12 @@ def simulate_air(experiment, seed):
     random = np.random.default_rng(seed)
     m, dt, noise, replicas = experiment.agents, experiment.run.dt, experiment.noise, experiment.run.replicas
     adjacency = [graph.adjacency for graph in experiment.graph_list]
+    neighbours = [[np.flatnonzero(row) for row in a] for a in adjacency]
     chain = experiment.chain
+    up_to = np.cumsum(scipy.linalg.expm(dt * chain.matrix), axis=1)
     modes = [int(random.choice(chain.modes, p=chain.stationary))]
-    while len(modes) < experiment.steps:
-        modes.append(int(random.choice(chain.modes, p=chain.transition(dt)[modes[-1]])))
+    for chance in random.random(experiment.steps - 1).tolist():
+        modes.append(int(np.searchsorted(up_to[modes[-1], :-1], chance, side="right")))
     states, published = np.zeros((2, experiment.steps + 1, m, replicas))
     lost = np.zeros((experiment.steps, m, max(int((a > 0).sum(axis=1).max()) for a in adjacency)), dtype=bool)
     for k, g in enumerate(modes):
@@ -133,8 +138,7 @@ def simulate_air(experiment, seed):
         pull = (adjacency[g][:, :, None] * arrived[:, :, None] * (heard - x[:, None])).sum(axis=1)
         process = experiment.noise_gain[g] @ random.standard_normal(x.shape)
         states[k + 1] = x + dt * pull + np.sqrt(dt) * process
-        for i in range(m):
-            links = np.flatnonzero(adjacency[g][i])
+        for i, links in enumerate(neighbours[g]):
             lost[k, i, : len(links)] = ~arrived[i, links]
     published[-1] = states[-1] + noise.broadcast * random.standard_normal(x.shape)
     record = RunRecord(uuid.UUID(int=seed), experiment, states[0])
@@ -144,6 +148,7 @@ def simulate_air(experiment, seed):
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
+@pytest.mark.usefixtures("predicted_once")
 def test_calibration_with_noise_that_depends_on_the_graph(loss):
     """40 runs; levels as in test_calibration, 11 or 12 tests."""
     noise = {"process": 0.2, "broadcast": 0.3, "link": 0.2, "loss": loss}
@@ -156,6 +161,7 @@ def test_calibration_with_noise_that_depends_on_the_graph(loss):
     assert sum(r.verdict == "disagrees" for r in results) <= stats.binom.isf(1e-4, len(results), 0.01)
 
 
+@pytest.mark.usefixtures("predicted_once")
 def test_standard_errors_hold_when_the_graph_hardly_ever_switches():
     """Rate 0.01 over 250 time units: two or three switches a run. 95 % intervals of 40 runs, binomial at 1e-4."""
     slow = changed(
@@ -330,6 +336,7 @@ def test_a_number_too_large_to_compute_with_disagrees(name, value):
     json.dumps(comparison.to_json(), allow_nan=False)
 
 
+@pytest.mark.usefixtures("predicted_once")
 def test_noise_that_is_common_to_all():
     """What rounding leaves of the disagreement is none: it has no z, and no order. All of 40 runs agree."""
     document = {

@@ -45,6 +45,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.usefixtures("predicted_once")
 def test_calibration(case):
     """p-values of 40 true runs of 400 steps are even, intervals cover, verdicts agree.
 
@@ -65,6 +66,7 @@ def test_calibration(case):
     assert alarms <= stats.binom.isf(1e-4, len(results), 0.01)
 
 
+@pytest.mark.usefixtures("predicted_once")
 def test_many_second_moments_of_a_short_run():
     """28 second moments in 150 steps, 40 runs: few enough p-values below 5 %, by the binomial law at 1e-4."""
     graphs = {"line": {"path": list(range(1, 9))}, "ring": {"cycle": list(range(1, 9))}}

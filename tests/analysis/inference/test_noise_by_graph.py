@@ -30,6 +30,7 @@ def experiment(line, ring, **run):
 
 
 @pytest.mark.parametrize(("line", "ring"), [(0.3, [1.0, 2.0, 0.5]), (SHARED, 1.0), (0.0, 1.0)])
+@pytest.mark.usefixtures("predicted_once")
 def test_calibration(line, ring):
     """p-values of 40 true runs are uniform, intervals cover, verdicts agree.
 

@@ -107,6 +107,7 @@ def test_document(three):
 
 
 @pytest.mark.parametrize("document", [DOCUMENT, AIR], ids=["quiet", "air"])
+@pytest.mark.usefixtures("predicted_once")
 def test_calibration(document):
     """p-values of 25 pools of two runs: Kolmogorov-Smirnov at 2e-4 for each of at most 13 tests."""
     results = [compare_pooled(runs(document, (50.0, 70.0), first_seed=10 * i)) for i in range(25)]
