@@ -97,12 +97,21 @@ def squared_deviations(experiment, process, seed):
     past = [np.zeros((NETWORKS, m))] * (noise.delay + 1)  # x(k), x(k - 1), ...
     for _ in range(STEPS):
         x = past[0]
-        sent = past[-1] + noise.broadcast * random.standard_normal(x.shape)
-        heard = sent[:, None, :] + noise.link * random.standard_normal((NETWORKS, m, m))
-        arrived = random.random((NETWORKS, m, m)) >= noise.loss
-        pull = np.where(arrived, heard, x[:, :, None])  # a lost value is replaced by one's own
-        moved = own[modes] * x + (coupling[modes] * pull).sum(axis=2)
-        moved += np.einsum("rab,rb->ra", gain[modes], random.standard_normal(x.shape))
+        sent = past[-1]
+        if noise.broadcast:
+            sent = sent + noise.broadcast * random.standard_normal(x.shape)
+        pull = sent[:, None, :]
+        if noise.link:
+            pull = pull + noise.link * random.standard_normal((NETWORKS, m, m))
+        if noise.loss:  # a lost value is replaced by one's own
+            pull = np.where(random.random((NETWORKS, m, m)) >= noise.loss, pull, x[:, :, None])
+        drawn = random.standard_normal(x.shape)
+        moved = np.empty_like(x)
+        for g in range(len(weights)):
+            now = modes == g
+            heard = np.broadcast_to(pull[now], (int(now.sum()), m, m))
+            moved[now] = own[g] * x[now] + np.einsum("ab,rab->ra", coupling[g], heard)
+            moved[now] += drawn[now] @ gain[g].T
         past = [moved, *past[:-1]]
         modes = jumped(random, modes, transition)
     deviation = past[0] - (past[0].mean(axis=1, keepdims=True) if experiment.problem == "consensus" else 0.0)
