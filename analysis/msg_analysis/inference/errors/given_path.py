@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -93,13 +93,15 @@ def means_given_path(observation: Observation) -> TimeMeans | None:
     """
     system, steps = observation.prediction.system, observation.steps
     d = system.dimension
-    for kind in ("joint", "nodes", "system"):
-        forms, nodes, trace = forms_of(system, kind)
-        q = len(forms)
-        if steps * d**2 * (q**2 + 5 * q * d) <= MAX_WORK:
-            break
-    else:
+    counts: dict[Literal["joint", "nodes", "system"], int] = {  # of forms; made only where they are used
+        "joint": packed_symmetric.size(d),
+        "nodes": observation.step.agents,
+        "system": 1,
+    }
+    kind = next((kind for kind, q in counts.items() if steps * d**2 * (q**2 + 5 * q * d) <= MAX_WORK), None)
+    if kind is None:
         return None
+    forms, nodes, trace = forms_of(system, kind)
     kinds = _steps(observation)
     if kinds is None:
         return None
