@@ -143,9 +143,10 @@ def _plots(page: Page) -> int:
 
 
 @pytest.mark.parametrize("agents", [2, 5, 100])
-def test_report(agents: int) -> None:
+def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agents: int) -> None:
     comparison, text = _made_up(agents)
-    page = _checked(text)
+    monkeypatch.setattr(report_page, "render", lambda *_, **__: text)
+    page = _page(comparison, tmp_path / "report.html")
     assert "The run agrees with the prediction." in page.text
     assert str(comparison.trajectory.record.run) in page.text
     assert "1.235" in page.text
@@ -154,8 +155,7 @@ def test_report(agents: int) -> None:
         assert f"{0.3 + i / 100:#.4g}" in page.text
     assert _plots(page) == 6
     assert page.tags.count("svg") == 3  # two graphs and the chain
-    assert "Real time" not in page.text  # lockstep has no timing
-    assert "predicted, steps of the run" in page.text
+    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
 
 
 def test_report_of_a_real_comparison(tmp_path: Path) -> None:
@@ -255,3 +255,9 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "The run agrees with the prediction." in text
     assert "600 of 600 (0 %)" not in text
     assert "0 of 600 (0 %)" in text
+
+
+def test_lockstep_has_no_timing() -> None:
+    page = Page(_made_up(5)[1])
+    assert "Real time" not in page.text
+    assert "predicted, steps of the run" in page.text
