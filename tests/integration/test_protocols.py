@@ -20,13 +20,13 @@ from msg_analysis.twin.simulate import simulate
 
 EXPERIMENTS = Path(__file__).parents[2] / "ros_ws/src/msg_agents_example_protocols/experiments"
 LEAVING = """
-import os
+import ctypes
 from msg_analysis.protocol import Protocol
 
 class Broken(Protocol):
     def step(self, k, mode, state, heard, noise):
         if k == 17 and self.agent == 2:
-            os._exit(0)
+            ctypes.CDLL(None)._exit(0)  # os._exit would be an error of the protocol
         return state
 """
 BROKEN = """

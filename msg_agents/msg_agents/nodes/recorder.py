@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from msg_agents.nodes.diagnostics import Health
@@ -15,12 +16,13 @@ from msg_analysis.errors import BagError
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.wire import topics
 from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.topics import Topic, network_topics
+from msg_analysis.wire.topics import Topic, agent_name, network_topics
 
 LEAST_WRITE, MOST_WRITE = 2**15, 2**18
 """Bytes of states after which they are written: 4 kB for each agent, within these bounds. Many at once cost a fraction
 of one by one, but in longer turns the recorder delays agents on the same core."""
 WRITE_PERIOD = 0.1  # s of wall time after which fewer are written, in slow runs and at the end
+LOOK_PERIOD = 0.5  # s of wall time between two looks for other nodes that publish states
 FLUSH_PERIOD = 1.0
 """s of wall time: a killed recorder loses at most so much, even if a chunk takes longer to fill."""
 
@@ -48,12 +50,14 @@ class Recorder(NetworkNode):
         self.subscribe(topics.EXPERIMENT, self._record_experiment)
         self.subscribe(topics.GRAPH, self._record_graph)
         for kind in self._kinds:
-            self.subscribe(kind.topic, self._collector(kind))
+            self.subscribe(kind.topic, self._collector(kind.add))
+        self._reads_single = False  # also the agents' own topics
         self._progress = self.publisher_of(topics.PROGRESS)
         self.finish_at_end()
         self.bag = BagWriter(directory, recorded, record=record.to_json(), storage=storage)
         every(self, WRITE_PERIOD, self._guarded(self._write_states))
         every(self, FLUSH_PERIOD, self._guarded(self.bag.flush))
+        every(self, LOOK_PERIOD, self._look_for_others)
 
     def health(self) -> Health:
         """Number of recorded messages."""
@@ -65,12 +69,29 @@ class Recorder(NetworkNode):
         self._guarded(self._write_states)()
         self.bag.close(complete=not self._awaiting)
 
-    def _collector(self, kind: StateReceiver) -> Callable[[bytes], None]:
-        """The callback for the batches of a kind of states."""
+    def _look_for_others(self) -> None:
+        """Read the agents' own topics, too, as soon as another node publishes there: a player has no batches."""
+        first = agent_name(0)
+        for kind in () if self._reads_single else self._kinds:
+            name = kind.of.of(0)
+            if self.count_publishers(name):
+                writers = self.get_publishers_info_by_topic(self.resolve_topic_name(name))
+                if any(writer.node_name != first for writer in writers):
+                    self._read_single()
+                    return
+
+    def _read_single(self) -> None:
+        self._reads_single = True
+        for kind in self._kinds:
+            for agent in range(self.record.experiment.agents):
+                self.subscribe(kind.of, self._collector(partial(kind.add_single, agent)), agent=agent)
+
+    def _collector(self, add: Callable[[bytes], int]) -> Callable[[bytes], None]:
+        """The callback for a topic of states; ``add`` gives the number of bytes that wait."""
         write_states, size = self._guarded(self._write_states), write_size(self.record.experiment.agents)
 
         def collect(data: bytes) -> None:
-            if kind.add(data) >= size:
+            if add(data) >= size:
                 write_states()
 
         return collect

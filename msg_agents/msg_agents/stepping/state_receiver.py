@@ -42,13 +42,15 @@ class StateReceiver:
 
     def __init__(self, record: RunRecord, topic: Topic, of: Topic, root: str) -> None:
         experiment = record.experiment
-        self.topic = topic
+        self.topic, self.of = topic, of
         self.names = [root + of.of(agent) for agent in range(experiment.agents)]  # by agent
         self._record, self._run = record, run_number(record.run.bytes)
         self._frame = state_frame(record, whole=topic is TRUTHS)
         self._graphs = len(experiment.graph_list)
         self._received = [ReceivedSteps(experiment.steps) for _ in range(experiment.agents)]
         self._batches: list[bytes] = []
+        self._single: list[bytes] = []
+        self._refused: list[tuple[str, str]] = []  # of these
         self._filled = 0
         # Odd numbers, the same in every run: two messages have the same mark with probability 2^-30.
         words = -(-self._frame.size // _WORD)
@@ -60,9 +62,19 @@ class StateReceiver:
         self._filled += len(data)
         return self._filled
 
+    def add_single(self, agent: int, data: bytes) -> int:
+        """The same of a message on the topic of an agent (index from 0)."""
+        frame = self._frame.unwrap(data)
+        if frame is None or frame[0] != agent + 1:
+            self._refused.append((self.names[agent], why_refused(data, self._record, agent, self._frame)))
+        else:
+            self._single.append(data)
+            self._filled += len(data)
+        return self._filled
+
     def take(self) -> Received:
         """What has come since the last call."""
-        refused: list[tuple[str, str]] = []
+        refused, self._refused = self._refused, []
         data, start, size = self._messages(refused)
         states, _ = own_layout(data, start, size, np.arange(len(start)))
         good = self._possible(states)
@@ -110,7 +122,10 @@ class StateReceiver:
                 continue
             parts.append(messages)
             sizes.append(size)
+        parts += self._single
+        sizes.append(np.array([len(message) for message in self._single], dtype=np.int64))
         self._batches.clear()
+        self._single.clear()
         self._filled = 0
         size = np.concatenate(sizes)
         return b"".join(parts), np.cumsum(size) - size, size

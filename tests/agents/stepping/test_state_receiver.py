@@ -147,3 +147,17 @@ def test_exact_states_beside_noisy_ones() -> None:
     receiver.add(encode_batch(record.run.bytes, [_message(record, 3, 0)]))
     assert receiver.take().agent.tolist() == [2]
     assert receiver.names[2] == "/agent_3/truth"
+
+
+def test_single_messages_beside_batches() -> None:
+    """Of a player, or of somebody else: taken once, on the topic of their agent only."""
+    record = _record()
+    receiver = _receiver(record)
+    receiver.add(encode_batch(record.run.bytes, [_message(record, 1, 0), _message(record, 2, 0)]))
+    for agent, message in ((0, _message(record, 1, 0)), (1, _message(record, 2, 1)), (1, _message(record, 3, 0))):
+        receiver.add_single(agent, message)
+    received = receiver.take()
+    assert sorted(zip(received.agent.tolist(), received.step.tolist(), strict=True)) == [(0, 0), (1, 0), (1, 1)]
+    assert sorted(received.refused) == sorted(
+        [("/net/agent_1/state", Refusal.REPEATED), ("/net/agent_2/state", Refusal.OTHER_AGENT)]
+    )
