@@ -114,7 +114,7 @@ def test_sojourns_of_one_step(network: Any) -> None:
     Between two graphs of 1.3 steps on average, an agent that had missed one would have kept its graph for ever.
     """
     fast = {"switching": {"generator": [[-20.0, 20.0], [20.0, -20.0]]}}
-    result = network.run(network.experiment(**fast, run={**REALTIME, "speed": 30, "duration": 60, "processes": 2}))
+    result = network.run(network.experiment(**fast, run={**REALTIME, "speed": 10, "duration": 60, "processes": 2}))
     assert result.failures == []
     assert result.strangers == []
     assert_possible(result.trajectory)

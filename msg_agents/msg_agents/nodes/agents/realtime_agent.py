@@ -19,7 +19,7 @@ from msg_analysis.wire import topics
 from msg_analysis.wire.messages import ActiveGraph, stamp_ns
 from msg_analysis.wire.refusals import Refusal
 
-MOST_AT_ONCE = 64
+MOST_AT_ONCE = 8
 """Late steps that are made in a row before the executor gets its turn: messages, timers, signals."""
 
 Value = tuple[bytes, int]  # a state, and the simulated time [ns] at which it was made
