@@ -239,6 +239,7 @@ def _copy(file: Path, copy: Path) -> FileCount:
             compression="zstd",
             profile=source.profile or "ros2",
             library=source.library or "mcap",
+            directory=str(copy.parent),
         )
         channels = _Channels(writer, source, count)
         for batch in itertools.chain([first] if first else [], batches):

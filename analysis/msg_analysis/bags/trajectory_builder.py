@@ -12,7 +12,7 @@ import numpy as np
 
 from msg_analysis.bags.format.mcap_file import Batch
 from msg_analysis.bags.state_columns import States, decode_states, run_number
-from msg_analysis.common.large_arrays import in_file, large_zeros, release
+from msg_analysis.common.large_arrays import large_zeros, release
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment.memory import amount, available_memory
 from msg_analysis.model.run.record import RunRecord
@@ -116,11 +116,11 @@ class Collected:
             return large_zeros(shape, dtype, total=needed)
 
         try:
+            if needed > available:  # a small bag may claim to be of a huge run, whose missing states are all written
+                raise MemoryError
             # 0 means missing: position, modes, used and made are kept plus one until `finish`. The position is that of
             # the copy that was kept.
             self._states: FloatArray = zeros((cells, width), np.float64)
-            if not in_file(self._states) and needed > available:
-                raise MemoryError
             self._position = zeros((cells,), np.int64)
             self._modes = zeros((cells,), np.int64)
             self._used = zeros((cells, most if self._realtime else 0), np.int64)

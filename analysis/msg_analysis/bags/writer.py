@@ -89,7 +89,9 @@ class BagWriter:
 
     def _begin_file(self) -> None:
         """Write all that is needed to read this file without the others."""
-        self._mcap = McapWriter(self._stream, chunk_size=self._chunk_size, compression=self._compression)
+        self._mcap = McapWriter(
+            self._stream, chunk_size=self._chunk_size, compression=self._compression, directory=str(self.directory)
+        )
         self._add_information()
         if self._record is not None:
             self._mcap.add_metadata(RECORD_NAME, {"record": self._record})

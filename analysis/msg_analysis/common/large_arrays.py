@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import os
 import tempfile
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -22,7 +23,7 @@ def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:
     MemoryError or ValueError: neither file nor memory is large enough.
     """
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    if total >= LARGE and size:
+    if total >= LARGE and size and hasattr(os, "posix_fallocate"):
         with suppress(OSError), tempfile.TemporaryFile(prefix="msg_analysis.") as file:
             os.posix_fallocate(file.fileno(), 0, size)  # a write to a full disk would end the process
             return np.memmap(file, dtype=dtype, mode="r+", shape=shape)
@@ -39,6 +40,14 @@ def release(array: AnyArray) -> None:
     mapping = _mapping(array)
     if mapping is not None and hasattr(mmap, "MADV_DONTNEED"):
         mapping.madvise(mmap.MADV_DONTNEED)
+
+
+def pieces(array: AnyArray) -> Iterator[slice]:
+    """Stretches of the first axis of ``BLOCK_NUMBERS`` numbers; each is released when it has been looked at."""
+    length = max(1, BLOCK_NUMBERS // max(1, array[:1].size))
+    for first in range(0, len(array), length):
+        yield slice(first, first + length)
+        release(array)
 
 
 def _mapping(array: Any) -> mmap.mmap | None:

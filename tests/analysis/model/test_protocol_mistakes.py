@@ -16,6 +16,7 @@ from euler import DIRECTED, Euler, EulerSteps, document, experiment
 
 from msg_analysis.cli.main import main
 from msg_analysis.errors import InputError
+from msg_analysis.model.experiment import protocol_binding
 from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
 from msg_analysis.protocol import Heard, LinearProtocol, Parameters, Protocol
 from msg_analysis.theory.prediction import predict
@@ -200,3 +201,19 @@ def test_no_prediction_is_refused_clearly(command: list[str], tmp_path: Path) ->
     assert "without a prediction: use `simulate` or `msg-agents run`" in outcome.stderr
     with pytest.raises(InputError, match="is not linear"):
         predict(ValidExperiment.load(file))
+
+
+def test_processes_that_a_protocol_forks_end_as_ever() -> None:
+    """``os._exit`` is an error in the process that calls the protocol only."""
+
+    def fork() -> int:
+        pid = os.fork()
+        if not pid:
+            os._exit(7)
+        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+    with protocol_binding._kept_alive():
+        assert fork() == 7
+        with pytest.raises(SystemExit, match=r"os\._exit\(0\)"):
+            os._exit(0)
+    assert fork() == 7

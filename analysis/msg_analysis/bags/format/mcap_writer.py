@@ -56,12 +56,13 @@ class McapWriter:
         compression: Compression,
         profile: str = "ros2",
         library: str = "mcap",
+        directory: str | None = None,  # of a temporary file; None: that of the system
     ) -> None:
         self._stream, self._chunk_size, self._compression = stream, chunk_size, compression
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         # An index of a chunk has an entry for every channel: an hour of a thousand agents has gigabytes of them.
-        self._chunk_indexes = tempfile.SpooledTemporaryFile(INDEXES_IN_MEMORY, prefix="msg_analysis.")  # noqa: SIM115
+        self._chunk_indexes = tempfile.SpooledTemporaryFile(INDEXES_IN_MEMORY, dir=directory)  # noqa: SIM115
         self._chunks = 0
         self._first: int | None = None  # log time [ns] of the first message
         self._last = 0
@@ -140,9 +141,8 @@ class McapWriter:
     def fitting(self, size: IntArray) -> int:
         """How many of the messages with these sizes, (messages,), go into the chunk in progress."""
         end = np.cumsum(size + MESSAGE.size)
-        return min(
-            int(np.searchsorted(end, self._chunk_size - self._size, side="right")) + 1, len(size)
-        )  # one too many
+        whole = int(np.searchsorted(end, self._chunk_size - self._size, side="right"))
+        return min(whole + 1, len(size))  # a chunk ends with the message that makes it too large
 
     def _add_piece(self, head: AnyArray, data: bytes, start: IntArray, size: IntArray) -> None:
         """Append messages to one chunk, and finish that when it is full."""

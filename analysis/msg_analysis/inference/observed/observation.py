@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import BLOCK_NUMBERS, release
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS, pieces, release
 from msg_analysis.common.long_work import tell
 from msg_analysis.errors import InputError
 from msg_analysis.model.run.trajectory import Trajectory
@@ -114,11 +114,8 @@ def bounded(states: FloatArray) -> FloatArray:
 def _largest(states: FloatArray) -> float:
     """Size of the largest number; 0 where there is none."""
     largest = 0.0
-    length = max(1, BLOCK_NUMBERS // max(1, states[0].size)) if len(states) else 1
-    for first in range(0, len(states), length):
-        piece = states[first : first + length]
-        largest = max(largest, float(piece.max(initial=0.0)), -float(piece.min(initial=0.0)))
-        release(states)
+    for piece in pieces(states):
+        largest = max(largest, float(states[piece].max(initial=0.0)), -float(states[piece].min(initial=0.0)))
     return largest
 
 

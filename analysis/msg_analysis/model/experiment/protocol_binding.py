@@ -8,9 +8,9 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import EntryPoint, entry_points
-from threading import get_ident
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import numpy as np
@@ -149,19 +149,24 @@ class ChosenProtocol:
 
 @contextmanager
 def _kept_alive() -> Iterator[None]:
-    """``os._exit`` raises SystemExit in this thread: it would end the program without a word."""
-    leave, thread = os._exit, get_ident()
-
-    def stay(status: int) -> NoReturn:
-        if get_ident() == thread:
-            raise SystemExit(f"os._exit({status})")
-        leave(status)
-
-    os._exit = stay
+    """``os._exit`` raises SystemExit meanwhile: it would end the program without a word."""
+    os._exit = _exit
+    token = _inside.set(os.getpid())
     try:
         yield
     finally:
-        os._exit = leave
+        _inside.reset(token)
+
+
+_inside: ContextVar[int] = ContextVar("inside", default=0)  # of a call of a protocol: the process that made it
+_leave = os._exit
+
+
+def _exit(status: int) -> NoReturn:
+    """``os._exit``, but in calls of a protocol; other threads, and processes that it has forked, end as ever."""
+    if _inside.get() == os.getpid():
+        raise SystemExit(f"os._exit({status})")
+    _leave(status)
 
 
 class AgentProtocol:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import BLOCK_NUMBERS, release
+from msg_analysis.common.large_arrays import pieces
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
@@ -107,11 +107,8 @@ class Trajectory:
         """(N + 1, m): which states are there; what was published of them, too, where that is something else."""
         there = np.ones(self.states.shape[:2], dtype=np.bool_)
         for states in (self.states,) if self.published is None else (self.states, self.published):
-            length = max(1, BLOCK_NUMBERS // max(1, states[:1].size))
-            for first in range(0, len(there), length):  # in pieces: a run may be long
-                piece = slice(first, first + length)
+            for piece in pieces(states):
                 there[piece] &= ~np.isnan(states[piece]).any(axis=2)
-                release(states)
         return there
 
     @property
