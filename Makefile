@@ -46,23 +46,23 @@ $(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
 	$(BIN)/msg-agents run $(EXPERIMENTS)/line_ring.yaml --out $(RUNS)
 
-# Networks wait a good part of their time, for discovery for example: three at once, each in a domain of its own. Each
-# worker gets neighbours in the list, so that most fixtures of a module are made once.
-SEVERAL_AT_ONCE := --numprocesses 3 --dist worksteal
+# Networks wait a good part of their time, for discovery for example: more at once than cores, each in a domain of its
+# own. Each worker gets neighbours in the list, so that most fixtures of a module are made once.
+SEVERAL_AT_ONCE := --numprocesses 4 --dist worksteal
 
 # More options of pytest.
 TEST_OPTIONS ?=
 SKIPPED := build/skipped
 # With "=": without, pytest takes an existing FILE for a path to test, before tests/conftest.py has defined the option.
-TEST := $(BIN)/python -m pytest --skipped-to=$(SKIPPED) $(TEST_OPTIONS)
+TEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --skipped-to=$(SKIPPED) $(TEST_OPTIONS)
 
-test: test-fast ## Run all tests
-	$(TEST) $(SEVERAL_AT_ONCE) tests/integration
+test: setup ## Run all tests
+	@rm -f $(SKIPPED)
+	$(TEST) $(SEVERAL_AT_ONCE)
 	@test ! -s $(SKIPPED) || { echo "Not tested:"; cat $(SKIPPED); } >&2
 
 test-fast: setup ## Run the tests that start no network
-	@rm -f $(SKIPPED)
-	OPENBLAS_NUM_THREADS=1 $(TEST) --numprocesses auto --dist worksteal --ignore tests/integration
+	$(TEST) $(SEVERAL_AT_ONCE) --ignore tests/integration
 
 STRESS ?= 20
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections import Counter
 from pathlib import Path
@@ -17,6 +18,8 @@ settings.load_profile("no deadline")
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+INTEGRATION = Path(__file__).parent / "integration"
+
 MACHINE = "this machine: "
 """How the reason of a skipped test begins if nothing that can be installed would help."""
 
@@ -26,6 +29,23 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--nothing-skipped", action="store_true", help=f"fail if a test is skipped, unless its reason is {MACHINE!r}"
     )
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Networks wait a good part of their time, so they run beside tests that compute.
+
+    Workers begin with equal parts of the list, in order: of two of them, one has all the networks of both.
+    """
+    pairs = max(1, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) // 2)
+    networks = [item for item in items if INTEGRATION in item.path.parents]
+    others = [item for item in items if INTEGRATION not in item.path.parents]
+    items[:] = [
+        item
+        for pair in range(pairs)
+        for kind in (networks, others)
+        for item in kind[pair * len(kind) // pairs : (pair + 1) * len(kind) // pairs]
+    ]
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -233,9 +233,10 @@ class Network:
         self.wait_for(lambda: self.recorded_bytes(out) > 50_000, 60, "recorded states")
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _forked() -> None:
-    forked_commands.install()
+@pytest.fixture(scope="module", autouse=True)
+def _forked() -> Iterator[None]:
+    with forked_commands.installed():
+        yield
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 import signal
@@ -12,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from awaiting_network import BAG, failures_of, network_awaiting
 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.twin.simulate import simulate
+from msg_analysis.twin.simulate import new_record, simulate
 
 LISTENER = """
 import json
@@ -76,18 +76,20 @@ def test_a_replay_gives_the_numbers_of_the_comparison(network: Any, domain: int)
 def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> None:
     """From the first step that it gets whole, it misses none: its number is that of the bag, to every printed digit.
 
-    Such a short run may be over before its announcements have been heard: then the next one is watched.
+    The run begins when it sees the watcher, and may be over before the watcher reads its states: then once more.
     """
-    live = network.start("live", "--reliable")
-    assert "waiting for one" in live.stderr.readline()
-    for _ in range(3):
-        result = network.run(network.experiment(run={"processes": 2, "duration": 250}), domain=domain)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            live.wait(timeout=10)
+    for attempt in range(3):
+        live = network.start("live", "--reliable")
+        assert "waiting for one" in live.stderr.readline()
+        directory = network.directory / str(attempt)
+        directory.mkdir()
+        record = new_record(network.experiment(run={"processes": 2, "duration": 250}))
+        with network_awaiting("live", record, directory, domain) as nodes:
+            network.wait_for(lambda nodes=nodes: not nodes.running or nodes.failures, 90, "the end of the run")
+            assert failures_of(nodes) == []
+        last = ended(live)[0].splitlines()[-1]
+        if "no complete step yet" not in last:
             break
-    assert result.failures == []
-    assert result.trajectory.completeness.complete
-    last = ended(live)[0].splitlines()[-1]
     found = re.fullmatch(
         r"step 5000 of 5000, system error ([\d.]+) .*, (\d+) steps(?: since step (\d+))?, 0 missing, \d+ steps/s",
         last,
@@ -95,7 +97,9 @@ def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> N
     assert found, last
     first = int(found[3] or 0)
     assert first + int(found[2]) == 5000
-    states = result.trajectory.states[first:5000]  # (steps, agents, replicas)
+    trajectory = read_bag(directory / BAG)
+    assert trajectory.completeness.complete
+    states = trajectory.states[first:5000]  # (steps, agents, replicas)
     error = ((states - states.mean(axis=1, keepdims=True)) ** 2).sum(axis=1).mean()
     assert found[1] == f"{error:.6g}"
 

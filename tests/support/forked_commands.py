@@ -1,15 +1,17 @@
 """Our own commands are forked from a process that has imported everything, instead of being executed.
 
-After ``install``, ``subprocess`` forks ``msg-agents``, ``msg-analysis`` and the fork server of a network, if nothing is
-asked for but streams, a directory, a session, and variables that are read after the imports. It executes all else as
-ever. A forked process is a child of the process that asked, has the title of its command, and its mark can be read in
-its environment, as after exec.
+Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis`` and the fork server of a network, if
+nothing is asked for but streams, a directory, a session, a network namespace (``ip netns exec``), and variables that
+are read after the imports. It executes all else as ever. A forked process is a child of the process that asked, has the
+title of its command, and its mark can be read in its environment, as after exec.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import fcntl
+import functools
 import importlib
 import io
 import json
@@ -20,7 +22,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +40,17 @@ PREPARED = (
     "msg_agents.nodes.replay.player",
     "msg_agents.nodes.watching.live",
     "msg_agents.running.runner",
+    "msg_agents.watching.terminal_panel",
     "msg_analysis.api",
+    "msg_analysis.cli.compare",
+    "msg_analysis.report.html.report_page",
+    "msg_analysis.report.terminal.comparison_text",
     "msg_analysis.twin.check",
     "scipy.stats",
 )
 READ_LATER = re.compile("(ROS_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_).*|NO_COLOR|COLUMNS|LINES|OPENBLAS_NUM_THREADS")
 """Names of variables that are read after the imports, or are the same for all that is forked."""
+CLONE_NEWNET = 0x40000000  # linux/sched.h
 LONGEST_TITLE = 2000
 FREE = 200  # descriptors from here on are not used
 
@@ -52,16 +59,27 @@ _fork_exec: Callable[..., int] | None = getattr(
 )  # where Popen ends; not of the public API
 
 
-def install() -> None:
-    """Fork from now on, where the system can do it."""
-    if _fork_exec is not None and sys.platform == "linux":
-        adopt_orphans(adopt=True)
-        subprocess._fork_exec = _Forker().fork_exec  # type: ignore[attr-defined]
+@contextlib.contextmanager
+def installed() -> Iterator[None]:
+    """Fork meanwhile, where the system can do it."""
+    if _fork_exec is None or sys.platform != "linux":
+        yield
+        return
+    adopt_orphans(adopt=True)
+    subprocess._fork_exec = _forker().fork_exec  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        subprocess._fork_exec = _fork_exec  # type: ignore[attr-defined]
+        adopt_orphans(adopt=False)
 
 
 def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Sequence[Any]) -> dict[str, Any] | None:
     """What the arguments of ``_fork_exec`` ask for; None if it is not known how to fork that."""
     command = [os.fsdecode(word) for word in words]
+    namespace = None
+    if command[:3] == ["ip", "netns", "exec"]:
+        namespace, command = command[3], command[4:]
     of_ours = Path(command[0]).parent == Path(sys.executable).parent and Path(command[0]).name in PROGRAMS
     close, kept, directory, environment = arguments[2:6]
     new_group, *identity = arguments[16:21]
@@ -71,6 +89,7 @@ def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Seque
     lines = [f"{name}={value}" for name, value in os.environ.items()] if environment is None else environment
     return {
         "command": command,
+        "namespace": namespace,
         "directory": os.fsdecode(directory or Path.cwd()),
         "environment": dict(os.fsdecode(line).split("=", 1) for line in lines),
         "session": arguments[15],
@@ -116,13 +135,20 @@ class _Forker:
         return ours
 
 
+@functools.cache
+def _forker() -> _Forker:
+    return _Forker()
+
+
 def _fixed(environment: Any) -> dict[str, str]:
     return {name: value for name, value in environment.items() if not READ_LATER.fullmatch(name)}
 
 
 def begin(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None]:
     """What a forked process is to do."""
-    waiting = _leave_one_waiting(descriptors) if request["command"][1:2] == ["run"] else None
+    if request["namespace"] is not None:
+        _enter(request["namespace"])
+    waiting = _leave_one_waiting(descriptors) if request["command"][1] in ("run", "host") else None
     return waiting or become(request, descriptors)
 
 
@@ -183,6 +209,13 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
     sys.argv = command
     module, name = PROGRAMS[Path(command[0]).name]
     return lambda: sys.exit(getattr(importlib.import_module(module), name)())
+
+
+def _enter(namespace: str) -> None:
+    """As ``ip netns exec`` does it, but for what it mounts."""
+    with Path("/run/netns", namespace).open() as file:
+        if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), "setns")
 
 
 def _open_streams() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import subprocess
 import sys
 from collections import Counter
@@ -12,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from awaiting_network import BAG, failures_of, network_awaiting
 
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.process_plan import ProcessPlan, plan_network
 from msg_agents.processes.ros_domain import free_domain
-from msg_agents.running.supervisor import Supervisor
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
@@ -44,9 +42,10 @@ kinds = dict.fromkeys(("progress", "end", "epoch", "resend"), Progress)
 kinds |= {"graph": ActiveGraph, "experiment": String, "states": StateBatch}
 readers = {"graph": PROCESSES + 1, "progress": 1, "end": PROCESSES + 1, "epoch": PROCESSES, "experiment": 1}
 readers |= {"resend": PROCESSES, "states": 1}
-readers |= {f"agent_{i}/state": 1 for i in (1, 2, 3, 5)}  # the neighbour in the other process
-readers["agent_4/state"] = 0
 messages = [line.split() for line in Path(sys.argv[1]).read_text().splitlines()]
+recorder = "agent_1/state" in dict(messages)  # it reads the agents' own topics when it sees a stranger on this one
+readers |= {f"agent_{i}/state": recorder + 1 for i in (1, 2, 3, 5)}  # the neighbour in the other process
+readers["agent_4/state"] = recorder
 publishers = {
     topic: node.create_publisher(kinds.get(topic, AgentState), topic, latched) for topic in dict(messages)
 }
@@ -80,22 +79,17 @@ def run_beside(
     reason).
     """
     directory: Path = network.directory
-    (directory / "run.json").write_text(record.to_json(with_key=True))
     (directory / "forged").write_text("".join(f"{topic} {data.hex()}\n" for topic, data in [*early, *meanwhile]))
-    with free_domain() as domain:
-        environment = node_environment(domain)
-        with _stranger(directory / "forged", len(early), environment), Supervisor(directory, environment) as nodes:
-            plans = plan_network(record.experiment, directory / "run.json", directory / "bag")
-            nodes.start([plans[0], *(_awaiting_referee(plan) for plan in plans[1:])])
-            network.wait_for(lambda: not nodes.running or nodes.failures, 90, "the end of the run")
-            failures = [(child.plan.name, child.failure, child.last_words()) for child in nodes.failures]
+    with (
+        free_domain() as domain,
+        _stranger(directory / "forged", len(early), node_environment(domain)),
+        network_awaiting("referee", record, directory, domain) as nodes,
+    ):
+        network.wait_for(lambda: not nodes.running or nodes.failures, 90, "the end of the run")
+        failures = failures_of(nodes)
     assert failures == []
     logs = {child.plan.name: child.log.read_text() for child in nodes.children}
-    return read_bag(directory / "bag"), logs, nodes.account().refused
-
-
-def _awaiting_referee(plan: ProcessPlan) -> ProcessPlan:
-    return dataclasses.replace(plan, arguments=(*plan.arguments, "--await", "referee"))
+    return read_bag(directory / BAG), logs, nodes.account().refused
 
 
 @contextmanager

@@ -1,0 +1,39 @@
+"""Networks whose agents and switcher wait for another node before their first step."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from msg_agents.processes.environment import node_environment
+from msg_agents.processes.fork_server import ForkServer
+from msg_agents.processes.process_plan import ProcessPlan, plan_network
+from msg_agents.running.supervisor import Supervisor
+from msg_analysis.model.run.record import RunRecord
+
+BAG = "bag"  # what is recorded, in the directory of the network
+
+
+@contextmanager
+def network_awaiting(node: str, record: RunRecord, directory: Path, domain: int) -> Iterator[Supervisor]:
+    """The processes of a run, which are ended at the end of the context."""
+    (directory / "run.json").write_text(record.to_json(with_key=True))
+    environment = node_environment(domain)
+    with (
+        ForkServer(environment, directory / "fork_server.log") as server,
+        Supervisor(directory, environment, fork_server=server) as nodes,
+    ):
+        recorder, *others = plan_network(record.experiment, directory / "run.json", directory / BAG)
+        nodes.start([recorder, *(_awaiting(node, plan) for plan in others)])
+        yield nodes
+
+
+def _awaiting(node: str, plan: ProcessPlan) -> ProcessPlan:
+    return dataclasses.replace(plan, arguments=(*plan.arguments, "--await", node))
+
+
+def failures_of(nodes: Supervisor) -> list[tuple[str, str | None, str]]:
+    """Processes that have failed: name, how, and the last line that they printed."""
+    return [(child.plan.name, child.failure, child.last_words()) for child in nodes.failures]
