@@ -33,12 +33,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Networks wait a good part of their time, so they run beside tests that compute.
+    """Networks wait a good part of their time, so they run beside tests that compute; the longest ones first.
 
     Workers begin with equal parts of the list, in order: of two of them, one has all the networks of both.
     """
     pairs = max(1, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) // 2)
-    networks = [item for item in items if INTEGRATION in item.path.parents]
+    networks = sorted((item for item in items if INTEGRATION in item.path.parents), key=_limit, reverse=True)
     others = [item for item in items if INTEGRATION not in item.path.parents]
     items[:] = [
         item
@@ -46,6 +46,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for kind in (networks, others)
         for item in kind[pair * len(kind) // pairs : (pair + 1) * len(kind) // pairs]
     ]
+
+
+def _limit(item: pytest.Item) -> float:
+    """Seconds that a test may take, where it needs more than others."""
+    mark = item.get_closest_marker("timeout")
+    return mark.args[0] if mark else 0.0
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -130,6 +130,7 @@ def test_a_killed_sweep_leaves_no_network(network: Any) -> None:
     assert lines(out / "points.jsonl") == 0
 
 
+@pytest.mark.timeout(300)
 def test_points_on_the_curves_of_the_paper(network: Any) -> None:
     """Short form: two networks. Level of the family of all points: 1 %, with fixed seeds: no alarm."""
     runs = [

@@ -8,9 +8,8 @@ import numpy as np
 
 from msg_analysis.model.arithmetic.many_steps import ManySteps, Round
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
-from msg_analysis.model.arithmetic.update_law import step
 from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.air_reception import AirReception, padded_inputs
+from msg_analysis.model.step.air_reception import AirReception
 from msg_analysis.model.step.phases import phases
 from msg_analysis.model.step.process_noise import ProcessNoise
 from msg_analysis.model.step.step_model import StepModel
@@ -29,11 +28,18 @@ def states(
 
     ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``reception``: one that keeps a log.
     """
-    blocks = _blocks(experiment, model, modes, first)
-    if experiment.noise.on_air:
-        return _heard(model, start, blocks, reception or AirReception(experiment, model))
+    if experiment.noise.on_air and reception is None:
+        reception = AirReception(experiment, model)
     phase = phases(experiment) if experiment.run.pace == "realtime" else np.zeros(model.agents)
-    return _undisturbed(ManySteps([_rounds(model, mode, phase) for mode in range(model.modes)]), start, blocks)
+    law = ManySteps([_rounds(model, mode, phase) for mode in range(model.modes)])
+    state = start
+    for begin, now, drives in _blocks(experiment, model, modes, first):
+        heard = None if reception is None else reception.block(begin // STEPS_PER_BLOCK)
+        made = law.advance(now, state, drives, heard)
+        if reception is not None and heard is not None:
+            reception.note(begin, state, made, heard)
+        yield made
+        state = made[-1]
 
 
 Block = tuple[int, IntArray, FloatArray]
@@ -54,37 +60,22 @@ def _blocks(experiment: ValidExperiment, model: StepModel, modes: IntArray, firs
         yield first + begin, now, drives
 
 
-def _undisturbed(law: ManySteps, start: FloatArray, blocks: Iterator[Block]) -> Iterator[FloatArray]:
-    state = start
-    for _, modes, drives in blocks:
-        made = law.advance(modes, state, drives)
-        yield made
-        state = made[-1]
-
-
-def _heard(
-    model: StepModel, start: FloatArray, blocks: Iterator[Block], reception: AirReception
-) -> Iterator[FloatArray]:
-    weights = [list(_padded(model, mode)[2][:, :, None]) for mode in range(model.modes)]
-    state = start
-    for first, modes, drives in blocks:
-        made = np.empty_like(drives)
-        for k, mode in enumerate(modes):
-            state = step(weights[mode], reception.values(first + k, mode, state), drives[k])
-            made[k] = state
-        yield made
-
-
-def _padded(model: StepModel, mode: int) -> tuple[IntArray, BoolArray, FloatArray]:
-    """``padded_inputs``, and the weight of each; 0 for padding, which changes no sum."""
-    columns, there = padded_inputs(model, mode)
-    return columns, there, np.where(there, model.nominal[mode, np.arange(model.agents), columns], 0.0)
+def _padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
+    """(d, m) the d-th input of every agent (agents from 0, ascending), padded with 0; and which entries are inputs."""
+    inputs = [model.inputs(mode, i) for i in range(model.agents)]
+    columns = np.zeros((max(len(row) for row in inputs), model.agents), dtype=np.int64)
+    there = np.zeros(columns.shape, dtype=np.bool_)
+    for i, row in enumerate(inputs):
+        columns[: len(row), i] = row
+        there[: len(row), i] = True
+    return columns, there
 
 
 def _rounds(model: StepModel, mode: int, phase: FloatArray) -> list[Round]:
     """The agents in rounds: each in the first one after those of the neighbours that are due before it."""
     m = model.agents
-    columns, there, weights = _padded(model, mode)
+    columns, there = _padded_inputs(model, mode)
+    weights = np.where(there, model.nominal[mode, np.arange(m), columns], 0.0)  # 0 for padding changes no sum
     earlier = there & (phase[columns] < phase)
     number = np.zeros(m, dtype=np.int64)
     for i in np.argsort(phase).tolist():

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msg_analysis.model.arithmetic import _kernel, many_steps
-from msg_analysis.model.arithmetic.many_steps import ManySteps, Round
+from msg_analysis.model.arithmetic.many_steps import ManySteps, Reception, Round
 
 Row = tuple[int, list[tuple[int, float]]]  # an agent, and its terms: row of [x(k); x(k+1)] and weight
 
@@ -28,17 +28,35 @@ def rounds_of(rows: list[list[Row]]) -> list[Round]:
     return found
 
 
-def by_hand(graphs: list[list[list[Row]]], modes: list[int], start: Any, drives: Any) -> Any:
+def used(reception: Reception, k: int, state: list[list[float]], agent: int, sender: int, r: int) -> float:
+    """What the agent uses for the sender's value."""
+    link = reception.links[agent, sender]
+    if reception.own[link, k]:
+        return state[agent][r]
+    value = state[sender][r]
+    if reception.broadcast is not None:
+        value += float(reception.broadcast[sender, k, r])
+    if reception.link is not None:
+        value += float(reception.link[link, k, r])
+    return value
+
+
+def by_hand(
+    graphs: list[list[list[Row]]], modes: list[int], start: Any, drives: Any, reception: Reception | None = None
+) -> Any:
     """The same with Python's floats, one sum after the other."""
     m, replicas = start.shape
     states = [start.tolist()]
-    for mode, drive in zip(modes, drives.tolist(), strict=True):
+    for k, (mode, drive) in enumerate(zip(modes, drives.tolist(), strict=True)):
         after: list[list[float]] = [[0.0] * replicas for _ in range(m)]
         for agent, terms in (row for each in graphs[mode] for row in each):
             for r in range(replicas):
                 total = None
                 for column, weight in terms:
-                    value = states[-1][column][r] if column < m else after[column - m][r]
+                    if reception is not None:
+                        value = used(reception, k, states[-1], agent, column, r)
+                    else:
+                        value = states[-1][column][r] if column < m else after[column - m][r]
                     total = value * weight if total is None else total + value * weight
                 assert total is not None
                 after[agent][r] = total + drive[agent][r]
@@ -47,14 +65,14 @@ def by_hand(graphs: list[list[list[Row]]], modes: list[int], start: Any, drives:
 
 
 @st.composite
-def networks(draw: st.DrawFn) -> tuple[int, list[list[list[Row]]]]:
+def networks(draw: st.DrawFn, rounds: int = 2) -> tuple[int, list[list[list[Row]]]]:
     """Agents, and for each graph rounds in which every agent uses itself, others, and what earlier rounds made."""
     m = draw(st.integers(1, 5))
     weight = st.floats(-2, 2).filter(bool)
     graphs = []
     for _ in range(draw(st.integers(1, 3))):
         order = draw(st.permutations(range(m)))
-        cut = draw(st.integers(1, m))
+        cut = draw(st.integers(1, m)) if rounds > 1 else m
         graph: list[list[Row]] = []
         made: list[int] = []
         for agents in filter(None, (order[:cut], order[cut:])):
@@ -80,6 +98,27 @@ def test_equal_to_the_last_bit(compiled: bool, network: tuple[int, list[list[lis
         patch.setattr(many_steps, "COMPILED", compiled)
         states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), start, drives)
     np.testing.assert_array_equal(states, by_hand(graphs, modes, start, drives))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@given(network=networks(rounds=1), data=st.data())
+def test_with_noise_and_loss_on_the_air(compiled: bool, network: tuple[int, Any], data: st.DataObject) -> None:
+    m, graphs = network
+    replicas, most = data.draw(st.integers(1, 4)), 6
+    modes = data.draw(st.lists(st.integers(0, len(graphs) - 1), min_size=1, max_size=most))
+    random = np.random.default_rng(data.draw(st.integers(0, 1000)))
+    start, drives = random.normal(size=(m, replicas)), random.normal(size=(len(modes), m, replicas))
+    links = np.arange(m * m).reshape(m, m)
+    np.fill_diagonal(links, m * m)
+    own = random.random((m * m + 1, most)) < 0.3
+    own[-1] = True
+    broadcast = random.normal(size=(m, most, replicas)) if data.draw(st.booleans()) else None
+    link = random.normal(size=(m * m + 1, most, replicas)) if data.draw(st.booleans()) else None
+    reception = Reception(links, own, broadcast, link)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(many_steps, "COMPILED", compiled)
+        states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), start, drives, reception)
+    np.testing.assert_array_equal(states, by_hand(graphs, modes, start, drives, reception))
 
 
 ARGUMENTS: dict[str, Any] = {  # two agents, one graph, three steps of one replica; agent 1 uses both
@@ -125,3 +164,35 @@ def test_the_kernel_reads_and_writes_nothing_outside_its_arrays(wrong: dict[str,
     _kernel.advance(*(ARGUMENTS | {"states": np.ones((4, 2, 1))}).values())
     with pytest.raises(ValueError, match="sizes and indices"):
         _kernel.advance(*(ARGUMENTS | wrong).values())
+
+
+AIR: dict[str, Any] = {  # two links, and their noise, in the three steps
+    "links": np.array([2, 0, 1, 2]),
+    "own": np.array([[False] * 3, [False] * 3, [True] * 3]),
+    "broadcast": np.zeros((2, 3, 1)),
+    "link": np.zeros((3, 3, 1)),
+}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"links": np.array([2, 0, 1])},
+        {"links": np.array([2, 0, 1, 3])},
+        {"links": np.array([2, 0, -1, 2])},
+        {"links": np.array([2, 0, 2**62, 2])},
+        {"own": np.ones((3, 2), dtype=np.bool_)},
+        {"own": np.ones(10, dtype=np.bool_)},
+        {"own": b""},
+        {"broadcast": np.zeros((2, 2, 1))},
+        {"broadcast": np.zeros((2, 3, 2))},
+        {"link": np.zeros((2, 3, 1))},
+        {"columns": np.array([0, 3, 1])},  # what another agent makes in the same step
+    ],
+    ids=str,
+)
+def test_nor_of_the_arrays_of_the_air(wrong: dict[str, Any]) -> None:
+    right = ARGUMENTS | {"states": np.ones((4, 2, 1))} | AIR
+    _kernel.advance(*right.values())
+    with pytest.raises(ValueError, match="sizes and indices"):
+        _kernel.advance(*(right | wrong).values())

@@ -85,16 +85,47 @@ static PyObject *all_finite(PyObject *Py_UNUSED(module), PyObject *payload)
 }
 
 PyDoc_STRVAR(advance_doc,
-             "advance(order, offsets, columns, weights, modes, drives, states, agents, replicas)\n\n"
-             "Fill states[1:] from states[0]: see many_steps.py.");
+             "advance(order, offsets, columns, weights, modes, drives, states, agents, replicas,"
+             " links=b'', own=b'', broadcast=b'', link=b'')\n\n"
+             "Fill states[1:] from states[0], with the reception of the last four: see many_steps.py.");
+
+/* What happens on the air: arrays of Reception in many_steps.py; noise that there is none of is NULL. */
+struct air {
+    const int64_t *links;
+    const char *own;
+    const double *broadcast, *link;
+    Py_ssize_t steps;
+};
+
+/* The values that an agent uses for one term of its sum: of the sender, or its own; ``room`` is for them. */
+static const double *heard(const struct air *air, const double *before, int64_t receiver, int64_t sender,
+                           Py_ssize_t k, Py_ssize_t agents, Py_ssize_t replicas, double *room)
+{
+    const Py_ssize_t at = air->links[receiver * agents + sender] * air->steps + k;
+    if (air->own[at])
+        return before + receiver * replicas;
+    const double *values = before + sender * replicas;
+    if (air->broadcast) {
+        for (Py_ssize_t r = 0; r < replicas; ++r)
+            room[r] = values[r] + air->broadcast[(sender * air->steps + k) * replicas + r];
+        values = room;
+    }
+    if (air->link) {
+        for (Py_ssize_t r = 0; r < replicas; ++r)
+            room[r] = values[r] + air->link[at * replicas + r];
+        values = room;
+    }
+    return values;
+}
 
 static PyObject *advance(PyObject *Py_UNUSED(module), PyObject *arguments)
 {
-    enum { ORDER, OFFSETS, COLUMNS, WEIGHTS, MODES, DRIVES, STATES, ARRAYS };
-    Py_buffer views[ARRAYS];
+    enum { ORDER, OFFSETS, COLUMNS, WEIGHTS, MODES, DRIVES, STATES, LINKS, BROADCAST, LINK, ARRAYS };
+    Py_buffer views[ARRAYS] = {{0}}, own = {0};
     Py_ssize_t agents, replicas;
-    if (!PyArg_ParseTuple(arguments, "y*y*y*y*y*y*w*nn", &views[ORDER], &views[OFFSETS], &views[COLUMNS],
-                          &views[WEIGHTS], &views[MODES], &views[DRIVES], &views[STATES], &agents, &replicas))
+    if (!PyArg_ParseTuple(arguments, "y*y*y*y*y*y*w*nn|y*y*y*y*", &views[ORDER], &views[OFFSETS], &views[COLUMNS],
+                          &views[WEIGHTS], &views[MODES], &views[DRIVES], &views[STATES], &agents, &replicas,
+                          &views[LINKS], &own, &views[BROADCAST], &views[LINK]))
         return NULL;
     const int64_t *order = views[ORDER].buf, *offsets = views[OFFSETS].buf, *columns = views[COLUMNS].buf;
     const int64_t *modes = views[MODES].buf;
@@ -118,6 +149,34 @@ static PyObject *advance(PyObject *Py_UNUSED(module), PyObject *arguments)
         right = columns[i] >= 0 && columns[i] < 2 * agents;
     for (Py_ssize_t k = 0; right && k < steps; ++k)
         right = modes[k] >= 0 && modes[k] < graphs;
+    struct air air = {views[LINKS].buf, own.buf, NULL, NULL, 0};
+    double *room = NULL;
+    if (right && views[LINKS].len) {
+        Py_ssize_t numbers = 1;
+        right = counts[LINKS] / agents == agents && counts[LINKS] % agents == 0;
+        for (Py_ssize_t i = 0; right && i < counts[LINKS]; ++i) {
+            right = air.links[i] >= 0 && air.links[i] < own.len;
+            numbers = right && air.links[i] >= numbers ? air.links[i] + 1 : numbers;
+        }
+        air.steps = right ? own.len / numbers : 0;
+        right = right && air.steps >= steps && own.len == numbers * air.steps;
+        for (Py_ssize_t i = 0; right && i < terms; ++i)
+            right = columns[i] < agents; /* no agent hears what another one makes in the same step */
+        if (right && views[BROADCAST].len) {
+            air.broadcast = views[BROADCAST].buf;
+            right = counts[BROADCAST] == agents * air.steps * replicas;
+        }
+        if (right && views[LINK].len) {
+            air.link = views[LINK].buf;
+            right = counts[LINK] == own.len * replicas;
+        }
+        if (right && (room = PyMem_Malloc(replicas * sizeof *room)) == NULL) {
+            for (int i = 0; i < ARRAYS; ++i)
+                PyBuffer_Release(&views[i]);
+            PyBuffer_Release(&own);
+            return PyErr_NoMemory();
+        }
+    }
     if (right) {
         Py_BEGIN_ALLOW_THREADS;
         for (Py_ssize_t k = 0; k < steps; ++k) {
@@ -125,7 +184,10 @@ static PyObject *advance(PyObject *Py_UNUSED(module), PyObject *arguments)
             for (Py_ssize_t row = modes[k] * agents; row < (modes[k] + 1) * agents; ++row) {
                 double *total = states + (k + 1) * size + order[row] * replicas;
                 for (int64_t term = offsets[row]; term < offsets[row + 1]; ++term) {
-                    const double *values = before + columns[term] * replicas, weight = weights[term];
+                    const double weight = weights[term];
+                    const double *values =
+                        room ? heard(&air, before, order[row], columns[term], k, agents, replicas, room)
+                             : before + columns[term] * replicas;
                     if (term == offsets[row])
                         for (Py_ssize_t r = 0; r < replicas; ++r)
                             total[r] = values[r] * weight;
@@ -139,8 +201,10 @@ static PyObject *advance(PyObject *Py_UNUSED(module), PyObject *arguments)
         }
         Py_END_ALLOW_THREADS;
     }
+    PyMem_Free(room);
     for (int i = 0; i < ARRAYS; ++i)
         PyBuffer_Release(&views[i]);
+    PyBuffer_Release(&own);
     if (!right)
         return wrong("expected arrays of 8-byte numbers whose sizes and indices fit together");
     Py_RETURN_NONE;

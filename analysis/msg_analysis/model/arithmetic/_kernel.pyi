@@ -1,6 +1,6 @@
 from collections.abc import Sequence
 
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 def combine(weights: Sequence[float], payloads: Sequence[bytes], drive: bytes, /) -> bytes: ...
 def all_finite(payload: bytes, /) -> bool: ...
@@ -14,5 +14,9 @@ def advance(
     states: FloatArray,
     agents: int,
     replicas: int,
+    links: IntArray | bytes = b"",
+    own: BoolArray | bytes = b"",
+    broadcast: FloatArray | bytes = b"",
+    link: FloatArray | bytes = b"",
     /,
 ) -> None: ...

@@ -28,6 +28,24 @@ class Round:
     weights: FloatArray  # (d, a), 0 for padding, which changes no sum
 
 
+@dataclass(frozen=True, slots=True)
+class Reception:
+    """What becomes of the values that agents send each other in K steps or more, over L links."""
+
+    links: IntArray  # (m, m) number of the link from the sender, the column; L for an agent's own value
+    own: BoolArray  # (L + 1, K) whether the receiver uses its own value, since the message is lost; last row: True
+    broadcast: FloatArray | None  # (m, K, R) noise that is added to what each agent publishes
+    link: FloatArray | None  # (L + 1, K, R) noise that is added on each link
+
+    def heard(self, k: int, state: FloatArray, agents: IntArray, rows: IntArray) -> list[FloatArray]:
+        """For each d, (a, R): what the agents use for their d-th value of x(k) (m, R)."""
+        numbers = self.links[agents, rows]
+        values = (state if self.broadcast is None else state + self.broadcast[:, k])[rows]
+        if self.link is not None:
+            values = values + self.link[numbers, k]
+        return list(np.where(self.own[numbers, k, None], state[agents], values))
+
+
 class ManySteps:
     """The steps of m agents, under each graph in one or several rounds."""
 
@@ -43,26 +61,37 @@ class ManySteps:
         self._columns = np.concatenate([one.rows.T[one.there.T] for one in together], dtype=np.int64)
         self._weights = np.concatenate([one.weights.T[one.there.T] for one in together])
 
-    def advance(self, modes: IntArray, start: FloatArray, drives: FloatArray) -> FloatArray:
+    def advance(
+        self, modes: IntArray, start: FloatArray, drives: FloatArray, reception: Reception | None = None
+    ) -> FloatArray:
         """(K, m, R): x(1) to x(K) from x(0) = ``start``, under the graphs ``modes`` (K,).
 
-        ``drives`` (K, m, R) has the noise of each step and what the reference adds.
+        ``drives`` (K, m, R) has the noise of each step and what the reference adds. With a ``reception``, all agents
+        are in one round.
         """
         if not COMPILED:
-            return self._with_numpy(modes, start, drives)
+            return self._with_numpy(modes, start, drives, reception)
         states = np.empty((len(modes) + 1, *start.shape))
         states[0] = start
         arrays = self._order, self._offsets, self._columns, self._weights, np.ascontiguousarray(modes)
-        _kernel.advance(*arrays, np.ascontiguousarray(drives), states, *start.shape)
+        air: list[IntArray | BoolArray | FloatArray | bytes] = []
+        if reception is not None:
+            air = [reception.links, reception.own]
+            air += [b"" if noise is None else noise for noise in (reception.broadcast, reception.link)]
+        _kernel.advance(*arrays, np.ascontiguousarray(drives), states, *start.shape, *air)
         return states[1:]
 
-    def _with_numpy(self, modes: IntArray, start: FloatArray, drives: FloatArray) -> FloatArray:
+    def _with_numpy(
+        self, modes: IntArray, start: FloatArray, drives: FloatArray, reception: Reception | None
+    ) -> FloatArray:
+        m = self._agents
         states = np.empty((len(modes), *start.shape))
         both = np.concatenate([start, start])  # x(k) above x(k+1)
-        sums = [[(one.agents, list(one.weights[:, :, None]), list(one.rows)) for one in each] for each in self._rounds]
+        sums = [[(one.agents, list(one.weights[:, :, None]), one.rows) for one in each] for each in self._rounds]
         for k, mode in enumerate(modes):
-            both[: self._agents] = both[self._agents :]
+            both[:m] = both[m:]
             for agents, weights, rows in sums[mode]:
-                both[self._agents + agents] = step(weights, [both[row] for row in rows], drives[k, agents])
-            states[k] = both[self._agents :]
+                values = list(both[rows]) if reception is None else reception.heard(k, both[:m], agents, rows)
+                both[m + agents] = step(weights, values, drives[k, agents])
+            states[k] = both[m:]
         return states
