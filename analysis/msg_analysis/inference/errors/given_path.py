@@ -126,10 +126,14 @@ def means_given_path(observation: Observation) -> TimeMeans | None:
 
 def _expected_sum(which: IntArray, matrices: FloatArray, noise: FloatArray, start: FloatArray) -> FloatArray:
     """(d, d): sum of M(0..N-1)."""
-    moment, total = start, np.zeros_like(start)
+    moment, total, room = start.copy(), np.zeros_like(start), np.empty_like(start)
+    steps = [(matrix, matrix.T, added) for matrix, added in zip(matrices, noise, strict=True)]
     for kind in which.tolist():
         total += moment
-        moment = matrices[kind] @ moment @ matrices[kind].T + noise[kind]
+        matrix, transposed, added = steps[kind]
+        np.matmul(matrix, moment, out=room)
+        np.matmul(room, transposed, out=moment)
+        moment += added
     return total
 
 
@@ -142,6 +146,7 @@ def _backwards(
     lifted = packed_symmetric.unpack(forms, d)
     seen, covariance = np.zeros(forms.shape[1]), np.zeros((q, q))
     series, variances = np.empty(steps), np.zeros(steps)
+    transposed, room = [matrix.T for matrix in matrices], np.empty_like(lifted)
     length = max(1, BLOCK_NUMBERS // max(q * d**2, observation.states[0].size))
     dual = lifted  # Y(last + 1) of the block
     for first in reversed(range(0, steps, length)):
@@ -153,11 +158,13 @@ def _backwards(
         last = min(last, steps - 1)  # the noise of the last step is in no error
         if last <= first:
             continue
-        duals = np.empty((last - first, q, d, d))
-        for k in range(last - 1, first - 1, -1):
-            duals[k - first] = dual
-            matrix = matrices[which[k]]
-            dual = lifted + matrix.T @ dual @ matrix
+        duals = np.empty((last - first + 1, q, d, d))  # of the steps from first - 1 on
+        duals[-1] = dual
+        for k, kind in zip(range(last - first, 0, -1), which[first:last][::-1].tolist(), strict=True):
+            np.matmul(transposed[kind], duals[k], out=room)
+            np.matmul(room, matrices[kind], out=duals[k - 1])
+            duals[k - 1] += lifted
+        dual, duals = duals[0].copy(), duals[1:]
         matrix, added = matrices[which[first:last]], noise[which[first:last]]
         now = packed_symmetric.unpack(found[: last - first], d)
         spread = (2.0 * added + 4.0 * matrix @ now @ matrix.transpose(0, 2, 1)) / observation.replicas

@@ -85,7 +85,7 @@ class JumpSystem:
         C_i(k+1) = sum_j P_ji (K_j[C_j(k)] + pi_j(k) N_j): the noise enters before the jump.
         """
         after = self.propagate(moments) + law[:, None, None] * self.noise
-        return np.tensordot(self.chain, after, axes=(0, 0)), law @ self.chain
+        return (self.chain.T @ after.reshape(len(after), -1)).reshape(after.shape), law @ self.chain
 
 
 def emulated(step: StepModel, problem: str) -> JumpSystem:
