@@ -10,7 +10,7 @@ import itertools
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -199,7 +199,10 @@ def _look(files: Sequence[Path]) -> tuple[list[FileInventory], SalvageReport]:
             for _ in entry.watch():
                 pass
         except BagError as error:
-            entry.problem = str(error)
+            if entry.count.messages:  # as much was read before
+                entry.file.torn = str(error)
+            else:
+                entry.problem = str(error)
             if len(entries) == len(files) and all(entry.problem for entry in entries):
                 raise
         total += _report(entry)
@@ -226,12 +229,18 @@ def _custom(entries: Sequence[FileInventory]) -> dict[str, str]:
     return custom
 
 
+def _readable(file: McapFile) -> Iterator[Batch]:
+    """Its messages up to where it cannot be read any further; some are known to be there."""
+    with contextlib.suppress(BagError):
+        yield from file.batches()
+
+
 def _copy(file: Path, copy: Path) -> FileCount:
     """Write what is whole in one file to a new one."""
     source = McapFile(file)
     count = FileCount(copy.name)
     with copy.open("wb") as stream:
-        batches = source.batches()
+        batches = _readable(source)
         first = next(batches, None)  # reads the header
         writer = McapWriter(
             stream,

@@ -62,6 +62,16 @@ def test_chunks_that_expand_to_fill_the_memory(tmp_path: Path) -> None:
         read_bag(file)
 
 
+def test_what_is_before_such_a_chunk_is_salvaged(tmp_path: Path) -> None:
+    good = _chunk(_channel(1, "/agent_1/state") + _message(1) * 3)
+    file = _file(tmp_path / "bomb.mcap", good + _chunk(_message(1) * 8_000_000))
+    report = salvage(file, tmp_path / "out")
+    assert (report.kept_messages, report.dropped_files, report.damaged_chunks) == (3, 0, 0)
+    assert "expected at most 1000 times as much" in (report.torn or "")
+    with (tmp_path / "out" / "out_0.mcap").open("rb") as stream:
+        assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == 3
+
+
 def test_too_many_topics(tmp_path: Path) -> None:
     topics = [_channel(number, f"/t{number}") for number in range(1, 10_000)]
     for name, records in (("loose", b"".join(topics)), ("chunk", _chunk(b"".join(topics)))):
