@@ -8,11 +8,7 @@ INTERFACES := ros_ws/src/msg_agents_interfaces
 EXAMPLES := ros_ws/src/msg_agents_example_protocols
 EXPERIMENTS := ros_ws/src/msg_agents_bringup/experiments
 RUNS := runs
-LOUD_PIP := $(BIN)/python -m pip --disable-pip-version-check
-PIP := $(LOUD_PIP) --quiet
-# A line for every twenty packages that pip looks for; its errors are on stderr.
-PROGRESS := awk -v all="$$(grep -c == requirements/lock.txt)" '/^Collecting/ && ++n % 20 == 0 \
-  { printf "  %d of %d packages found\n", n, all; fflush() } /^Installing/ { print "  installing them"; fflush() }'
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 LOCAL := --no-index --no-deps --no-build-isolation
 
 # Some container images set it. Every process of a network, and every worker of the tests, would compile all modules.
@@ -25,13 +21,11 @@ help: ## Say what can be made
 
 setup: $(VENV)/.packages ## Set up .venv with everything
 
-$(VENV)/.locked: requirements/lock.txt
+$(VENV)/.locked: requirements/lock.txt requirements/uv.txt requirements/install.py
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("error: %s is Python %d.%d: need 3.11 or newer, give PYTHON=..." % (sys.executable, *sys.version_info[:2]))'
-	@echo "Setting up $(VENV) (about two minutes, once)" >&2
+	@echo "Setting up $(VENV) (about a minute, once)" >&2
 	$(PYTHON) -m venv $(VENV)
-	@echo "Installing the packages of requirements/lock.txt" >&2
-	@{ $(LOUD_PIP) install --progress-bar off --require-hashes --requirement requirements/lock.txt; \
-	   echo $$? > $(VENV)/.status; } | $(PROGRESS) >&2; exit $$(cat $(VENV)/.status)
+	$(BIN)/python requirements/install.py
 	@touch $@
 
 $(VENV)/.interfaces: $(VENV)/.locked $(wildcard $(INTERFACES)/msg/*) $(INTERFACES)/CMakeLists.txt $(INTERFACES)/package.xml $(INTERFACES)/pyproject.toml
@@ -122,9 +116,12 @@ lint-container: build/lint/.installed ## Check the Dockerfile with hadolint, the
 container: setup ## Build the image in a chroot and run the compose file in namespaces (root, no engine needed)
 	$(BIN)/python docker/rehearse.py
 
-lock: ## Pin the newest versions (needs uv)
-	cd requirements && uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --upgrade \
-	  --quiet --custom-compile-command "make lock" --output-file lock.txt runtime.in build.in dev.in
+COMPILE := pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --upgrade --quiet \
+  --custom-compile-command "make lock"
+
+lock: setup ## Pin the newest versions
+	cd requirements && ../$(BIN)/uv $(COMPILE) --output-file lock.txt runtime.in build.in dev.in
+	cd requirements && ../$(BIN)/uv $(COMPILE) --output-file uv.txt uv.in
 
 clean: ## Remove all that was made, runs excepted
 	rm -rf $(VENV) build site .pytest_cache .mypy_cache .ruff_cache .hypothesis

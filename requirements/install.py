@@ -1,0 +1,103 @@
+"""Installs the packages of lock.txt into the environment of this Python: by uv, or by pip where uv cannot do it.
+
+uv, several times as fast, is a package like the others (uv.txt). It does not read pip's settings, so it gets those that
+say where packages are. Both check the hash of every file, and neither writes outside of the environment.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+HERE = Path(__file__).resolve().parent
+PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-cache-dir"]
+BY_PIP = "pip installs the packages, which takes a minute longer"
+SETTINGS = {
+    "index-url": ("UV_DEFAULT_INDEX", " "),
+    "extra-index-url": ("UV_INDEX", " "),
+    "find-links": ("UV_FIND_LINKS", ","),
+    "trusted-host": ("UV_INSECURE_HOST", " "),
+    "cert": ("SSL_CERT_FILE", " "),
+    "timeout": ("UV_HTTP_TIMEOUT", " "),
+}
+"""Of pip; the variable by which uv has the same, and what stands between several values in it."""
+
+
+def main() -> None:
+    """Install; the exit code is that of the program that did it."""
+    if subprocess.run([*PIP, "install", "--quiet", *hashed("uv.txt")]).returncode:
+        print(f"uv cannot be had: {BY_PIP}", file=sys.stderr)
+    elif not install_by_uv():
+        return
+    else:
+        print(f"uv has failed: {BY_PIP}", file=sys.stderr)
+    sys.exit(install_by_pip())
+
+
+def hashed(file: str) -> list[str]:
+    """Options for a file of packages with their hashes."""
+    return ["--require-hashes", "--requirement", str(HERE / file)]
+
+
+def install_by_uv() -> int:
+    """Its exit code; what it prints, without the names of all packages."""
+    uv = str(Path(sysconfig.get_path("scripts")) / "uv")
+    # Which of several indexes a file is from does not matter: its hash is checked.
+    command = [uv, "pip", "install", "--python", sys.executable, "--index-strategy", "unsafe-best-match"]
+    cache = Path(sys.prefix) / "uv_cache"  # from where it links files to their places
+    variables = {"UV_CACHE_DIR": str(cache)} | variables_of_uv() | os.environ
+    with subprocess.Popen([*command, *hashed("lock.txt")], env=variables, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        for line in process.stderr:
+            if not line.startswith((" + ", " - ", " ~ ")):
+                print(f"  {line}", end="", file=sys.stderr)
+    shutil.rmtree(cache, ignore_errors=True)
+    return process.returncode
+
+
+def install_by_pip() -> int:
+    """Its exit code; a line for every twenty packages that it looks for."""
+    command = [*PIP, "install", "--progress-bar", "off", *hashed("lock.txt")]
+    count, found = (HERE / "lock.txt").read_text().count("=="), 0
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as pip:
+        assert pip.stdout is not None
+        for line in pip.stdout:
+            found += line.startswith("Collecting")
+            if line.startswith("Collecting") and found % 20 == 0:
+                print(f"  {found} of {count} packages found", file=sys.stderr)
+            elif line.startswith("Installing"):
+                print("  installing them", file=sys.stderr)
+    return pip.returncode
+
+
+def variables_of_uv() -> dict[str, str]:
+    """Where pip would look for packages."""
+    listed = subprocess.run([*PIP, "config", "list"], stdout=subprocess.PIPE, text=True, check=True).stdout
+    found: dict[str, str] = {}
+    for wanted in ("global", "install", ":env:"):  # each over those before, as pip has it
+        for line in listed.splitlines():  # global.index-url='https://...', :env:.index-url='https://...'
+            name, _, value = line.partition("=")
+            where, _, key = name.rpartition(".")
+            if key in SETTINGS and where == wanted:
+                variable, between = SETTINGS[key]
+                found[variable] = between.join(word for word in str(ast.literal_eval(value)).split() if exists(word))
+    return {variable: value for variable, value in found.items() if value}
+
+
+def exists(place: str) -> bool:
+    """False for a folder that is not there, by name or by URL: pip ignores it, uv does not."""
+    parts = urlsplit(place)
+    if parts.scheme == "file":
+        return Path(url2pathname(parts.path)).exists()
+    return not place.startswith("/") or Path(place).exists()
+
+
+if __name__ == "__main__":
+    main()
