@@ -13,6 +13,7 @@ from typing import Any
 import jinja2
 import numpy as np
 import yaml
+from bokeh.document import Document
 from bokeh.embed import components
 from bokeh.models import UIElement
 from bokeh.resources import Resources
@@ -84,6 +85,10 @@ def render(
     environment.filters |= {"number": _number, "p": _p, "z": _z}
     names = [graph.name for graph in experiment.graph_list]
     models, sojourns = _models(document, comparison, trajectory)
+    figures = Document()
+    with figures.models.freeze():  # otherwise every figure is gone through again for each one added
+        for model in models.values():
+            figures.add_root(model)
     script, divs = components(models)
     timing = document["timing"]
     return environment.get_template("report.html.j2").render(
