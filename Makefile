@@ -37,6 +37,12 @@ $(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_
 	$(BIN)/python -m compileall -q analysis/msg_analysis msg_agents/msg_agents
 	@touch $@
 
+# What is not compiled here, Python compiles when it is first needed: for a demo, that is less.
+$(VENV)/.compiled: $(VENV)/.locked
+	@echo "Compiling all packages (half a minute, once)" >&2
+	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null 2>&1 || true  # some have templates, which are no modules
+	@touch $@
+
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
 	$(BIN)/msg-agents run $(EXPERIMENTS)/line_ring.yaml --out $(RUNS)
 
@@ -50,12 +56,12 @@ SKIPPED := build/skipped
 # With "=": without, pytest takes an existing FILE for a path to test, before tests/conftest.py has defined the option.
 TEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --skipped-to=$(SKIPPED) $(TEST_OPTIONS)
 
-test: setup ## Run all tests
+test: setup $(VENV)/.compiled ## Run all tests
 	@rm -f $(SKIPPED)
 	$(TEST) $(SEVERAL_AT_ONCE)
 	@test ! -s $(SKIPPED) || { echo "Not tested:"; cat $(SKIPPED); } >&2
 
-test-fast: setup ## Run the tests that start no network
+test-fast: setup $(VENV)/.compiled ## Run the tests that start no network
 	$(TEST) $(SEVERAL_AT_ONCE) --ignore tests/integration
 
 STRESS ?= 20
