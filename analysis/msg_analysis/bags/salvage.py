@@ -123,7 +123,7 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
     try:
         if out.exists():
             raise exists_already(out)
-        entries, total = _look(files)
+        entries, total = _look(files, parts=True)
         if not total.kept_messages:
             raise BagError(f"{torn}: no whole message is left in it: nothing can be salvaged")
         workshop.mkdir(parents=True)
@@ -155,7 +155,8 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
     if (directory / METADATA_FILE).exists():
         raise BagError(f"{directory}: has its {METADATA_FILE}: it is a bag already, nothing to salvage")
     _refuse_living(directory)
-    entries, total = _look(bag_files(directory))
+    # A file that cannot be read to its end stays as it is: of a disk, another attempt may read more.
+    entries, total = _look(bag_files(directory), parts=False)
     saved: list[tuple[Path, Path | None, FileCount]] = []  # file, its copy (None: whole), what is in it
     try:
         for entry in (entry for entry in entries if not entry.problem):
@@ -189,8 +190,11 @@ def _refuse_living(bag: Path) -> None:
         raise BagError(f"{bag}: process {pid} is recording it: stop that first")
 
 
-def _look(files: Sequence[Path]) -> tuple[list[FileInventory], SalvageReport]:
-    """Read all files: what each holds, and the report of all."""
+def _look(files: Sequence[Path], *, parts: bool) -> tuple[list[FileInventory], SalvageReport]:
+    """Read all files: what each holds, and the report of all.
+
+    With ``parts``, a file that cannot be read any further counts as torn there, otherwise as unreadable.
+    """
     entries, total = [], SalvageReport(0, 0, 0)
     for file in files:
         entry = FileInventory(McapFile(file), FileCount(file.name))
@@ -199,7 +203,7 @@ def _look(files: Sequence[Path]) -> tuple[list[FileInventory], SalvageReport]:
             for _ in entry.watch():
                 pass
         except BagError as error:
-            if entry.count.messages:  # as much was read before
+            if parts and entry.count.messages:
                 entry.file.torn = str(error)
             else:
                 entry.problem = str(error)

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 
 from msg_analysis.bags.format.inventory import Inventory
 from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.salvage import salvage
+from msg_analysis.bags.salvage import salvage, salvage_in_place
 from msg_analysis.errors import BagError
 
 STATE = "msg_agents_interfaces/msg/AgentState"
@@ -70,6 +70,17 @@ def test_what_is_before_such_a_chunk_is_salvaged(tmp_path: Path) -> None:
     assert "expected at most 1000 times as much" in (report.torn or "")
     with (tmp_path / "out" / "out_0.mcap").open("rb") as stream:
         assert len(list(make_reader(stream, validate_crcs=True).iter_messages())) == 3
+
+
+def test_in_place_nothing_of_such_a_file_is_lost(tmp_path: Path) -> None:
+    """Another file of the bag is torn, and replaced by what is whole of it."""
+    good = _chunk(_channel(1, "/agent_1/state") + _message(1) * 3)
+    _file(tmp_path / "a_0.mcap", good)
+    bomb = _file(tmp_path / "a_1.mcap", good + _chunk(_message(1) * 8_000_000))
+    before = bomb.read_bytes()
+    report = salvage_in_place(tmp_path)
+    assert (report.kept_messages, report.dropped_files) == (3, 1)
+    assert bomb.read_bytes() == before
 
 
 def test_too_many_topics(tmp_path: Path) -> None:

@@ -61,10 +61,7 @@ class AirReception:
         None where there is no broadcast noise, or no loss.
         """
         if self._published is not None:
-            number, within = divmod(len(modes), STEPS_PER_BLOCK)
-            agents = range(self._model.agents)
-            noise = np.stack([self._air.broadcast_noise(i, number)[within] for i in agents])
-            self._published[len(modes)] = last + noise
+            self._published[-1] = [self._air.published(i, len(modes), state) for i, state in enumerate(last)]
         return self._published, self._losses(modes) if self._air.loss else None
 
     def _losses(self, modes: IntArray) -> BoolArray:
