@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections import Counter
@@ -17,6 +18,10 @@ settings.load_profile("no deadline")
 # A shell script has what it starts in the background ignore Ctrl-C, and so would all that the tests start.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# All that is imported and collected stays to the end: the collector of garbage need not look through it each time.
+gc.disable()
+OBJECTS_BETWEEN_COLLECTIONS = 20_000  # Python's 700 are for smaller programs
 
 INTEGRATION = Path(__file__).parent / "integration"
 
@@ -46,6 +51,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for kind in (networks, others)
         for item in kind[pair * len(kind) // pairs : (pair + 1) * len(kind) // pairs]
     ]
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.set_threshold(OBJECTS_BETWEEN_COLLECTIONS, *gc.get_threshold()[1:])
+    gc.enable()
 
 
 def _limit(item: pytest.Item) -> float:

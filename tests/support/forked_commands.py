@@ -48,7 +48,9 @@ PREPARED = (
     "msg_analysis.twin.check",
     "scipy.stats",
 )
-READ_LATER = re.compile("(ROS_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_).*|NO_COLOR|COLUMNS|LINES|OPENBLAS_NUM_THREADS")
+READ_LATER = re.compile(
+    "(ROS_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_).*|NO_COLOR|COLUMNS|LINES|(OPENBLAS|OMP)_NUM_THREADS|PYTHONSAFEPATH"
+)
 """Names of variables that are read after the imports, or are the same for all that is forked."""
 CLONE_NEWNET = 0x40000000  # linux/sched.h
 LONGEST_TITLE = 2000
@@ -125,10 +127,11 @@ class _Forker:
 
     def _start(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        same = {"OPENBLAS_NUM_THREADS": "1", MARK: "0" * LENGTH_OF_MARK, "SPT_NOENV": "1"}  # titles leave it readable
+        same = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", MARK: "0" * LENGTH_OF_MARK}
+        same["SPT_NOENV"] = "1"  # titles leave the environment readable
         with theirs:
             subprocess.Popen(
-                [sys.executable, __file__, str(theirs.fileno()), " " * LONGEST_TITLE],
+                [sys.executable, "-P", __file__, str(theirs.fileno()), " " * LONGEST_TITLE],
                 env=self._whole | same,
                 pass_fds=[theirs.fileno()],
             )
@@ -144,12 +147,12 @@ def _fixed(environment: Any) -> dict[str, str]:
     return {name: value for name, value in environment.items() if not READ_LATER.fullmatch(name)}
 
 
-def begin(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None]:
-    """What a forked process is to do."""
+def run(request: dict[str, Any], descriptors: list[int]) -> None:
+    """What a forked process does."""
     if request["namespace"] is not None:
         _enter(request["namespace"])
     waiting = _leave_one_waiting(descriptors) if request["command"][1] in ("run", "host") else None
-    return waiting or become(request, descriptors)
+    (waiting or become(request, descriptors))()
 
 
 def _leave_one_waiting(descriptors: list[int]) -> Callable[[], None] | None:
@@ -248,7 +251,7 @@ def main() -> None:
     for name in PREPARED:
         importlib.import_module(name)
     importlib.import_module(NODE_SERVER)._import_all()
-    serve(socket.socket(fileno=int(sys.argv[1])), begin)()
+    serve(socket.socket(fileno=int(sys.argv[1])), run)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import importlib
 import os
 import socket
 import sys
+from typing import Any
 
 MODULES = (
     "msg_agents.nodes.agents.agent_group",
@@ -24,17 +25,20 @@ def main() -> None:
     import numpy as np
     from setproctitle import setproctitle
 
-    from msg_agents.cli.main import main as run
+    from msg_agents.cli.main import main as command
     from msg_agents.processes.environment import tolerate_warnings
     from msg_agents.processes.fork_server import begin_node, serve
 
+    def run(request: dict[str, Any], descriptors: list[int]) -> None:
+        arguments = begin_node(request, descriptors)
+        setproctitle(f"msg-agents {' '.join(arguments)}")
+        np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
+        sys.argv = ["msg-agents", *arguments]
+        command(arguments, prog_name="msg-agents")
+
     tolerate_warnings()
     _import_all()
-    arguments = serve(socket.socket(fileno=int(sys.argv[1])), begin_node)
-    setproctitle(f"msg-agents {' '.join(arguments)}")
-    np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
-    sys.argv = ["msg-agents", *arguments]
-    run(arguments, prog_name="msg-agents")
+    serve(socket.socket(fileno=int(sys.argv[1])), run)
 
 
 def _import_all() -> None:

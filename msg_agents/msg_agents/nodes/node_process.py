@@ -100,6 +100,7 @@ def run_nodes(
         rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
     nodes: Sequence[NetworkNode] = []
     reporter: HealthReporter | None = None
+    spinner: Executor | None = None
     complete = False
     try:
         nodes = make_nodes()
@@ -132,7 +133,7 @@ def run_nodes(
             node.finish(complete=complete, deadline=deadline)
         if reporter:
             reporter.write_status_file()
-        leave(nodes, complete=complete)
+        leave(nodes, spinner, complete=complete)
     return complete
 
 
@@ -148,8 +149,11 @@ def store_participant(takeovers: Sequence[Takeover], node: Node) -> None:
             takeover.store_prefix(*prefixes)
 
 
-def leave(nodes: Sequence[Node], *, complete: bool) -> None:
-    """Remove the nodes from the network, so that no other node waits for them, and make sure that the process ends."""
+def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -> None:
+    """Remove the nodes from the network, so that no other node waits for them, and make sure that the process ends.
+
+    As long as an executor has a node, the middleware keeps it, and the others are not told.
+    """
     # When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
     # interpreter's lock held or after the interpreter has gone. Then only C code helps: an alarm, whose default action
     # ends the process. Nothing is lost, because a complete process has delivered everything by now.
@@ -158,6 +162,8 @@ def leave(nodes: Sequence[Node], *, complete: bool) -> None:
         signal.alarm(LEAVE_GRACE)
     else:
         faulthandler.dump_traceback_later(INTERRUPTED_GRACE, exit=True)
+    if executor is not None:
+        executor.shutdown()
     for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()

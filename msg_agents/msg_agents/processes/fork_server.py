@@ -6,19 +6,22 @@ may end, or be killed, at any time.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
+import functools
 import gc
 import json
 import os
 import socket
 import subprocess
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, NoReturn, Protocol, Self
 
 PROGRAM = "msg_agents.cli.node_server"  # calls ``serve``
 LONGEST_TITLE = 1000  # bytes of the titles of processes, which take the place of the arguments of the first
@@ -26,9 +29,7 @@ LONGEST = 1 << 16  # bytes of a request
 MOST_DESCRIPTORS = 8  # that come with a request
 PATIENCE = 60.0  # s for an answer; the first comes after all imports
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # of linux/prctl.h
-
-
-Begun = TypeVar("Begun")
+CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
 
 
 class Process(Protocol):
@@ -180,10 +181,10 @@ def adopt_orphans(*, adopt: bool) -> bool | None:
     return bool(before.value)
 
 
-def serve(control: socket.socket, begin: Callable[[Any, list[int]], Begun]) -> Begun:
+def serve(control: socket.socket, run: Callable[[Any, list[int]], object]) -> NoReturn:
     """Fork a process for each request from the other side, and end when that does.
 
-    Returns in the forked processes only: what ``begin`` makes of the request and the descriptors that came with it.
+    The forked process does ``run`` with the request and the descriptors that came with it.
     """
     gc.collect()
     gc.freeze()  # the collector writes to the objects that it looks at, and their memory would be copied
@@ -194,8 +195,7 @@ def serve(control: socket.socket, begin: Callable[[Any, list[int]], Begun]) -> B
         pid = _fork_orphan()
         if pid is None:
             control.close()
-            end_without_libraries()
-            return begin(json.loads(message), descriptors)
+            run_and_end(functools.partial(run, json.loads(message), descriptors))
         for descriptor in descriptors:
             os.close(descriptor)
         control.send(str(pid).encode())
@@ -225,14 +225,32 @@ def _fork_orphan() -> int | None:
         return None
 
 
-def end_without_libraries() -> None:
-    """Let this forked process end where Python has ended, before what C libraries do at the end.
-
-    A tracer's (LTTng) stops its threads there, which a forked process does not have, and crashes now and then.
-    """
-    with contextlib.suppress(AttributeError):  # only in the C library of GNU
-        library = ctypes.CDLL(None)
-        library.on_exit(library._exit, None)
+def run_and_end(run: Callable[[], object]) -> NoReturn:
+    """Run it, and end this forked process as Python would, except that memory and C libraries are left as they are."""
+    # Python would free all that was imported before the fork, and the system would copy it for that: a third of the CPU
+    # time of a short run. Exit handlers of C libraries do not expect a fork either: a tracer's (LTTng) stops its
+    # threads, which a forked process does not have, and crashes now and then.
+    code = 0
+    try:
+        run()
+    except SystemExit as end:
+        if isinstance(end.code, int):
+            code = end.code
+        elif end.code is not None:
+            print(end.code, file=sys.stderr)
+            code = 1
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+        code = 1
+    gc.collect()  # what the command has left, such as nodes of ROS, which say that they go
+    threading._shutdown()  # type: ignore[attr-defined]  # waits for threads, as multiprocessing does it
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            code = CANNOT_FLUSH
+    os._exit(code & 0xFF)
 
 
 def begin_node(request: dict[str, Any], descriptors: list[int]) -> list[str]:

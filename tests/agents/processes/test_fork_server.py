@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
@@ -145,21 +144,40 @@ def test_it_ends_when_its_user_is_killed(tmp_path: Path) -> None:
     wait_for(lambda: gone(int(server.name)))
 
 
-ENDS = """
-import atexit, ctypes, os, sys
-from msg_agents.processes.fork_server import end_without_libraries
-library = ctypes.CDLL(None)
-library.on_exit(library.abort, None)  # as a library that crashes at its end
+RUN = """
+import atexit, ctypes, os, sys, threading, time
+def run():
+    atexit.register(print, "handlers")
+    threading.Thread(target=lambda: (time.sleep(0.2), print("threads"))).start()
+    %s
+"""
+FORKED = """
+from msg_agents.processes.fork_server import run_and_end
+if hasattr(ctypes.CDLL(None), "on_exit"):  # the C library of GNU
+    ctypes.CDLL(None).on_exit(ctypes.CDLL(None).abort, None)  # as a library that crashes at its end
 pid = os.fork()
 if not pid:
-    end_without_libraries()
-    atexit.register(print, "Python has ended")
-    sys.exit(3)
-print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
+    run_and_end(run)
+os._exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 """
 
 
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "on_exit"), reason="this machine: no C library of GNU")
-def test_the_ends_of_libraries_are_left_out() -> None:
-    process = subprocess.run([sys.executable, "-P", "-c", ENDS], capture_output=True, text=True)
-    assert (process.returncode, process.stdout.split("\n")) == (-signal.SIGABRT, ["Python has ended", "3", ""])
+@pytest.mark.parametrize(
+    ("statement", "code", "said"),
+    [
+        ("pass", 0, ""),
+        ("sys.exit()", 0, ""),
+        ("sys.exit(3)", 3, ""),
+        ("sys.exit(256 + 7)", 7, ""),
+        ("sys.exit('why')", 1, "why\n"),
+        ("raise OSError('why')", 1, "OSError: why\n"),
+        ("sys.stdout = open('/dev/full', 'w'); print('lost')", 120, ""),
+    ],
+)
+def test_a_forked_process_ends_as_python_does(statement: str, code: int, said: str) -> None:
+    """After its threads and handlers, but without those of C libraries."""
+    for end in ("run()", FORKED):
+        process = subprocess.run([sys.executable, "-P", "-c", RUN % statement + end], capture_output=True, text=True)
+        assert process.returncode == code
+        assert process.stderr.endswith(said)
+        assert process.stdout == ("" if code == 120 else "threads\nhandlers\n")

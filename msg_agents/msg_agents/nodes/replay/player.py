@@ -345,5 +345,5 @@ def play(
     finally:
         for line in bag.damage[known:]:
             on_note(line)
-        leave(nodes, complete=complete)
+        leave(nodes, None, complete=complete)
     return nodes[0].played

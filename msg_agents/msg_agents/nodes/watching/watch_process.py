@@ -126,6 +126,7 @@ def run_watcher(
     with ros_arguments():
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Kind] = []
+    executor: Executor | None = None
     try:
         nodes = [node := make_node()]
         executor = make_executor()
@@ -150,7 +151,7 @@ def run_watcher(
             node.conclude()
         # After the run no node waits for this one, and leaving while others leave can deadlock: see ``leave``.
         if not all(node.done.done() for node in nodes):
-            leave(nodes, complete=False)
+            leave(nodes, executor, complete=False)
     return nodes[0] if nodes else None
 
 
