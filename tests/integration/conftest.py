@@ -291,7 +291,7 @@ def plain(network: Network) -> Iterator[Callable[[Path, dict[str, int]], subproc
         total = str(sum(topics.values()))
         started.append(
             subprocess.Popen(
-                [sys.executable, PLAIN_RECORDER, file, total, *topics],
+                [sys.executable, "-P", "-c", PLAIN_RECORDER.read_text(), file, total, *topics],
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,

@@ -50,7 +50,7 @@ def test_a_replay_gives_the_numbers_of_the_comparison(network: Any, domain: int)
     trajectory = simulate(network.experiment(noise={"process": 1.0, "loss": 0.05}))
     bag = network.directory / "bag"
     write_trajectory(trajectory, bag)
-    listener = subprocess.Popen([sys.executable, "-c", LISTENER], stdout=subprocess.PIPE, text=True)
+    listener = subprocess.Popen([sys.executable, "-P", "-c", LISTENER], stdout=subprocess.PIPE, text=True)
     assert listener.stdout
     assert listener.stdout.readline() == "ready\n"
     live = network.start("live", "--reliable", "--json", "--timeout", "60")

@@ -50,7 +50,7 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
     with free_domain() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         script = LISTENER.replace("{LAST}", str(STEPS))
-        listener = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+        listener = subprocess.Popen([sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, text=True)
         assert listener.stdout
         assert listener.stdout.readline() == "ready\n"
         markers = network.start("markers", "--replica", "2", "--frame", "lab")

@@ -71,7 +71,7 @@ def assert_possible(trajectory: Trajectory) -> None:
 
 @contextmanager
 def clock(domain: int) -> Iterator[None]:
-    process = subprocess.Popen([sys.executable, "-c", CLOCK], env=node_environment(domain))
+    process = subprocess.Popen([sys.executable, "-P", "-c", CLOCK], env=node_environment(domain))
     try:
         yield
     finally:

@@ -1,9 +1,10 @@
 """Our own commands are forked from a process that has imported everything, instead of being executed.
 
-Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis`` and the fork server of a network, if
-nothing is asked for but streams, a directory, a session, a network namespace (``ip netns exec``), and variables that
-are read after the imports. It executes all else as ever. A forked process is a child of the process that asked, has the
-title of its command, and its mark can be read in its environment, as after exec.
+Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis``, the fork server of a network and the
+nodes of tests (``python -P -c CODE``), if nothing is asked for but streams, a directory, a session, a network namespace
+(``ip netns exec``), and variables that are read after the imports. It executes all else as ever. A forked process is a
+child of the process that asked, has the title of its command, and its mark can be read in its environment, as after
+exec.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import signal
 import socket
 import subprocess
 import sys
+import types
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,8 @@ from msg_agents.processes.fork_server import LONGEST, MOST_DESCRIPTORS, adopt_or
 MARK = "MSG_AGENTS_TEST"
 LENGTH_OF_MARK = 32
 NODE_SERVER = "msg_agents.cli.node_server"
+OF_NODE_SERVER = ["-m", NODE_SERVER]
+OF_NODE = ["-P", "-c"]
 PROGRAMS = {
     "msg-agents": ("msg_agents.cli.entry_points", "msg_agents"),
     "msg-analysis": ("msg_analysis.cli.main", "main"),
@@ -86,7 +90,7 @@ def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Seque
     close, kept, directory, environment = arguments[2:6]
     new_group, *identity = arguments[16:21]
     unusual = not close or new_group != -1 or identity != [None, None, None, -1] or arguments[21] is not None
-    if unusual or not (of_ours or command[1:3] == ["-m", NODE_SERVER]):
+    if unusual or not (of_ours or (command[1:3] in (OF_NODE_SERVER, OF_NODE) and command[0] == sys.executable)):
         return None
     lines = [f"{name}={value}" for name, value in os.environ.items()] if environment is None else environment
     return {
@@ -172,7 +176,7 @@ def _leave_one_waiting(descriptors: list[int]) -> Callable[[], None] | None:
 
     def fork_exec(*arguments: Any) -> int:
         request = request_of(arguments[0], arguments)
-        if request is None or ours.fileno() == -1:
+        if request is None or request["command"][1:3] != OF_NODE_SERVER or ours.fileno() == -1:
             return _fork_exec(*arguments)  # type: ignore[misc]
         with ours:
             socket.send_fds(ours, [json.dumps(request).encode()], descriptors_of(request, arguments))
@@ -205,13 +209,18 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
     random.seed()
     np.random.seed()
     of_python = [] if command[0] == sys.executable else [sys.executable]
-    setproctitle(" ".join([*of_python, *command]).rstrip())
-    if command[1:2] == ["-m"]:
+    shown = command[:3] if command[1:3] == OF_NODE else command  # ROS names a log file by it, where code cannot stand
+    setproctitle(" ".join([*of_python, *shown]).rstrip())
+    if command[1:3] == OF_NODE:
+        sys.argv = command[2:3] + command[4:]
+        sys.modules["__main__"] = module = types.ModuleType("__main__")
+        return functools.partial(exec, command[3], module.__dict__)
+    if command[1:3] == OF_NODE_SERVER:
         sys.argv = command[2:]
         return importlib.import_module(NODE_SERVER).main  # type: ignore[no-any-return]
     sys.argv = command
-    module, name = PROGRAMS[Path(command[0]).name]
-    return lambda: sys.exit(getattr(importlib.import_module(module), name)())
+    place, name = PROGRAMS[Path(command[0]).name]
+    return lambda: sys.exit(getattr(importlib.import_module(place), name)())
 
 
 def _enter(namespace: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
@@ -26,13 +27,25 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """Context in which BLAS uses one thread, in the libraries that are loaded when it begins."""
+    limit: AbstractContextManager[Any] = _controller(with_scipy="scipy.linalg" in sys.modules).limit(
+        limits=1, user_api="blas"
+    )
+    return limit
+
+
 def blas_threads(agents: int) -> AbstractContextManager[Any]:
     """Context in which BLAS uses one thread for networks of this size, unless they are large.
 
     Its threads wait for each other without sleeping. Where another program keeps a core busy, every product of small
     matrices then takes as long as a time slice: a comparison of 20 agents took 3 minutes instead of 4 s.
     """
-    return nullcontext() if agents >= LARGE else _controller().limit(limits=1, user_api="blas")
+    if agents >= LARGE:
+        return nullcontext()
+    import scipy.linalg  # noqa: F401  it brings a library of its own
+
+    return one_blas_thread()
 
 
 def few_blas_threads(function: Callable[Concatenate[N, P], R]) -> Callable[Concatenate[N, P], R]:
@@ -46,10 +59,9 @@ def few_blas_threads(function: Callable[Concatenate[N, P], R]) -> Callable[Conca
     return limited
 
 
-@functools.cache  # it looks through all loaded libraries
-def _controller() -> ThreadpoolController:
-    import numpy  # noqa: F401  the libraries must be loaded
-    import scipy.linalg  # noqa: F401
+@functools.cache  # it looks through all loaded libraries, which takes milliseconds
+def _controller(*, with_scipy: bool) -> ThreadpoolController:  # noqa: ARG001  each has found other libraries
+    import numpy  # noqa: F401  the library must be loaded
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import networkx as nx
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from msg_analysis.common.blas_threads import few_blas_threads
+from msg_analysis.common.blas_threads import few_blas_threads, one_blas_thread
 from msg_analysis.common.text.json_numbers import finite
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
@@ -258,7 +257,7 @@ def stationary_start_factor(experiment: ValidExperiment, mode: int) -> FloatArra
     its last bits do not depend on the number of threads.
     """
     step = build_step_model(experiment)
-    with threadpool_limits(1):
+    with one_blas_thread():
         solver, steady = _steady(step, build_run_model(experiment, step), experiment.problem)
         values, vectors = np.linalg.eigh(steady[mode] / step.stationary[mode])
         root = (vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msg_agents.watching.checkpoint_reader import CheckpointReader
+from msg_analysis.common.blas_threads import one_blas_thread
 from msg_analysis.errors import InputError
 from msg_analysis.model.run.record import RunRecord
 
@@ -49,8 +50,6 @@ class RunObserver:
         self._thread.join()
 
     def _run(self) -> None:
-        from threadpoolctl import threadpool_limits
-
         from msg_analysis.inference.online.running_errors import (
             LiveEstimate,  # takes long to import, while the network starts
         )
@@ -58,7 +57,7 @@ class RunObserver:
         with suppress(OSError, AttributeError):  # on Linux each thread has its own priority
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         try:
-            with threadpool_limits(1):
+            with one_blas_thread():
                 estimate = LiveEstimate(self._record, nodes=self._record.experiment.agents <= MOST_NODES)
                 while not self._over.wait(PERIOD):
                     self._follow(estimate, math.inf)

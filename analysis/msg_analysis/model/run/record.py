@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from msg_analysis.common.blas_threads import one_blas_thread
 from msg_analysis.common.version import __version__
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
@@ -180,7 +181,6 @@ def _without_matrices(experiment: ValidExperiment) -> StepMatrices | None:
     if experiment.time == "continuous" or experiment.protocol:
         return None
     import scipy.linalg  # here, since the processes of a run would wait for it
-    from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(1):
+    with one_blas_thread():
         return step_matrices(experiment, scipy.linalg.expm)

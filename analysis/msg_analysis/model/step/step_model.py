@@ -8,8 +8,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from msg_analysis.common.blas_threads import one_blas_thread
 from msg_analysis.model.arithmetic.matrix_exponential import exponential
 from msg_analysis.model.network.markov_chain import MarkovChain
 from msg_analysis.types import BoolArray, FloatArray, IntArray
@@ -113,7 +113,7 @@ class StepMatrices:
 
 @lru_cache(maxsize=16)
 def _transition(chain: MarkovChain, dt: float) -> FloatArray:
-    with threadpool_limits(1):
+    with one_blas_thread():
         transition = chain.transition(dt)
     transition.flags.writeable = False
     return transition

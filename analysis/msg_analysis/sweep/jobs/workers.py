@@ -21,6 +21,7 @@ from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
+from msg_analysis.common.blas_threads import one_blas_thread
 from msg_analysis.common.cores import count_cores
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.software import installed_software
@@ -253,14 +254,12 @@ def _take(pending: deque[T], seconds: float, threads: int) -> list[T]:
 
 def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: str) -> tuple[list[R], float]:
     """On a worker: do a batch, and time it [s]; one thread of linear algebra, since there is a worker for every CPU."""
-    from threadpoolctl import threadpool_limits
-
     if installed_software() != software:
         raise InputError(f"it has {installed_software()}: expected {software}")
     stopping = _Stopping(stop_name)
     begin = time.perf_counter()
     results = []
-    with threadpool_limits(1):
+    with one_blas_thread():
         for item in batch:
             if stopping():
                 raise EndedError

@@ -7,6 +7,8 @@ programming (Alizadeh, Haeberly and Overton 1998).
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from msg_analysis.types import FloatArray, IntArray
@@ -17,10 +19,14 @@ def size(d: int) -> int:
     return d * (d + 1) // 2
 
 
+@lru_cache(maxsize=16)
 def indices(d: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """(row, column, factor), each (p,), of the entries of the vector."""
+    """(row, column, factor), each (p,) and not to be changed, of the entries of the vector."""
     rows, columns = np.tril_indices(d)
-    return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
+    found = rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
+    for array in found:
+        array.flags.writeable = False
+    return found
 
 
 def pack(matrices: FloatArray) -> FloatArray:
