@@ -27,11 +27,11 @@ def main() -> None:
 
     from msg_agents.cli.main import main as command
     from msg_agents.processes.environment import tolerate_warnings
-    from msg_agents.processes.fork_server import begin_node, serve
+    from msg_agents.processes.fork_server import LONGEST_TITLE, begin_node, serve
 
     def run(request: dict[str, Any], descriptors: list[int]) -> None:
         arguments = begin_node(request, descriptors)
-        setproctitle(f"msg-agents {' '.join(arguments)}")
+        setproctitle(f"msg-agents {' '.join(arguments)}"[:LONGEST_TITLE])
         np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
         sys.argv = ["msg-agents", *arguments]
         command(arguments, prog_name="msg-agents")

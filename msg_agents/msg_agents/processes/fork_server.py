@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import Any, NoReturn, Protocol, Self
 
 PROGRAM = "msg_agents.cli.node_server"  # calls ``serve``
-LONGEST_TITLE = 1000  # bytes of the titles of processes, which take the place of the arguments of the first
+LONGEST_TITLE = 200  # characters; ROS names a log file by the title, and a longer name than 255 cannot be written
 LONGEST = 1 << 16  # bytes of a request
 MOST_DESCRIPTORS = 8  # that come with a request
 PATIENCE = 60.0  # s for an answer; the first comes after all imports
@@ -107,7 +107,7 @@ class ForkServer:
         self._control.settimeout(PATIENCE)
         with theirs, self._log.open("ab") as output:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", PROGRAM, str(theirs.fileno()), " " * LONGEST_TITLE],
+                [sys.executable, "-m", PROGRAM, str(theirs.fileno()), " " * LONGEST_TITLE],  # room for titles
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,

@@ -16,7 +16,7 @@ pytest.importorskip("rclpy")
 from waiting import gone, participants, record_of_two, wait_for
 
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import ForkedProcess, ForkServer, ForkServerError
+from msg_agents.processes.fork_server import LONGEST_TITLE, ForkedProcess, ForkServer, ForkServerError
 from msg_agents.processes.ros_domain import free_domain
 from msg_analysis.common.cores import available_cores
 
@@ -94,6 +94,15 @@ def test_it_ends_when_its_lifeline_closes(server: ForkServer, tmp_path: Path, wa
     wait_for(lambda: participants(domain))
     assert process.poll() is None
     os.close(writing)
+    assert process.wait() == 3
+
+
+def test_a_command_of_any_length(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
+    """A process of many agents: its node starts, although ROS names a log file by what ``ps`` shows."""
+    process = start(server, tmp_path / "log", *waiting, "--discovery-timeout", "60".zfill(3000))
+    wait_for(lambda: participants(domain))
+    assert len(" ".join(title(process))) == LONGEST_TITLE
+    process.send_signal(signal.SIGINT)
     assert process.wait() == 3
 
 
