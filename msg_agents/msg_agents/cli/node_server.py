@@ -31,7 +31,8 @@ def main() -> None:
 
     def run(request: dict[str, Any], descriptors: list[int]) -> None:
         arguments = begin_node(request, descriptors)
-        setproctitle(f"msg-agents {' '.join(arguments)}"[:LONGEST_TITLE])
+        title = os.fsencode(f"msg-agents {' '.join(arguments)}")
+        setproctitle(title[:LONGEST_TITLE].decode(errors="ignore"))
         np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
         sys.argv = ["msg-agents", *arguments]
         command(arguments, prog_name="msg-agents")

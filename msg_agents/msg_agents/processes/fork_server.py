@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import Any, NoReturn, Protocol, Self
 
 PROGRAM = "msg_agents.cli.node_server"  # calls ``serve``
-LONGEST_TITLE = 200  # characters; ROS names a log file by the title, and a longer name than 255 cannot be written
+LONGEST_TITLE = 200  # bytes; ROS names a log file by the title, and a longer name than 255 cannot be written
 LONGEST = 1 << 16  # bytes of a request
 MOST_DESCRIPTORS = 8  # that come with a request
 PATIENCE = 60.0  # s for an answer; the first comes after all imports
