@@ -22,7 +22,7 @@ from msg_agents.cli.main import main as agents
 from msg_analysis.cli.main import main as analysis
 
 ROUNDS = 7
-NETWORKS = (5, 20, 40)  # agents, each with a process of its own
+NETWORKS = (5, 20, 40, 90)  # agents, each with a process of its own
 BIN = Path(sys.executable).parent
 
 
@@ -46,7 +46,7 @@ def main() -> None:
             file.write_text(yaml.safe_dump(network(size)))
             command = [str(BIN / "msg-agents"), "run", str(file), "--no-record"]
             networks |= {f"{size} agents": command, f"{size} agents, --no-fork": [*command, "--no-fork"]}
-        report(networks, rounds=3)
+        report(networks, rounds=2)
 
 
 def network(agents: int) -> dict[str, object]:

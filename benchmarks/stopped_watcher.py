@@ -14,7 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from msg_agents.processes.ros_domain import free_domain
+from msg_agents.discovery.ros_domain import free_domain
 
 PROGRAM = str(Path(sys.executable).with_name("msg-agents"))
 EXPERIMENT = str(Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml")

@@ -59,6 +59,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
     "msg_agents": [
         "stepping",
         "terminal",
+        "discovery",
         "processes",
         "recovery",
         "replay",

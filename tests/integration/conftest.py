@@ -28,7 +28,7 @@ import yaml
 
 pytest.importorskip("rclpy")
 
-from msg_agents.processes.ros_domain import free_domain
+from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.running.run_folder import PREFIX
 from msg_agents.running.runner import RunResult, run_network
 from msg_analysis.bags.reader import read_bag

@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.ros_domain import free_domain
 
 # Prints every DiagnosticArray of /diagnostics, level and values included, a line each.
 MONITOR = """

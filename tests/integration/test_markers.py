@@ -12,7 +12,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from msg_agents.processes.ros_domain import free_domain
+from msg_agents.discovery.ros_domain import free_domain
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.twin.simulate import simulate
 

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from msg_agents.processes.ros_domain import free_domain
+from msg_agents.discovery.ros_domain import free_domain
 from msg_analysis import Experiment
 
 ROOT = Path(__file__).parents[2]

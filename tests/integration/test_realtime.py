@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.ros_domain import free_domain
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.run.trajectory import Trajectory

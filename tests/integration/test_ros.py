@@ -16,7 +16,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
-from msg_agents.processes.ros_domain import free_domain
+from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.running.launch_support import NETWORK_ARGUMENTS, LaunchedNetwork, environment
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check

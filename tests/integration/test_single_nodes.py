@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from msg_agents.processes.ros_domain import free_domain
+from msg_agents.discovery.ros_domain import free_domain
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from stranger import STEPS, batch, graph, run_beside, states
 
+from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.ros_domain import free_domain
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record

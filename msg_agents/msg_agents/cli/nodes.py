@@ -49,6 +49,7 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
             help="Offer the parameters to `ros2 param`: six services per node, too many for large networks.",
         ),
         click.option("--lifeline", type=int, hidden=True),
+        click.option("--introduction", type=int, hidden=True),
         click.option(
             "--account",
             type=PATH,
@@ -212,6 +213,7 @@ def _run_nodes(
     record: RunRecord,
     *,
     lifeline: int | None,
+    introduction: int | None,
     discovery_timeout: float,
     use_sim_time: bool,
     account: Path | None,
@@ -231,6 +233,7 @@ def _run_nodes(
         throughput=throughput,
         use_sim_time=use_sim_time,
         account=account,
+        introduction=introduction,
         patience=patience,
     ):
         sys.exit(ExitCode.INCOMPLETE)

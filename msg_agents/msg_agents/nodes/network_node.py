@@ -71,6 +71,11 @@ class NetworkNode(LeanNode):
         """Whether all nodes that should read what this node publishes have been discovered; polled."""
         return True
 
+    @property
+    def resumed(self) -> bool:
+        """Whether it takes the place of a killed one, for which the others wait."""
+        return False
+
     def missing_nodes(self) -> list[str]:
         """Names of the nodes that have not been discovered yet."""
         return []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import faulthandler
 import gc
@@ -18,21 +19,28 @@ from rclpy.exceptions import NotInitializedException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
+from msg_agents.discovery.introducer import write_introduction
+from msg_agents.discovery.rtps import PREFIX_SIZE, remove_participant
 from msg_agents.nodes.diagnostics import HealthReporter
 from msg_agents.nodes.network_node import ACK_TIMEOUT, NetworkNode
 from msg_agents.nodes.peer_presence import PeerPresence
 from msg_agents.nodes.ros.node_parameters import ros_arguments
 from msg_agents.processes.environment import discovery_scope
-from msg_agents.recovery.takeover import PREFIX_SIZE, Takeover
+from msg_agents.processes.fork_server import ends_at_once
+from msg_agents.recovery.takeover import Takeover
 from msg_analysis.errors import InputError
 
-GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
+GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine, but for its beginning
+FIRST_POLL = 0.02  # s
 SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wakes up
 GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collections find nothing
 LEAVE_GRACE = 5  # s
 INTERRUPTED_GRACE = 15  # s; longer, because a process that ends by it has failed
 LIFELINE_GRACE = 5.0  # s
 USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
+
+
+_LEFT: list[object] = []  # what must not be taken down before the end of the process
 
 
 class NotFoundError(InputError):
@@ -85,6 +93,7 @@ def run_nodes(
     throughput: bool = True,  # see ``prefer_throughput``
     use_sim_time: bool = False,
     account: Path | None = None,  # status file, written once a second and at the end
+    introduction: int | None = None,  # descriptor for what ``Introducer`` wants to know
     patience: float | None = None,  # s, see ``PeerPresence``; None: no limit
 ) -> bool:
     """Run nodes until each has done its part; False if the process was told to stop (SIGINT, SIGTERM) before.
@@ -99,11 +108,15 @@ def run_nodes(
     with ros_arguments():
         rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
     nodes: Sequence[NetworkNode] = []
+    prefix = b""  # of a process that was introduced
     reporter: HealthReporter | None = None
     spinner: Executor | None = None
     complete = False
     try:
         nodes = make_nodes()
+        if introduction is not None:
+            prefix = own_prefix(nodes[0])
+            write_introduction(introduction, nodes[0].get_name(), prefix)
         reporter = HealthReporter(nodes, account)
         spinner = make_executor(executor)
         for node in nodes:
@@ -133,20 +146,29 @@ def run_nodes(
             node.finish(complete=complete, deadline=deadline)
         if reporter:
             reporter.write_status_file()
-        leave(nodes, spinner, complete=complete)
+        if prefix and ends_at_once():
+            leave_at_once(nodes, spinner, prefix)
+        else:
+            leave(nodes, spinner, complete=complete)
     return complete
 
 
-def store_participant(takeovers: Sequence[Takeover], node: Node) -> None:
-    """Store the GUID prefix of this process, read from the endpoints of one of its nodes, for a later takeover."""
-    if not takeovers:
-        return
+def own_prefix(node: Node) -> bytes:
+    """The prefix of the GUIDs of this process, read from the endpoints of one of its nodes.
+
+    Empty if that cannot be told, since another node has the same name.
+    """
     own = (node.get_name(), node.get_namespace())
     endpoints = [p for topic in node.publishers for p in node.get_publishers_info_by_topic(topic.topic_name)]
     prefixes = {bytes(p.endpoint_gid[:PREFIX_SIZE]) for p in endpoints if (p.node_name, p.node_namespace) == own}
-    if len(prefixes) == 1:  # else another node has the same name: a later process removes neither
-        for takeover in takeovers:
-            takeover.store_prefix(*prefixes)
+    return prefixes.pop() if len(prefixes) == 1 else b""
+
+
+def store_participant(takeovers: Sequence[Takeover], node: Node) -> None:
+    """Store the GUID prefix of this process for a later takeover; without one, that will remove no process."""
+    prefix = own_prefix(node) if takeovers else b""
+    for takeover in takeovers if prefix else ():
+        takeover.store_prefix(prefix)
 
 
 def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -> None:
@@ -169,13 +191,24 @@ def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -
     rclpy.try_shutdown()
 
 
+def leave_at_once(nodes: Sequence[Node], executor: Executor | None, prefix: bytes) -> None:
+    """Let the end of this process be its removal from the network, in one message to each of the others.
+
+    For processes that the introducer knows, which have no shared memory. Otherwise each endpoint's end would be told to
+    each of them: in a large network more messages than all the rest.
+    """
+    _LEFT.extend([executor, *nodes])
+    atexit.register(remove_participant, prefix, int(os.environ.get("ROS_DOMAIN_ID") or 0), repeats=1)
+    rclpy.try_shutdown()
+
+
 def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
     """Wait until the publishers of all nodes have found their readers, and every name belongs to one node only.
 
     Readers are identified by name: with duplicates, a run might start without the node that belongs to it.
     """
     deadline = time.monotonic() + timeout
-    waiting = list(nodes)
+    waiting, pause = list(nodes), FIRST_POLL
     warned = False
     while True:
         waiting = [node for node in waiting if not node.discovered_all() or node.missing_clock()]
@@ -197,4 +230,6 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
             )
         if not rclpy.ok():
             raise ExternalShutdownException
-        time.sleep(GATE_POLL)
+        time.sleep(pause)
+        if not nodes[0].resumed:  # else few look at the same time
+            pause = min(2 * pause, GATE_POLL)

@@ -7,18 +7,15 @@ import tempfile
 import warnings
 from pathlib import Path
 
+from msg_agents.discovery.profiles import LOOPBACK_PROFILE, UDP_PROFILE
 from msg_analysis.errors import InputError
 
-LOOPBACK_PROFILE = Path(__file__).with_name("loopback.xml")
-MOST_PARTICIPANTS = 100  # that find each other in a domain on one machine: maxInitialPeersRange of loopback.xml
-UDP_PROFILE = Path(__file__).with_name("udp.xml")
 TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
 RESTARTS = 3  # of killed processes in a run, by default
 # The arithmetic of one agent is far too small for threads, which would only compete for the cores.
 SINGLE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
 DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
-PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
 SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 LOGS_VARIABLE = "ROS_LOG_DIR"
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name

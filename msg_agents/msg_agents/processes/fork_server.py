@@ -29,6 +29,7 @@ LONGEST = 1 << 16  # bytes of a request
 MOST_DESCRIPTORS = 8  # that come with a request
 PATIENCE = 60.0  # s for an answer; the first comes after all imports
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # of linux/prctl.h
+_ending_at_once = False
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
 
 
@@ -230,6 +231,8 @@ def run_and_end(run: Callable[[], object]) -> NoReturn:
     # Python would free all that was imported before the fork, and the system would copy it for that: a third of the CPU
     # time of a short run. Exit handlers of C libraries do not expect a fork either: a tracer's (LTTng) stops its
     # threads, which a forked process does not have, and crashes now and then.
+    global _ending_at_once
+    _ending_at_once = True
     code = 0
     try:
         run()
@@ -251,6 +254,11 @@ def run_and_end(run: Callable[[], object]) -> NoReturn:
         except (OSError, ValueError):
             code = CANNOT_FLUSH
     os._exit(code & 0xFF)
+
+
+def ends_at_once() -> bool:
+    """Whether this process was forked, and so will end without taking its memory down: see ``run_and_end``."""
+    return _ending_at_once
 
 
 def begin_node(request: dict[str, Any], descriptors: list[int]) -> list[str]:

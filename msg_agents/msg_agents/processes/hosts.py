@@ -16,13 +16,9 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from msg_agents.processes.environment import (
-    LAST_DOMAIN,
-    LOOPBACK_PROFILE,
-    MOST_PARTICIPANTS,
-    PEERS_VARIABLE,
-    node_environment,
-)
+from msg_agents.discovery.profiles import LOOPBACK_PROFILE, MOST_PARTICIPANTS
+from msg_agents.discovery.rtps import PEERS_VARIABLE
+from msg_agents.processes.environment import LAST_DOMAIN, node_environment
 from msg_agents.processes.process_plan import Share, wanted_processes
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment

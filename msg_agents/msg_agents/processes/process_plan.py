@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,14 +12,18 @@ from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, MEGABYTE, 
 from msg_analysis.common.cores import count_cores
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.types import BoolArray
+from msg_analysis.wire.topics import agent_name
 
 RECORDER, SWITCHER = "recorder", "switcher"
 SMALL = 8
 """Of ``processes: auto``: up to so many agents, each has a process of its own; beyond, there is one process per so many
 agents, but not more than the machine has cores."""
-MOST_PROCESSES = 90
-"""Agent processes. Discovery on one machine finds up to ``maxInitialPeersRange`` of loopback.xml participants, of which
-the switcher, the recorder and the user's own tools need some."""
+MOST_PROCESSES = 200
+"""Agent processes that ``Introducer`` introduces to each other, which with switcher, recorder and the user's own tools
+fill the ports of two ROS domains."""
+MOST_UNAIDED = 90
+"""Agent processes that look for each other: Fast DDS finds ``MOST_PARTICIPANTS``, of which some are for others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +34,11 @@ class ProcessPlan:
     arguments: tuple[str, ...]  # of the command ``msg-agents``
     agents: tuple[int, ...] = ()  # indices from 0
     resumes: bool = False  # whether the same command takes over after the process was killed
+
+    @property
+    def first_node(self) -> str:
+        """Name of its first node."""
+        return agent_name(self.agents[0]) if self.agents else self.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,17 +57,17 @@ def wanted_processes(experiment: ValidExperiment, agents: int) -> int:
     return min(agents, wanted) if isinstance(wanted, int) else agents
 
 
-def count_processes(experiment: ValidExperiment, agents: int | None = None) -> int:
-    """Number of processes for ``agents`` agents (None: all) on this machine; InputError: too many for discovery."""
+def count_processes(experiment: ValidExperiment, agents: int | None = None, *, most: int = MOST_UNAIDED) -> int:
+    """Number of processes for ``agents`` agents (None: all) on this machine; InputError: more than ``most``."""
     agents = experiment.agents if agents is None else agents
     wanted, count = experiment.run.processes, wanted_processes(experiment, agents)
     if wanted == "auto" and agents > SMALL:
         # A message to another process costs more than the step it is for: no more processes than can run at once.
-        return min(math.ceil(agents / SMALL), MOST_PROCESSES, count_cores())
-    if count > MOST_PROCESSES:
+        return min(math.ceil(agents / SMALL), most, count_cores())
+    if count > most:
         raise InputError(
-            f"run.processes: {wanted} ({count} processes): expected at most {MOST_PROCESSES}, because discovery on one "
-            "machine finds about 100 participants: give a smaller number, several agents share a process"
+            f"run.processes: {wanted} ({count} processes): expected at most {most}, because discovery on one machine "
+            "finds no more participants: give a smaller number, several agents share a process"
         )
     return count
 
@@ -79,13 +89,14 @@ def plan_network(
     use_sim_time: bool = False,
     storage: Storage = DEFAULT_STORAGE,
     share: Share | None = None,
+    most: int = MOST_UNAIDED,
 ) -> list[ProcessPlan]:
     """The processes of a run, in the order in which to start them; with ``share``, those of this host only.
 
-    InputError: more processes than discovery can handle.
+    InputError: more than ``most`` processes with agents.
     """
     here = tuple(range(experiment.agents)) if share is None else share.agents
-    count = count_processes(experiment, len(here))
+    count = count_processes(experiment, len(here), most=most)
     common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
     timeout = discovery_timeout(experiment.agents, count) if share is None else share.discovery_timeout
     if timeout != DISCOVERY_TIMEOUT:
@@ -114,3 +125,19 @@ def plan_network(
     if home:
         plans.append(ProcessPlan(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
     return plans
+
+
+def partners(plans: Sequence[ProcessPlan], listens: BoolArray) -> dict[str, set[str]]:
+    """The processes that each process exchanges messages with; processes go by their first nodes.
+
+    ``listens``: (m, m), whether agent i ever listens to agent j. Recorder and switcher have to do with all.
+    """
+    exchanges = listens | listens.T
+    names = {plan.first_node for plan in plans}
+    of_agent = {agent: plan.first_node for plan in plans for agent in plan.agents}
+    central = {plan.first_node for plan in plans if not plan.agents}
+    found = {}
+    for plan in plans:
+        peers = {of_agent[int(j)] for i in plan.agents for j in exchanges[i].nonzero()[0]}
+        found[plan.first_node] = (peers | central if plan.agents else names) - {plan.first_node}
+    return found

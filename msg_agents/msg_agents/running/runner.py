@@ -13,14 +13,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from msg_agents.processes.core_pinning import place
-from msg_agents.processes.environment import LOGS_VARIABLE, RESTARTS, can_log, node_environment
+from msg_agents.processes.environment import RESTARTS
 from msg_agents.processes.fork_server import ForkServer
-from msg_agents.processes.middleware_check import require_middleware
-from msg_agents.processes.process_plan import SWITCHER, Share, count_processes, plan_network
-from msg_agents.processes.ros_domain import free_domain
+from msg_agents.processes.process_plan import (
+    MOST_PROCESSES,
+    MOST_UNAIDED,
+    SWITCHER,
+    Share,
+    count_processes,
+    partners,
+    plan_network,
+)
 from msg_agents.recovery.checkpoint import room_for
 from msg_agents.running.run_folder import workshop
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, STEPS, Supervisor
+from msg_agents.running.surroundings import ROS_LOGS, surroundings
 from msg_agents.stepping.stall_detection import LagDetector, StallDetector
 from msg_agents.terminal.interruption import Interruption
 from msg_agents.watching.view import View
@@ -42,7 +49,6 @@ if TYPE_CHECKING:
 
 POLL = 0.05  # s
 REPORT_FILE = "report.html"
-ROS_LOGS = "ros"  # of nodes that have no other place for the log files of ROS
 
 
 @dataclass(slots=True)
@@ -197,16 +203,16 @@ def run_network(
     """
     view = view or View(on_progress, on_note)
     experiment.require_available()
-    count_processes(experiment, None if share is None else len(share.agents))
+    processes = count_processes(experiment, None if share is None else len(share.agents), most=MOST_PROCESSES)
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
     bag = directory if share is None or share.home else None
     result = RunResult(experiment, bag)
     try:
-        with workshop() as folder, free_domain() if domain is None else nullcontext(domain) as chosen:
-            variables = node_environment(chosen) | dict(environment or {})
-            require_middleware(variables)
-            if not can_log():
-                variables[LOGS_VARIABLE] = str(folder / ROS_LOGS)
+        with (
+            workshop() as folder,
+            surroundings(folder, domain, environment or {}, processes + 2) as around,
+        ):
+            variables = around.environment
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 record = record or new_record(experiment)
                 run_file = folder / "run.json"
@@ -215,7 +221,13 @@ def run_network(
                 with (
                     workshop(experiment.agents * room_for(longest)) if restarts else nullcontext() as checkpoints,
                     Interruption() as interruption,
-                    Supervisor(folder, variables, last_step=experiment.steps, fork_server=fork_server) as supervisor,
+                    Supervisor(
+                        folder,
+                        variables,
+                        last_step=experiment.steps,
+                        fork_server=fork_server,
+                        introducer=around.introducer,
+                    ) as supervisor,
                 ):
                     plans = plan_network(
                         experiment,
@@ -225,9 +237,12 @@ def run_network(
                         use_sim_time=use_sim_time,
                         storage=storage,
                         share=share,
+                        most=MOST_PROCESSES if around.introducer else MOST_UNAIDED,
                     )
+                    if around.introducer:
+                        around.introducer.introduce(partners(plans, record.model.listens()))
                     if pin and experiment.run.pace == "lockstep":
-                        supervisor.cores = place(plans, available_cores(), first=chosen)
+                        supervisor.cores = place(plans, available_cores(), first=around.domain)
                     supervisor.start(plans)
                     view.begin(record, checkpoints if share is None else None)
                     _watch(supervisor, experiment, result, restarts, interruption, view, follow_clock=not use_sim_time)

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from msg_agents.discovery.introducer import Introducer
 from msg_agents.processes.core_pinning import keep_to
 from msg_agents.processes.fork_server import ForkServer, ForkServerError, Process
 from msg_agents.processes.process_plan import RECORDER, SWITCHER, ProcessPlan
@@ -110,6 +111,7 @@ class Supervisor:
     cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
     last_step: int = 0  # of the run
     fork_server: ForkServer | None = None  # without one, or when it has ended, every child starts on its own
+    introducer: Introducer | None = None  # without one, the children look for each other
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
 
@@ -131,6 +133,8 @@ class Supervisor:
         if plan.name == SWITCHER:
             arguments += ["--steps", str(self.logs / STEPS)]
         descriptors = {"--lifeline": self._lifeline[0]}
+        if self.introducer is not None:
+            descriptors["--introduction"] = self.introducer.descriptor
         with log.open("ab") as output:
             process = self._launch(arguments, descriptors, output.fileno(), self.cores.get(plan.name))
         return Child(plan, process, log, number)

@@ -87,9 +87,9 @@ def run_file(tmp_path: Path) -> Path:
         ({"run": {"dt": 0.3, "duration": 5}}, [], ["run.duration"]),
         ({"unknown": 1}, [], ["unknown"]),
         (
-            {"agents": 100, "run": {"dt": 0.01, "start": "zero", "processes": "one_per_agent"}},
+            {"agents": 201, "run": {"dt": 0.001, "start": "zero", "processes": "one_per_agent"}},
             [],
-            ["run.processes", "at most 90"],
+            ["run.processes", "at most 200"],
         ),
         ({"noise": {"loss": 0.1}}, ["--pace", "realtime"], ["noise.loss: 0.1", "real time"]),
         ({"noise": {"delay": 1}}, ["--pace", "realtime"], ["noise.delay: 1"]),

@@ -15,9 +15,9 @@ pytest.importorskip("rclpy")
 
 import rclpy
 
+from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.nodes.recorder import Recorder, write_size
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.ros_domain import free_domain
 from msg_agents.stepping.received_steps import ReceivedSteps
 from msg_agents.stepping.state_receiver import StateReceiver
 from msg_agents.stepping.synchronizer import RESEND_LIMIT

@@ -15,9 +15,9 @@ pytest.importorskip("rclpy")
 
 from waiting import gone, participants, record_of_two, wait_for
 
+from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.fork_server import LONGEST_TITLE, ForkedProcess, ForkServer, ForkServerError
-from msg_agents.processes.ros_domain import free_domain
 from msg_analysis.common.cores import available_cores
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="this machine: not Linux")

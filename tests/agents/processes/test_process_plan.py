@@ -7,13 +7,23 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import networkx as nx
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from msg_agents.processes.core_pinning import place
 from msg_agents.processes.environment import DISCOVERY_TIMEOUT
-from msg_agents.processes.process_plan import MOST_PROCESSES, RECORDER, ProcessPlan, count_processes, plan_network
+from msg_agents.processes.process_plan import (
+    MOST_PROCESSES,
+    MOST_UNAIDED,
+    RECORDER,
+    ProcessPlan,
+    count_processes,
+    partners,
+    plan_network,
+)
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 
@@ -42,7 +52,7 @@ def numbers(process: ProcessPlan) -> list[int]:
     return [int(value) for option, value in pairwise(words) if option == "--agent"]
 
 
-@given(st.integers(2, 110), st.integers(1, MOST_PROCESSES))
+@given(st.integers(2, 110), st.integers(1, MOST_UNAIDED))
 def test_every_agent_exactly_once(agents: int, processes: int) -> None:
     hosts = [process for process in plan(agents, processes) if process.agents]
     assert len(hosts) == min(agents, processes)
@@ -68,11 +78,12 @@ def test_auto_never_asks_for_too_many(monkeypatch: pytest.MonkeyPatch, cores: in
     assert count_processes(experiment(200, "auto")) <= MOST_PROCESSES
 
 
-@pytest.mark.parametrize("processes", ["one_per_agent", MOST_PROCESSES + 1])
-def test_too_many_processes(processes: Any) -> None:
-    with pytest.raises(InputError, match=rf"run\.processes: {processes} .*at most {MOST_PROCESSES}"):
-        plan(MOST_PROCESSES + 1, processes)
-    assert len(plan(MOST_PROCESSES, "one_per_agent")) == MOST_PROCESSES + 2
+@pytest.mark.parametrize("most", [MOST_UNAIDED, MOST_PROCESSES])
+def test_too_many_processes(most: int) -> None:
+    for processes in ("one_per_agent", most + 1):
+        with pytest.raises(InputError, match=rf"run\.processes: {processes} .*at most {most}"):
+            plan_network(experiment(most + 1, processes), Path("/run.json"), None, most=most)
+    assert len(plan_network(experiment(most, "one_per_agent"), Path("/run.json"), None, most=most)) == most + 1
 
 
 def test_large_networks_are_given_time_to_find_each_other() -> None:
@@ -115,3 +126,22 @@ def test_neighbours_share_a_core() -> None:
     placed = place(plan(12, 6), [0, 1])
     first = {RECORDER: 0, "agents_1_to_2": 0, "agents_3_to_4": 0}
     assert placed == first | {"agents_5_to_6": 1, "agents_7_to_8": 1, "agents_9_to_10": 1, "agents_11_to_12": 1}
+
+
+@given(st.integers(2, 30), st.integers(1, 30), st.integers(0, 2**32 - 1))
+def test_partners(agents: int, processes: int, seed: int) -> None:
+    """Processes whose agents are neighbours in the union of both directions, and the central ones with all."""
+    listens = np.random.default_rng(seed).random((agents, agents)) < 0.1
+    np.fill_diagonal(listens, False)
+    plans = plan(agents, processes)
+    found = partners(plans, listens)
+    of_agent = {agent: process.first_node for process in plans for agent in process.agents}
+    graph = nx.quotient_graph(
+        nx.from_numpy_array(listens | listens.T), lambda a, b: of_agent[a] == of_agent[b], relabel=False
+    )
+    expected = {
+        of_agent[min(group)]: {of_agent[min(other)] for other in graph[group]} | {RECORDER, "switcher"}
+        for group in graph.nodes
+    }
+    all_names = set(expected) | {RECORDER, "switcher"}
+    assert found == expected | {name: all_names - {name} for name in (RECORDER, "switcher")}

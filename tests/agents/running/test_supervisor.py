@@ -17,9 +17,9 @@ pytest.importorskip("rclpy")
 
 from waiting import gone, participants, record_of_two, wait_for
 
+from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.process_plan import ProcessPlan
-from msg_agents.processes.ros_domain import free_domain
 from msg_agents.running import supervisor as module
 from msg_agents.running.supervisor import Child, Supervisor
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from msg_agents.processes import ros_domain
-from msg_agents.processes.ros_domain import DOMAINS, PORT_BASE, PORTS_PER_DOMAIN, free_domain
+from msg_agents.discovery import ros_domain
+from msg_agents.discovery.ros_domain import DOMAINS, PORT_BASE, PORTS_PER_DOMAIN, free_domain
 from msg_analysis.errors import InputError
 
 HOLD = """
-from msg_agents.processes import ros_domain as domain
+from msg_agents.discovery import ros_domain as domain
 domain.DOMAINS = range({first}, {end})
 with domain.free_domain() as held:
     print(held, flush=True)

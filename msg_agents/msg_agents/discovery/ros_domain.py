@@ -7,7 +7,7 @@ import os
 import random
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from msg_analysis.errors import InputError
@@ -42,27 +42,33 @@ def _open_lock(path: Path) -> int:
 
 
 @contextmanager
-def free_domain() -> Iterator[int]:
+def free_domain(count: int = 1) -> Iterator[int]:
     """Hold a ROS_DOMAIN_ID that no other run holds and whose ports are unused; InputError if there is none.
 
-    It is held by a lock on a file, which the system releases when this process ends, however it ends.
+    ``count``: as many in a row, for a network that needs their ports; the first one is its domain. They are held by
+    locks on files, which the system releases when this process ends, however it ends.
     """
     busy = {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in _ports_in_use()}
-    candidates = [domain for domain in DOMAINS if domain not in busy]
+    free = [domain for domain in DOMAINS if domain not in busy]
+    candidates = [first for first in free if set(range(first, first + count)) <= set(free)]
     random.shuffle(candidates)
-    for domain in candidates:
-        path = Path(tempfile.gettempdir()) / f"msg_agents_domain_{domain}.lock"
-        try:
-            descriptor = _open_lock(path)
-        except OSError:
-            continue
-        try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            yield domain
-            return
-        finally:
-            os.close(descriptor)
+    for first in candidates:
+        with ExitStack() as locks:
+            if all(_lock(domain, locks) for domain in range(first, first + count)):
+                yield first
+                return
     raise InputError(f"no free ROS domain among {DOMAINS[0]}..{DOMAINS[-1]}: end some runs or give --domain")
+
+
+def _lock(domain: int, locks: ExitStack) -> bool:
+    """Lock a domain until the end of ``locks``; whether that was possible."""
+    try:
+        descriptor = _open_lock(Path(tempfile.gettempdir()) / f"msg_agents_domain_{domain}.lock")
+    except OSError:
+        return False
+    locks.callback(os.close, descriptor)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

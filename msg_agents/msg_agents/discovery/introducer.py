@@ -1,0 +1,156 @@
+"""Introduces the processes of a run on one machine to each other: those that exchange messages, as soon as they can.
+
+Left to itself, every process announces itself to every other, again with every process that it meets, and then tells
+it of each endpoint as it makes them: messages grow with the third power of the processes. So they have a profile
+(introduced.xml) by which they announce themselves only to the numbers of visitors, one of which is taken here. When a
+process has all its endpoints, its announcement is passed on, as it is, to those that it has to do with, and no other
+process of the run ever hears of it. Visitors, such as the user's tools, are introduced to all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+from msg_agents.discovery.profiles import FIRST_INTRODUCED
+from msg_agents.discovery.rtps import LOOPBACK, Announcement, discovery_port, read_announcement
+
+REPEAT = 10.0  # s after which an announcement is passed on again: it was lost, or a stopped process has been given up
+FRESH = 10.0  # s for which an announcement is valid; a participant repeats it every 3 s
+PATIENCE = 5.0  # s after which a participant that is not of the run, but has a number like those, is a visitor
+MOST_KNOWN = 1000  # participants
+LARGEST = 1 << 16  # bytes of a datagram
+
+
+def write_introduction(descriptor: int, name: str, prefix: bytes) -> None:
+    """Tell the introducer, once, that a process is ready: the name of its first node, and the prefix of its GUIDs.
+
+    Without a prefix it stays a stranger, who is introduced to all.
+    """
+    with contextlib.suppress(OSError):  # it has gone, and so has the run
+        if prefix:
+            os.write(descriptor, f"{prefix.hex()} {name}\n".encode())
+    os.close(descriptor)
+
+
+@dataclass(slots=True)
+class _Known:
+    announcement: Announcement
+    first: float  # when it was first heard [s]
+    heard: float  # when it was last heard [s]
+    passed: float = float("-inf")  # when it was last passed on [s]
+
+
+class Introducer:
+    """A thread that introduces processes to each other; to be used with ``with``, which takes a port for visitors.
+
+    ``descriptor``: where processes write their introductions (``write_introduction``). OSError: no port is left.
+    """
+
+    def __init__(self, domain: int) -> None:
+        self._domain = domain
+        self._partners: Mapping[str, Collection[str]] = {}
+        self._prefixes: dict[str, bytes] = {}  # of processes that are ready, by name
+        self._known: dict[bytes, _Known] = {}  # by prefix
+        self._thread = threading.Thread(target=self._serve, daemon=True, name="introducer")
+
+    def __enter__(self) -> Self:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+        try:
+            self._bind()
+        except OSError:
+            self._socket.close()
+            raise
+        self._reports, self.descriptor = os.pipe()
+        self._stop, self._stopped = os.pipe()
+        self._thread.start()
+        return self
+
+    def _bind(self) -> None:
+        for participant in range(FIRST_INTRODUCED):
+            try:
+                self._socket.bind((LOOPBACK, discovery_port(self._domain, participant)))
+            except OSError:
+                if participant == FIRST_INTRODUCED - 1:
+                    raise
+            else:
+                return
+
+    def introduce(self, partners: Mapping[str, Collection[str]]) -> None:
+        """From now on, introduce these: the names of those that a process exchanges messages with, by its name."""
+        self._partners = partners
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self._stopped)
+        self._thread.join()
+        for descriptor in (self._reports, self.descriptor, self._stop):
+            os.close(descriptor)
+        self._socket.close()
+
+    def _serve(self) -> None:
+        rest = b""
+        with selectors.DefaultSelector() as selector:
+            for source in (self._socket, self._reports, self._stop):
+                selector.register(source, selectors.EVENT_READ)
+            while True:
+                ready = [key.fileobj for key, _ in selector.select()]
+                if self._stop in ready:
+                    return
+                if self._socket in ready:
+                    with contextlib.suppress(OSError):
+                        self._hear(self._socket.recv(LARGEST))
+                if self._reports in ready:
+                    *lines, rest = (rest + os.read(self._reports, LARGEST)).split(b"\n")
+                    for line in lines:
+                        self._read_report(line.decode(errors="replace"))
+
+    def _read_report(self, line: str) -> None:
+        prefix, _, name = line.partition(" ")
+        with contextlib.suppress(ValueError):
+            self._prefixes[name] = bytes.fromhex(prefix)
+            if self._prefixes[name] in self._known:
+                self._pass_on(self._known[self._prefixes[name]])
+
+    def _hear(self, datagram: bytes) -> None:
+        heard = read_announcement(datagram)
+        if heard is None:
+            return
+        if not heard.port:
+            self._known.pop(heard.prefix, None)
+            return
+        now = time.monotonic()
+        known = self._known.setdefault(heard.prefix, _Known(heard, now, now))
+        known.announcement, known.heard = heard, now
+        if len(self._known) > MOST_KNOWN:
+            del self._known[min(self._known, key=lambda prefix: self._known[prefix].heard)]
+        if now >= known.passed + REPEAT:
+            self._pass_on(known)
+
+    def _pass_on(self, known: _Known) -> None:
+        """Pass an announcement on to those that should know it. Whoever hears it announces itself to its sender."""
+        now = time.monotonic()
+        own = known.announcement.prefix
+        names = [name for name, prefix in self._prefixes.items() if prefix == own]
+        if names:
+            others = {partner for name in names for partner in self._partners.get(name, ())}
+        elif known.announcement.port < discovery_port(self._domain, FIRST_INTRODUCED) or now > known.first + PATIENCE:
+            others = set(self._prefixes)
+        else:  # a process of the run that is not ready yet
+            return
+        known.passed = now
+        for name in others:
+            other = self._known.get(self._prefixes.get(name, b""))
+            if other and other is not known and now < other.heard + FRESH:
+                with contextlib.suppress(OSError):  # it has just gone
+                    self._socket.sendto(known.announcement.datagram, (LOOPBACK, other.announcement.port))

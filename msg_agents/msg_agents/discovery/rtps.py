@@ -1,0 +1,121 @@
+"""The little of RTPS messages that is read and written here, and its ports (DDSI-RTPS 2.3, 8.3, 8.5.3, 9.4 to 9.6)."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+from msg_agents.discovery.profiles import FIRST_INTRODUCED, MOST_INTRODUCED
+from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN
+
+PREFIX_SIZE = 12  # bytes of a GUID that all endpoints of a participant share
+PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
+LOOPBACK = "127.0.0.1"
+_MAGIC, _HEADER_SIZE = b"RTPS", 20
+_HEADER = _MAGIC + b"\x02\x03\x01\x0f"  # version 2.3, vendor eProsima, as of a Fast DDS participant
+_DATA, _TO_ONE = 0x15, 0x0E  # submessages
+_LITTLE_ENDIAN, _INLINE_QOS, _WITH_DATA = 0x01, 0x02, 0x04  # flags
+_PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
+_KEY_HASH, _STATUS_INFO, _SENTINEL, _DISCOVERY_LOCATOR = 0x70, 0x71, 0x01, 0x32
+_PARAMETERS_LITTLE_ENDIAN = b"\x00\x03"
+_DISPOSED_UNREGISTERED = b"\x00\x00\x00\x03"
+_LATE = 1 << 30  # sequence number: higher than that of any announcement that the participant made itself
+
+
+def discovery_port(domain: int, participant: int) -> int:
+    """Port at which a participant of this number hears announcements (9.6.1.1)."""
+    return PORT_BASE + PORTS_PER_DOMAIN * domain + 10 + 2 * participant
+
+
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """What a participant says of itself to those that do not know it yet."""
+
+    prefix: bytes  # of its GUID
+    port: int  # at which it hears announcements; 0: it leaves
+    datagram: bytes
+
+
+def read_announcement(datagram: bytes) -> Announcement | None:
+    """The announcement in a datagram; None if there is none, or it is not meant for everybody."""
+    if datagram[:4] != _MAGIC:
+        return None
+    with contextlib.suppress(struct.error):  # it is cut off
+        for kind, flags, body in _submessages(datagram):
+            if kind == _TO_ONE:
+                return None
+            if kind == _DATA and body[8:12] == _PARTICIPANT_WRITER and flags & _LITTLE_ENDIAN:
+                port = _port(flags, body) if flags & _WITH_DATA else 0
+                return None if port is None else Announcement(datagram[8:_HEADER_SIZE], port, datagram)
+    return None
+
+
+def _submessages(datagram: bytes) -> Iterator[tuple[int, int, bytes]]:
+    position = _HEADER_SIZE
+    while position < len(datagram):
+        kind, flags = struct.unpack_from("BB", datagram, position)
+        (size,) = struct.unpack_from("<H" if flags & _LITTLE_ENDIAN else ">H", datagram, position + 2)
+        size = size or len(datagram) - position - 4  # 0: to the end
+        yield kind, flags, datagram[position + 4 : position + 4 + size]
+        position += 4 + size
+
+
+def _port(flags: int, body: bytes) -> int | None:
+    """Of a DATA submessage of discovery."""
+    (offset,) = struct.unpack_from("<H", body, 2)
+    position = 4 + offset
+    if flags & _INLINE_QOS:
+        *_, (_, position, size) = _parameters(body, position)
+        position += size
+    if body[position : position + 2] != _PARAMETERS_LITTLE_ENDIAN:
+        return None
+    for key, begin, _ in _parameters(body, position + 4):
+        if key == _DISCOVERY_LOCATOR:
+            port: int = struct.unpack_from("<I", body, begin + 4)[0]
+            return port if 0 < port < 1 << 16 else None
+    return None
+
+
+def _parameters(body: bytes, position: int) -> Iterator[tuple[int, int, int]]:
+    """Key, place and size of every value, up to the sentinel, which is the last."""
+    key = None
+    while key != _SENTINEL:
+        key, size = struct.unpack_from("<HH", body, position)
+        yield key, position + 4, size if key != _SENTINEL else 0
+        position += 4 + size
+
+
+def disposal_message(prefix: bytes, number: int = _LATE) -> bytes:
+    """The message by which the participant with this GUID prefix (12 bytes) removes itself from the network."""
+    parameters = (
+        struct.pack("<HH", _KEY_HASH, 16)
+        + prefix
+        + _PARTICIPANT
+        + struct.pack("<HH", _STATUS_INFO, 4)
+        + _DISPOSED_UNREGISTERED
+        + struct.pack("<HH", _SENTINEL, 0)
+    )
+    # Extra flags, octets to the inline QoS, any reader, the writer, its sequence number (high, low).
+    body = (
+        struct.pack("<HH4s4siI", 0, 16, bytes(4), _PARTICIPANT_WRITER, number >> 32, number & 0xFFFFFFFF) + parameters
+    )
+    return _HEADER + prefix + struct.pack("<BBH", _DATA, _LITTLE_ENDIAN | _INLINE_QOS, len(body)) + body
+
+
+def remove_participant(prefix: bytes, domain: int, *, repeats: int = 3) -> None:
+    """Tell every participant on the hosts of the run that one has gone; on other machines its lease has to end.
+
+    ``repeats``: how often, since datagrams may be lost.
+    """
+    addresses = {LOOPBACK, *os.environ.get(PEERS_VARIABLE, "").split()}
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for repeat in range(repeats):
+            message = disposal_message(prefix, _LATE + repeat)
+            for address, participant in product(addresses, range(FIRST_INTRODUCED + MOST_INTRODUCED)):
+                with contextlib.suppress(OSError):  # no participant there
+                    sender.sendto(message, (address, discovery_port(domain, participant)))

@@ -1,0 +1,55 @@
+"""What the processes of a run find around them: a ROS domain, an environment, and who introduces them to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from msg_agents.discovery.introducer import Introducer
+from msg_agents.discovery.profiles import INTRODUCED_PROFILE, domains_for
+from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.processes.environment import LOGS_VARIABLE, PROFILE_VARIABLES, can_log, node_environment
+from msg_agents.processes.middleware_check import require_middleware
+
+ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files of ROS
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """Of one run."""
+
+    domain: int
+    environment: dict[str, str]
+    introducer: Introducer | None  # None: the processes look for each other, by the user's profile for example
+
+
+@contextmanager
+def surroundings(
+    folder: Path,  # of the run
+    domain: int | None,  # None: a free one
+    changes: Mapping[str, str],  # of the environment
+    participants: int,  # of the run
+) -> Iterator[Surroundings]:
+    """Provide them for a run; InputError: no domain is free, or there is no middleware."""
+    with ExitStack() as stack:
+        if domain is None:
+            domain = stack.enter_context(free_domain(domains_for(participants)))
+        environment = node_environment(domain, INTRODUCED_PROFILE) | dict(changes)
+        introducer = None
+        if _is_introduced(environment):
+            try:
+                introducer = stack.enter_context(Introducer(domain))
+            except OSError:  # many others are in this domain
+                environment = node_environment(domain) | dict(changes)
+        require_middleware(environment)
+        if not can_log():
+            environment[LOGS_VARIABLE] = str(folder / ROS_LOGS)
+        yield Surroundings(domain, environment, introducer)
+
+
+def _is_introduced(environment: Mapping[str, str]) -> bool:
+    """Whether the middleware of this environment follows our profile."""
+    ours = environment.get(PROFILE_VARIABLES[0]) == str(INTRODUCED_PROFILE)
+    return ours and environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")

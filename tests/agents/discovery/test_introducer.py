@@ -1,0 +1,224 @@
+"""Introductions, between sockets that stand for participants."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from msg_agents.discovery import introducer
+from msg_agents.discovery.introducer import Introducer, write_introduction
+from msg_agents.discovery.profiles import FIRST_INTRODUCED
+from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.discovery.rtps import discovery_port, disposal_message
+
+QUIET = 0.2  # s in which nothing comes
+PARTNERS = {"agent_1": {"agent_2", "switcher"}, "agent_2": {"agent_1", "switcher"}, "agent_3": {"switcher"}}
+
+
+class Participant:
+    """A socket at a participant's port, and what it says of itself."""
+
+    def __init__(self, domain: int, number: int) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._to = ("127.0.0.1", discovery_port(domain, 0))
+        port = discovery_port(domain, number)
+        self.socket.bind(("127.0.0.1", port))
+        self.prefix = bytes([number]) * 12
+        locator = b"\x32\0\x18\0" + b"\1\0\0\0" + port.to_bytes(4, "little") + bytes(12) + b"\x7f\0\0\1"
+        body = bytes.fromhex("0000100000000000 000100c2 0000000001000000 00030000") + locator + b"\1\0\0\0"
+        self.announcement = b"RTPS\2\3\1\x0f" + self.prefix + b"\x15\5" + len(body).to_bytes(2, "little") + body
+
+    def announce(self, datagram: bytes | None = None) -> None:
+        self.socket.sendto(self.announcement if datagram is None else datagram, self._to)
+
+    def hears(self, *others: Participant) -> None:
+        """It hears the announcements of these, in any order, and then nothing."""
+        self.socket.settimeout(10)
+        heard = [self.socket.recv(1 << 16) for _ in others]
+        assert sorted(heard) == sorted(other.announcement for other in others)
+        self.socket.settimeout(QUIET)
+        with pytest.raises(TimeoutError):
+            self.socket.recv(1 << 16)
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    with free_domain() as number:
+        yield number
+
+
+@pytest.fixture
+def meeting(domain: int) -> Iterator[Introducer]:
+    with Introducer(domain) as meeting:
+        meeting.introduce({**PARTNERS, "switcher": set(PARTNERS)})
+        yield meeting
+    assert not any(thread.name == "introducer" for thread in threading.enumerate())
+
+
+@pytest.fixture
+def crowd(domain: int, meeting: Introducer) -> Iterator[list[Participant]]:
+    """Four processes of the run."""
+    del meeting  # which has the first port
+    crowd = [Participant(domain, FIRST_INTRODUCED + i) for i in range(4)]
+    yield crowd
+    for each in crowd:
+        each.socket.close()
+
+
+def report(meeting: Introducer, name: str, participant: Participant) -> None:
+    write_introduction(os.dup(meeting.descriptor), name, participant.prefix)
+
+
+def settle() -> None:
+    time.sleep(QUIET)
+
+
+def test_those_who_have_to_do_with_each_other_meet(meeting: Introducer, crowd: list[Participant]) -> None:
+    """As soon as both are ready: the later one is announced to the earlier one, which answers by itself."""
+    for each in crowd:
+        each.announce()
+    settle()
+    one, two, three, switcher = crowd
+    report(meeting, "agent_1", one)
+    report(meeting, "agent_3", three)
+    settle()
+    report(meeting, "agent_2", two)
+    one.hears(two)
+    report(meeting, "switcher", switcher)
+    one.hears(switcher)
+    two.hears(switcher)
+    three.hears(switcher)
+    switcher.hears()
+
+
+def test_a_report_may_be_faster_than_the_announcement(meeting: Introducer, crowd: list[Participant]) -> None:
+    one, two, *_ = crowd
+    one.announce()
+    report(meeting, "agent_1", one)
+    report(meeting, "agent_2", two)
+    settle()
+    two.announce()
+    one.hears(two)
+
+
+def test_who_comes_back_is_introduced_again(meeting: Introducer, crowd: list[Participant], domain: int) -> None:
+    one, two, *_ = crowd
+    for name, each in (("agent_1", one), ("agent_2", two)):
+        each.announce()
+        settle()
+        report(meeting, name, each)
+        settle()
+    one.hears(two)
+    again = Participant(domain, FIRST_INTRODUCED + 7)
+    again.announce()
+    settle()
+    report(meeting, "agent_2", again)
+    one.hears(again)
+    two.hears()
+    again.socket.close()
+
+
+def test_visitors_are_introduced_to_all(meeting: Introducer, crowd: list[Participant], domain: int) -> None:
+    for name, each in zip(["agent_1", "agent_2", "agent_3"], crowd, strict=False):
+        each.announce()
+        settle()
+        report(meeting, name, each)
+    settle()
+    crowd[0].hears(crowd[1])
+    visitor = Participant(domain, 5)
+    visitor.announce()
+    for each in crowd[:3]:
+        each.hears(visitor)
+    crowd[3].hears()  # it is not ready
+    visitor.socket.close()
+
+
+def test_strangers_among_the_numbers_of_the_run(
+    meeting: Introducer, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They may be processes of the run that are not ready; later they are visitors."""
+    monkeypatch.setattr(introducer, "PATIENCE", 0.5)
+    one, stranger, *_ = crowd
+    one.announce()
+    report(meeting, "agent_1", one)
+    stranger.announce()
+    one.hears()
+    time.sleep(0.5)
+    stranger.announce()
+    one.hears(stranger)
+
+
+def test_announcements_are_repeated(
+    meeting: Introducer, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Now and then only: most of them, the participants hear directly."""
+    one, two, *_ = crowd
+    for name, each in (("agent_1", one), ("agent_2", two)):
+        each.announce()
+        settle()
+        report(meeting, name, each)
+    one.hears(two)
+    two.announce()
+    one.hears()
+    monkeypatch.setattr(introducer, "REPEAT", 0.0)
+    two.announce()
+    one.hears(two)
+
+
+def test_the_dead_are_not_introduced(
+    meeting: Introducer, crowd: list[Participant], domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who has said that it leaves, and who has not been heard for long."""
+    one, two, three, _ = crowd
+    visitor = Participant(domain, 5)
+    for name, each in (("agent_1", one), ("agent_2", two), ("agent_3", three)):
+        each.announce()
+        report(meeting, name, each)
+    settle()
+    two.announce(disposal_message(two.prefix))
+    settle()
+    monkeypatch.setattr(introducer, "FRESH", 0.1)
+    three.announce()
+    visitor.announce()
+    three.hears(visitor)
+    two.hears()
+    visitor.socket.close()
+
+
+@pytest.mark.parametrize("noise", [b"", b"RTPS", bytes(3000), b"RTPS" + bytes(100)])
+def test_noise_does_no_harm(meeting: Introducer, crowd: list[Participant], noise: bytes) -> None:
+    one, two, *_ = crowd
+    one.announce(noise)
+    os.write(meeting.descriptor, b"nonsense\nzz agent_1\n")
+    for name, each in (("agent_1", one), ("agent_2", two)):
+        each.announce()
+        settle()
+        report(meeting, name, each)
+    one.hears(two)
+
+
+def test_not_more_is_remembered_than_needed(
+    meeting: Introducer, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(introducer, "MOST_KNOWN", 2)
+    for each in crowd:
+        each.announce()
+        settle()
+    assert set(meeting._known) == {each.prefix for each in crowd[2:]}
+
+
+def test_without_a_port_it_does_not_start(domain: int) -> None:
+    with ExitStack() as stack:
+        for number in range(FIRST_INTRODUCED):
+            taken = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            taken.bind(("127.0.0.1", discovery_port(domain, number)))
+        with pytest.raises(OSError, match="in use"), Introducer(domain):
+            pass
+    with Introducer(domain):
+        pass

@@ -1,0 +1,158 @@
+"""RTPS messages of discovery, against bytes that were put together by hand from DDSI-RTPS 2.3, and real ones."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("rclpy")
+
+from msg_agents.discovery.profiles import FIRST_INTRODUCED, INTRODUCED_PROFILE, MOST_INTRODUCED, domains_for
+from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN, free_domain
+from msg_agents.discovery.rtps import (
+    PEERS_VARIABLE,
+    Announcement,
+    discovery_port,
+    disposal_message,
+    read_announcement,
+    remove_participant,
+)
+from msg_agents.processes.environment import node_environment
+
+PREFIX = bytes(range(1, 13))
+HEADER = bytes.fromhex("52545053 0203 010f 0102030405060708090a0b0c")
+# DATA with inline QoS (key hash, status), writer 0x000100c2.
+DISPOSAL = HEADER + bytes.fromhex(
+    "15 03 3400"
+    "0000 1000 00000000 000100c2 00000000 05000000"
+    "7000 1000 0102030405060708090a0b0c 000001c1"
+    "7100 0400 00000003"
+    "0100 0000"
+)
+TIMESTAMP = bytes.fromhex("09 01 0800 0000000000000000")
+TO_ONE = bytes.fromhex("0e 01 0c00 0102030405060708090a0b0d")
+# Protocol version, two locators for discovery (ports 7474 and 7475, at 127.0.0.1), sentinel.
+PARAMETERS = bytes.fromhex(
+    "0003 0000"
+    "1500 0400 02030000"
+    "3200 1800 01000000 321d0000 000000000000000000000000 7f000001"
+    "3200 1800 01000000 331d0000 000000000000000000000000 7f000001"
+    "0100 0000"
+)
+DATA = bytes.fromhex("0000 1000 00000000 000100c2 00000000 01000000")
+INLINE_QOS = bytes.fromhex("7000 1000 0102030405060708090a0b0c 000001c1 0100 0000")
+ANNOUNCER = """
+import time, rclpy
+rclpy.init()
+node = rclpy.create_node("announcer")
+time.sleep(60)
+"""
+
+
+def submessage(flags: int, body: bytes, *, kind: int = 0x15, size: int | None = None) -> bytes:
+    return bytes([kind, flags]) + (len(body) if size is None else size).to_bytes(2, "little") + body
+
+
+@pytest.mark.parametrize(
+    "datagram",
+    [
+        HEADER + submessage(5, DATA + PARAMETERS),
+        HEADER + TIMESTAMP + submessage(5, DATA + PARAMETERS),
+        HEADER + TIMESTAMP + submessage(5, DATA + PARAMETERS, size=0),
+        HEADER + TIMESTAMP + submessage(7, DATA + INLINE_QOS + PARAMETERS),
+    ],
+    ids=["alone", "with its time", "to the end", "with inline QoS"],
+)
+def test_announcements(datagram: bytes) -> None:
+    assert read_announcement(datagram) == Announcement(PREFIX, 7474, datagram)
+
+
+def test_who_leaves_has_no_port() -> None:
+    assert read_announcement(DISPOSAL) == Announcement(PREFIX, 0, DISPOSAL)
+
+
+@pytest.mark.parametrize(
+    "datagram",
+    [
+        b"",
+        b"RTPS",
+        HEADER,
+        HEADER + TO_ONE + TIMESTAMP + submessage(5, DATA + PARAMETERS),
+        HEADER + submessage(5, DATA.replace(b"\x01\x00\xc2", b"\x04\x03\x03") + PARAMETERS),
+        HEADER + submessage(5, DATA + PARAMETERS.replace(b"\x32\x1d", b"\x00\x00", 1)),
+        HEADER + submessage(5, DATA + PARAMETERS.replace(b"\x32\x00\x18", b"\x31\x00\x18")),
+        HEADER + submessage(5, DATA + b"\0\1" + PARAMETERS[2:]),
+        b"XTPS" + HEADER[4:] + submessage(5, DATA + PARAMETERS),
+    ],
+    ids=["empty", "cut off", "nothing", "to one", "other writer", "port 0", "no port", "other encoding", "other magic"],
+)
+def test_other_datagrams(datagram: bytes) -> None:
+    assert read_announcement(datagram) is None
+
+
+@given(st.binary(max_size=200), st.integers(0, 200))
+def test_no_bytes_are_an_error(noise: bytes, place: int) -> None:
+    whole = HEADER + TIMESTAMP + submessage(7, DATA + INLINE_QOS + PARAMETERS)
+    for datagram in (noise, HEADER + noise, whole[:place], whole[:place] + noise, whole[:place] + whole[place + 1 :]):
+        found = read_announcement(datagram)
+        assert found is None or 0 <= found.port < 1 << 16
+
+
+def test_the_announcement_of_a_real_participant() -> None:
+    """Its prefix is that of all its messages; its port, by what the system knows, is one that it listens to."""
+    with ExitStack() as stack:
+        domain = stack.enter_context(free_domain())
+        listener = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        listener.bind(("127.0.0.1", discovery_port(domain, 3)))
+        listener.settimeout(30)
+        environment = node_environment(domain, INTRODUCED_PROFILE)
+        process = stack.enter_context(subprocess.Popen([sys.executable, "-P", "-c", ANNOUNCER], env=environment))
+        stack.callback(process.kill)
+        found = read_announcement(listener.recv(1 << 16))
+        assert found is not None
+        assert found.prefix == found.datagram[8:20]
+        sockets = "".join(
+            str(entry.readlink()) for entry in Path(f"/proc/{process.pid}/fd").iterdir() if entry.is_symlink()
+        )
+        own = set(re.findall(r"socket:\[(\d+)\]", sockets))
+        lines = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
+        ports = {int(line[1].rpartition(":")[2], 16) for line in lines if line[9] in own}
+        assert found.port in ports
+        assert discovery_port(domain, FIRST_INTRODUCED) == found.port
+
+
+def test_the_disposal_byte_for_byte() -> None:
+    assert disposal_message(PREFIX, 5) == DISPOSAL
+
+
+def test_every_participant_of_the_domain_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On this machine, and on the other hosts of the run."""
+    monkeypatch.setenv(PEERS_VARIABLE, "127.0.0.1 127.0.0.2")
+    places = [("127.0.0.1", 0), ("127.0.0.1", FIRST_INTRODUCED + MOST_INTRODUCED - 1), ("127.0.0.2", 3)]
+    with free_domain(2) as domain:
+        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in places]
+        for listener, (address, participant) in zip(sockets, places, strict=True):
+            listener.bind((address, PORT_BASE + PORTS_PER_DOMAIN * domain + 10 + 2 * participant))
+            listener.settimeout(10)
+        remove_participant(PREFIX, domain)
+        for listener in sockets:
+            heard = [listener.recv(1000) for _ in range(3)]
+            assert len(set(heard)) == 3  # with numbers of their own: repetitions would be passed over
+            assert all(message.startswith(DISPOSAL[:36]) and message[44:] == DISPOSAL[44:] for message in heard)
+            listener.close()
+
+
+@pytest.mark.parametrize(("participants", "domains"), [(1, 1), (87, 1), (88, 2), (MOST_INTRODUCED, 2), (207, 3)])
+def test_ports_of_a_run_stay_in_its_domains(participants: int, domains: int) -> None:
+    """Both ports of the last participant lie below the first of the next domain (9.6.1.1: offsets 10 and 11)."""
+    assert domains_for(participants) == domains
+    last = discovery_port(1, FIRST_INTRODUCED + participants - 1) + 1
+    assert last < PORT_BASE + PORTS_PER_DOMAIN * (1 + domains)
