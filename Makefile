@@ -83,6 +83,7 @@ format: setup ## Rewrite the code in the house style
 
 bench: setup ## Measure speed side by side with the bare middleware, other solvers and other readers of bags
 	$(BIN)/python benchmarks/startup.py
+	$(BIN)/python benchmarks/restart.py
 	$(BIN)/python benchmarks/network.py
 	$(BIN)/python benchmarks/precision.py
 	$(BIN)/python benchmarks/moments.py

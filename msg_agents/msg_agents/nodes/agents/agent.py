@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
 
 from msg_agents.nodes.network_node import NetworkNode
+from msg_agents.nodes.ros.timers import after
 from msg_agents.processes.process_plan import RECORDER
 from msg_agents.recovery.checkpoint import Checkpoint
 from msg_agents.stepping.stall_detection import StallDetector
@@ -23,6 +26,9 @@ from msg_analysis.wire import topics
 from msg_analysis.wire.messages import ActiveGraph, StateCodec, with_state
 from msg_analysis.wire.receiving import state_frame, state_receiver
 from msg_analysis.wire.topics import Qos, agent_name
+
+RETURN_TIME = 2.0  # s for which states are not repeated yet, because a reader is missing
+RETURN_POLL = 0.02  # s
 
 
 class Group(Protocol):
@@ -97,6 +103,8 @@ class Agent(NetworkNode):
         self._expected = [*map(agent_name, self._far), *(name for name in readers if name != RECORDER)]
         self._next_progress = 0.0
         self._stall = StallDetector()
+        self._far_states: list[Subscription] = []
+        self._owed: int | None = None  # step from which on states are to be repeated
         self._states = self.publisher_of(topics.STATE, agent)
         self._truth: Publisher | None = None
         if experiment.truth:
@@ -111,13 +119,15 @@ class Agent(NetworkNode):
         """Connect to the peers: agents of this process (by index) by direct calls, the others by topics."""
         self._listeners = [colleagues[j].hear for j in self._near]
         for j in self._far:
-            self.subscribe(topics.STATE, self._receiver(j), agent=j, qos=self.hears)
+            self._far_states.append(self.subscribe(topics.STATE, self._receiver(j), agent=j, qos=self.hears))
 
     def create_shared(self, agents: Sequence[Agent]) -> None:
         """Create what a process needs only once. Called on its first agent, with all its agents."""
 
     def discovered_all(self) -> bool:
-        """See NetworkNode."""
+        """See NetworkNode. One that comes back will ask for messages at once, so it must be ready for them."""
+        if self.resumed and not all(states.get_publisher_count() for states in self._far_states):
+            return False
         return self.has_readers(self._states, self._expected) and not self._group.missing_recorder()
 
     def missing_nodes(self) -> list[str]:
@@ -132,9 +142,10 @@ class Agent(NetworkNode):
                 writer.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
 
     def begin(self) -> None:
-        """Publish x(0); after a takeover, repeat all states that are kept and ask the peers to repeat theirs."""
+        """Publish x(0); after a takeover, repeat what others may have missed, and ask the peers to repeat theirs."""
         if self._published.found:
-            self._repeat(0)
+            # All that is kept, for the recorder and for readers outside the run; peers have what is older.
+            self._repeat(0, heard_since=0 if self.has_other_readers(self._states) else self._missed_since())
             self._ask_again()
         if not self._law.step:
             self._publish_state(0)
@@ -161,34 +172,66 @@ class Agent(NetworkNode):
         self._published.write(law.step, message)
         self._send(law.step, mode, law.state, message)
 
-    def _send(self, step: int, mode: int, state: bytes, message: bytes) -> None:
-        """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it."""
+    def _send(self, step: int, mode: int, state: bytes, message: bytes, *, heard: bool = True) -> None:
+        """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it.
+
+        Without ``heard``, to the recorder only.
+        """
         if self._truth is not None:
-            self.publish(self._truth, message)
+            if heard:
+                self.publish(self._truth, message)
             self._group.record_truth(message)
             whole, state = state, self._law.published(step, state)
             message = with_state(message, state, len(whole))
-        self.publish(self._states, message)
+        if heard:
+            self.publish(self._states, message)
         self._group.record_state(message)
-        for hear in self._listeners:
+        for hear in self._listeners if heard else ():
             hear(self._law.agent, step, mode, state, message)
         if step == self._last:
             self._group.send_batches()
 
+    @property
+    def resumed(self) -> bool:
+        """See NetworkNode. It goes on from a state that an earlier process published."""
+        return self._resumed is not None
+
     def send_again(self, since: int) -> None:
-        """Repeat the states from step ``since`` on, for a reader that may have missed them."""
+        """Repeat the states from step ``since`` on, for a peer that may have missed them, once all readers are there.
+
+        One that has come back, and asks, may not have been matched yet. Requests are latched, and may be old.
+        """
+        since = max(since, self._missed_since())
+        waiting, self._owed = self._owed is not None, min(since, since if self._owed is None else self._owed)
+        if not waiting:
+            self._send_owed(time.monotonic() + RETURN_TIME)
+
+    def _send_owed(self, deadline: float) -> None:
+        if time.monotonic() < deadline and not self.has_readers(self._states, self._expected):
+            after(self, RETURN_POLL, partial(self._send_owed, deadline))
+            return
+        since, self._owed = self._owed, None
+        assert since is not None
         self._repeat(since)
 
-    def _repeat(self, since: int) -> None:
-        """Repeat the kept states from step ``since`` on; what others hear is derived from the exact states."""
+    def _repeat(self, since: int, heard_since: int = 0) -> None:
+        """Repeat the kept states from step ``since`` on; what others hear is derived from the exact states.
+
+        Those before ``heard_since`` go to the recorder only.
+        """
         for step, message in self._published.read(since):
             frame = self._whole.unwrap(message)
             assert frame is not None, "written by this software"
-            self._send(step, frame[2], frame[3], message)
+            self._send(step, frame[2], frame[3], message, heard=step >= heard_since)
         self._group.send_batches()
 
     def _ask_again(self) -> None:
         """Ask the peers in other processes for states that may have been missed."""
+        for j in self._far:
+            self._group.ask_again(j, self._missed_since())
+
+    def _missed_since(self) -> int:
+        """The first step whose state a peer may still need after a restart, of this agent or of itself."""
         raise NotImplementedError
 
     def _receiver(self, peer: int) -> Callable[[bytes], None]:

@@ -65,6 +65,8 @@ class AgentGroup:
         self._states = StateBatches(self._host, topics.STATES)
         self._truths = StateBatches(self._host, topics.TRUTHS) if record.experiment.truth else None
         self._resend: Publisher | None = None
+        if any(agent.resumed for agent in self.nodes):  # which will ask: in time to be discovered with the rest
+            self._resend = self._host.publisher_of(topics.RESEND)
         self._host.subscribe(topics.GRAPH, self._receive_graph)
         self._host.subscribe(topics.RESEND, self._receive_resend)
         self._host.finish_at_end(self.nodes)
@@ -112,7 +114,7 @@ class AgentGroup:
 
     def ask_again(self, agent: int, step: int) -> None:
         """Ask an agent of another process (index from 0) for its states from a step on."""
-        if self._resend is None:  # rarely needed; latched, so a late discovery does no harm
+        if self._resend is None:  # rarely needed; latched, so a late discovery only takes its time
             self._resend = self._host.publisher_of(topics.RESEND)
         self._host.publish(self._resend, self._host.progress(topics.RESEND, agent + 1, step))
 

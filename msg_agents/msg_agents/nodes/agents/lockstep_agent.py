@@ -34,11 +34,9 @@ class LockstepAgent(Agent):
         super().begin()
         self._turns.join(self)
 
-    def _ask_again(self) -> None:
-        """Ask the peers in other processes for the states of the window and one step more: none is further behind."""
-        since = max(0, self._law.step - LOCKSTEP_WINDOW - 1)
-        for j in self._far:
-            self._group.ask_again(j, since)
+    def _missed_since(self) -> int:
+        """See Agent. The states of the window and one step more: no peer is further behind."""
+        return max(0, self._law.step - LOCKSTEP_WINDOW - 1)
 
     def health(self) -> Health:
         """See NetworkNode. A stalled agent says what it waits for, and asks for it again from time to time."""

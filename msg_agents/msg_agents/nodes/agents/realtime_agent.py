@@ -121,13 +121,9 @@ class RealtimeAgent(Agent):
         self._published.write(law.step, message)
         self._send(law.step, mode + 1, law.state, message)
 
-    def send_again(self, since: int) -> None:  # noqa: ARG002  only the newest value is of use
-        """Publish the newest state again; older ones are of no use."""
-        self._repeat(self._law.step)
-
-    def _ask_again(self) -> None:
-        for j in self._far:
-            self._group.ask_again(j, self._law.step)
+    def _missed_since(self) -> int:
+        """See Agent. Only the newest value is of use."""
+        return self._law.step
 
     def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002
         """See Agent."""

@@ -42,3 +42,13 @@ class DueTimer:
 def every(node: Node, period: float, callback: Callable[[], None]) -> None:
     """Call back every ``period`` s of wall time, from the node's executor, even while the node's clock stands still."""
     node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def after(node: Node, seconds: float, callback: Callable[[], None]) -> None:
+    """Call back once, after so many seconds of wall time."""
+
+    def fire() -> None:
+        node.destroy_timer(timer)
+        callback()
+
+    timer = node.create_timer(seconds, fire, clock=Clock(clock_type=ClockType.STEADY_TIME))
