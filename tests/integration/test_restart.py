@@ -5,14 +5,41 @@ from __future__ import annotations
 import html
 import random
 import re
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.processes.environment import node_environment
+
 RUN = {"duration": 200, "replicas": 16, "processes": 3}  # long enough to be killed in the middle
 KILLED = r"(agents?_\w+|switcher): killed by SIGKILL.*, started again$"
+LISTENER = """
+import struct, sys, rclpy
+from msg_agents_interfaces.msg import AgentState
+from rclpy.executors import ExternalShutdownException
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+newest, repeated = -1, 0
+def hear(data):
+    global newest, repeated
+    seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
+    stamp = seconds * 10**9 + nanoseconds
+    repeated, newest = repeated + (stamp <= newest), max(newest, stamp)
+rclpy.init()
+node = rclpy.create_node("listener")
+quality = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
+node.create_subscription(AgentState, sys.argv[1], hear, quality, raw=True)
+print("ready", flush=True)
+try:
+    rclpy.spin(node)
+except ExternalShutdownException:
+    pass
+print(newest, repeated, flush=True)
+"""
 
 
 @pytest.mark.parametrize("kinds", [["agent"], ["agent"] * 3, ["switcher"], ["agent", "switcher"]], ids=" ".join)
@@ -72,3 +99,28 @@ def test_budget(network: Any) -> None:
         stderr,
         re.MULTILINE,
     ), stderr
+
+
+def test_who_comes_back_repeats_only_what_peers_may_lack(network: Any) -> None:
+    """Not the thousands of states that it keeps, neither by itself nor for latched requests of earlier restarts."""
+    with free_domain() as domain:
+        file = network.file(run={"duration": 1000, "processes": 5})
+        run = network.record(file, "--domain", str(domain), "--restarts", "2", "--json")
+        command = [sys.executable, "-P", "-c", LISTENER, "/agent_3/state"]
+        with subprocess.Popen(command, env=node_environment(domain), stdout=subprocess.PIPE, text=True) as listener:
+            assert listener.stdout is not None
+            assert listener.stdout.readline() == "ready\n"
+            network.wait_until_moving()
+            for agent in (2, 3):
+                (victim,) = [process for process in network.processes("agent") if process.agent == agent]
+                victim.kill()
+                network.wait_for(lambda victim=victim: not victim.alive, 10, "its end")
+                recorded = network.recorded_bytes()
+                network.wait_for(lambda recorded=recorded: network.recorded_bytes() > recorded + 100_000, 60, "states")
+            result = network.completed(run)
+            listener.terminate()
+            newest, repeated = map(int, listener.stdout.read().split())
+    assert len(result["restarts"]) == 2
+    assert newest > 0
+    # Once by itself, once for the latched request, and for each neighbour that asks meanwhile: 66 states each time.
+    assert 0 < repeated <= 5 * 66

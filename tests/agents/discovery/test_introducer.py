@@ -143,13 +143,12 @@ def test_strangers_among_the_numbers_of_the_run(
     meeting: Introducer, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They may be processes of the run that are not ready; later they are visitors."""
-    monkeypatch.setattr(introducer, "PATIENCE", 0.5)
     one, stranger, *_ = crowd
     one.announce()
     report(meeting, "agent_1", one)
     stranger.announce()
     one.hears()
-    time.sleep(0.5)
+    monkeypatch.setattr(introducer, "PATIENCE", 0.0)
     stranger.announce()
     one.hears(stranger)
 
@@ -183,11 +182,13 @@ def test_the_dead_are_not_introduced(
     settle()
     two.announce(disposal_message(two.prefix))
     settle()
-    monkeypatch.setattr(introducer, "FRESH", 0.1)
-    three.announce()
     visitor.announce()
     three.hears(visitor)
     two.hears()
+    monkeypatch.setattr(introducer, "FRESH", 0.0)
+    monkeypatch.setattr(introducer, "REPEAT", 0.0)
+    visitor.announce()
+    three.hears()
     visitor.socket.close()
 
 
@@ -209,8 +210,10 @@ def test_not_more_is_remembered_than_needed(
     monkeypatch.setattr(introducer, "MOST_KNOWN", 2)
     for each in crowd:
         each.announce()
-        settle()
-    assert set(meeting._known) == {each.prefix for each in crowd[2:]}
+    wanted, end = {each.prefix for each in crowd[2:]}, time.monotonic() + 10
+    while set(meeting._known) != wanted and time.monotonic() < end:
+        time.sleep(0.01)
+    assert set(meeting._known) == wanted
 
 
 def test_without_a_port_it_does_not_start(domain: int) -> None:
