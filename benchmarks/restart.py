@@ -19,7 +19,6 @@ import tempfile
 import time
 from functools import partial
 from itertools import cycle, islice
-from os import kill
 from pathlib import Path
 
 import rclpy
@@ -90,7 +89,7 @@ class Listener(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
 
     def away(self, agent: int, process: int) -> float:
         """Kill a process; the seconds until something new comes from its agent."""
-        kill(process, signal.SIGKILL)
+        os.kill(process, signal.SIGKILL)
         moment = time.monotonic()
         self.listen(ON_THEIR_WAY)
         before = self.newest[agent]

@@ -32,6 +32,12 @@ def discovery_port(domain: int, participant: int) -> int:
     return PORT_BASE + PORTS_PER_DOMAIN * domain + 10 + 2 * participant
 
 
+def discovery_ports(domain: int) -> range:
+    """Those of all participants that there can be; the last domain has fewer."""
+    first, end = discovery_port(domain, 0), discovery_port(domain, FIRST_INTRODUCED + MOST_INTRODUCED)
+    return range(first, min(end, 1 << 16), 2)
+
+
 @dataclass(frozen=True, slots=True)
 class Announcement:
     """What a participant says of itself to those that do not know it yet."""
@@ -116,6 +122,6 @@ def remove_participant(prefix: bytes, domain: int, *, repeats: int = 3) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for repeat in range(repeats):
             message = disposal_message(prefix, _LATE + repeat)
-            for address, participant in product(addresses, range(FIRST_INTRODUCED + MOST_INTRODUCED)):
+            for place in product(addresses, discovery_ports(domain)):
                 with contextlib.suppress(OSError):  # no participant there
-                    sender.sendto(message, (address, discovery_port(domain, participant)))
+                    sender.sendto(message, place)

@@ -29,8 +29,8 @@ LONGEST = 1 << 16  # bytes of a request
 MOST_DESCRIPTORS = 8  # that come with a request
 PATIENCE = 60.0  # s for an answer; the first comes after all imports
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # of linux/prctl.h
-_ending_at_once = False
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
+_ending_at_once = False  # see ``ends_at_once``
 
 
 class Process(Protocol):

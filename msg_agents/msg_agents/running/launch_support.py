@@ -15,8 +15,8 @@ from typing import Any
 from msg_agents.processes.environment import SINGLE_THREAD
 from msg_agents.processes.process_plan import ProcessPlan, plan_network
 from msg_agents.running.experiment_overrides import load_with_overrides
-from msg_agents.running.run_folder import workshop
-from msg_agents.running.runner import REPORT_FILE, make_bag_directory
+from msg_agents.running.run_folder import make_bag_directory, workshop
+from msg_agents.running.runner import REPORT_FILE
 from msg_agents.running.supervisor import failure_of
 from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.errors import InputError

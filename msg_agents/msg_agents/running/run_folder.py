@@ -1,4 +1,4 @@
-"""Temporary folders of a run: its record, the output of its processes, and the states for a takeover."""
+"""Folders of a run: that of its bag; temporary ones for its record, what processes print, and states for a takeover."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
+
+from msg_analysis.common.files import require_utf8
+from msg_analysis.errors import InputError
+from msg_analysis.model.experiment.experiment import ValidExperiment
 
 PREFIX = "msg_agents_run_"
 MEMORY = Path("/dev/shm")
@@ -58,3 +63,24 @@ def _clear_abandoned() -> None:
                 shutil.rmtree(path)
             finally:
                 os.close(lock)
+
+
+def make_bag_directory(experiment: ValidExperiment, out: Path) -> Path:
+    """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name.
+
+    InputError: it cannot be made.
+    """
+    require_utf8(out)
+    stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
+    candidate, number = out / stem, 2
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        while True:
+            try:
+                candidate.mkdir()
+                return candidate
+            except FileExistsError:
+                candidate, number = out / f"{stem}_{number}", number + 1
+    except OSError as error:
+        place = "is a file" if out.is_file() else f"cannot be written ({error.strerror})"
+        raise InputError(f"--out: {out}: {place}: give a directory for the bags of runs") from error

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,9 +24,9 @@ from msg_agents.processes.process_plan import (
     plan_network,
 )
 from msg_agents.recovery.checkpoint import room_for
-from msg_agents.running.run_folder import workshop
+from msg_agents.running.run_folder import make_bag_directory, workshop
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, STEPS, Supervisor
-from msg_agents.running.surroundings import ROS_LOGS, surroundings
+from msg_agents.running.surroundings import ROS_LOGS, surroundings, will_introduce
 from msg_agents.stepping.stall_detection import LagDetector, StallDetector
 from msg_agents.terminal.interruption import Interruption
 from msg_agents.watching.view import View
@@ -36,8 +35,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.writer import RECORDING_MARKER
 from msg_analysis.common.cores import available_cores
-from msg_analysis.common.files import require_utf8
-from msg_analysis.errors import BagError, InputError
+from msg_analysis.errors import BagError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
@@ -115,27 +113,6 @@ class RunResult:
         self.failures.insert(0, f"stopped by {name} {during}".rstrip())
 
 
-def make_bag_directory(experiment: ValidExperiment, out: Path) -> Path:
-    """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name.
-
-    InputError: it cannot be made.
-    """
-    require_utf8(out)
-    stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
-    candidate, number = out / stem, 2
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        while True:
-            try:
-                candidate.mkdir()
-                return candidate
-            except FileExistsError:
-                candidate, number = out / f"{stem}_{number}", number + 1
-    except OSError as error:
-        place = "is a file" if out.is_file() else f"cannot be written ({error.strerror})"
-        raise InputError(f"--out: {out}: {place}: give a directory for the bags of runs") from error
-
-
 def run_network(
     experiment: ValidExperiment,
     out: Path | None,
@@ -203,15 +180,13 @@ def run_network(
     """
     view = view or View(on_progress, on_note)
     experiment.require_available()
-    processes = count_processes(experiment, None if share is None else len(share.agents), most=MOST_PROCESSES)
+    most = MOST_PROCESSES if will_introduce(environment or {}) else MOST_UNAIDED
+    processes = count_processes(experiment, None if share is None else len(share.agents), most=most)
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
     bag = directory if share is None or share.home else None
     result = RunResult(experiment, bag)
     try:
-        with (
-            workshop() as folder,
-            surroundings(folder, domain, environment or {}, processes + 2) as around,
-        ):
+        with workshop() as folder, surroundings(folder, domain, environment or {}, processes + 2) as around:
             variables = around.environment
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 record = record or new_record(experiment)

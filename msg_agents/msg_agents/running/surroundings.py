@@ -38,7 +38,7 @@ def surroundings(
             domain = stack.enter_context(free_domain(domains_for(participants)))
         environment = node_environment(domain, INTRODUCED_PROFILE) | dict(changes)
         introducer = None
-        if _is_introduced(environment):
+        if will_introduce(changes):
             try:
                 introducer = stack.enter_context(Introducer(domain))
             except OSError:  # many others are in this domain
@@ -49,7 +49,8 @@ def surroundings(
         yield Surroundings(domain, environment, introducer)
 
 
-def _is_introduced(environment: Mapping[str, str]) -> bool:
-    """Whether the middleware of this environment follows our profile."""
+def will_introduce(changes: Mapping[str, str]) -> bool:
+    """Whether the middleware will follow our profile: not if that of the user, or of several hosts, is used."""
+    environment = node_environment(0, INTRODUCED_PROFILE) | dict(changes)
     ours = environment.get(PROFILE_VARIABLES[0]) == str(INTRODUCED_PROFILE)
     return ours and environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")

@@ -21,11 +21,12 @@ from msg_agents.discovery.rtps import (
     PEERS_VARIABLE,
     Announcement,
     discovery_port,
+    discovery_ports,
     disposal_message,
     read_announcement,
     remove_participant,
 )
-from msg_agents.processes.environment import node_environment
+from msg_agents.processes.environment import LAST_DOMAIN, node_environment
 
 PREFIX = bytes(range(1, 13))
 HEADER = bytes.fromhex("52545053 0203 010f 0102030405060708090a0b0c")
@@ -148,6 +149,16 @@ def test_every_participant_of_the_domain_is_told(monkeypatch: pytest.MonkeyPatch
             assert len(set(heard)) == 3  # with numbers of their own: repetitions would be passed over
             assert all(message.startswith(DISPOSAL[:36]) and message[44:] == DISPOSAL[44:] for message in heard)
             listener.close()
+
+
+@pytest.mark.parametrize("domain", [1, LAST_DOMAIN])
+def test_ports_are_ports(domain: int) -> None:
+    """The last domain has no ports for so many participants."""
+    ports = discovery_ports(domain)
+    assert ports[0] == discovery_port(domain, 0)
+    assert len(ports) == min(FIRST_INTRODUCED + MOST_INTRODUCED, (65535 - ports[0]) // 2 + 1)
+    assert ports[-1] < 1 << 16
+    remove_participant(PREFIX, domain)
 
 
 @pytest.mark.parametrize(("participants", "domains"), [(1, 1), (87, 1), (88, 2), (MOST_INTRODUCED, 2), (207, 3)])

@@ -202,9 +202,11 @@ class Agent(NetworkNode):
         One that has come back, and asks, may not have been matched yet. Requests are latched, and may be old.
         """
         since = max(since, self._missed_since())
-        waiting, self._owed = self._owed is not None, min(since, since if self._owed is None else self._owed)
-        if not waiting:
-            self._send_owed(time.monotonic() + RETURN_TIME)
+        if self._owed is not None:
+            self._owed = min(self._owed, since)
+            return
+        self._owed = since
+        self._send_owed(time.monotonic() + RETURN_TIME)
 
     def _send_owed(self, deadline: float) -> None:
         if time.monotonic() < deadline and not self.has_readers(self._states, self._expected):
