@@ -74,9 +74,10 @@ class Process:
 
     @property
     def kind(self) -> str:
-        """Command of msg-agents that it runs: agent, switcher, recorder, run, ..., or node_server."""
-        if "msg_agents.cli.node_server" in self.command:
-            return "node_server"
+        """Command of msg-agents that it runs: agent, switcher, recorder, run, ..., or node_server, run_server."""
+        for server in ("node_server", "run_server"):
+            if f"msg_agents.cli.{server}" in self.command:
+                return server
         for program in ("msg_agents", "msg-agents", str(PROGRAM)):
             if program in self.command:
                 return self.command[self.command.index(program) + 1]

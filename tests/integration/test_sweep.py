@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,7 @@ def test_a_worker_is_killed_in_the_middle(network: Any, cluster: tuple[str, list
 def test_networks_interrupted_and_resumed(network: Any) -> None:
     """Two runs; the false-alarm rate of the verdict is 1 %, with fixed seeds: none."""
     out = network.directory / "out"
-    over = {"switching.generator": generators(0.5, 2.0), "run.duration": [15, 100]}
+    over = {"switching.generator": generators(0.5, 2.0), "run.duration": [15, 300]}
     path = sweep_file(network, kind="network", over=over, combine="zip")
     process = start(path, "--workers", "2", "--out", out, "--json")
     network.wait_for(lambda: lines(out / "points.jsonl") == 1, 100, "the shorter run")
@@ -117,6 +118,34 @@ def test_networks_interrupted_and_resumed(network: Any) -> None:
     assert (result["done"], result["kept"], result["verdict"]) == (2, 1, "agrees")
     assert list((out / "runs").iterdir()) == []  # they agree: their bags are not kept
     check_against_the_twin(network, result["points"])
+
+
+def test_networks_are_forked(network: Any) -> None:
+    """Where what forks them is killed, the next one is not forked: its result is the same. Fixed seeds: no alarm."""
+    out = network.directory / "out"
+    over = {"switching.generator": generators(0.5), "run.duration": [15, 10_000, 20]}
+    process = start(sweep_file(network, kind="network", over=over), "--out", out, "--json")
+    network.wait_for(lambda: lines(out / "points.jsonl") == 1, 60, "the first network")
+    network.wait_for(lambda: network.processes("recorder"), 60, "the second one")
+    (server,) = network.processes("run_server")
+    (run,) = network.processes("run")
+    assert network.processes("node_server") != []
+    assert parent(run) == parent(server)
+    server.kill()
+    time.sleep(0.2)
+    assert run.alive  # nothing depends on it
+    run.kill(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=100)
+    assert process.returncode == 3, stderr + stdout
+    result = json.loads(stdout)
+    assert [row["status"] for row in result["points"]] == ["done", "failed", "done"]
+    assert result["points"][1]["reason"].startswith("stopped by Ctrl-C")
+    assert not (out / "runs" / "report.html").exists()
+    check_against_the_twin(network, result["points"][::2])
+
+
+def parent(process: Any) -> int:
+    return int(Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[1])
 
 
 def test_a_killed_sweep_leaves_no_network(network: Any) -> None:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import ForkServer
+from msg_agents.processes.fork_server import NodeServer
 from msg_agents.processes.process_plan import ProcessPlan, plan_network
 from msg_agents.running.supervisor import Supervisor
 from msg_analysis.model.run.record import RunRecord
@@ -22,7 +22,7 @@ def network_awaiting(node: str, record: RunRecord, directory: Path, domain: int)
     (directory / "run.json").write_text(record.to_json(with_key=True))
     environment = node_environment(domain)
     with (
-        ForkServer(environment, directory / "fork_server.log") as server,
+        NodeServer(environment, directory / "fork_server.log") as server,
         Supervisor(directory, environment, fork_server=server) as nodes,
     ):
         recorder, *others = plan_network(record.experiment, directory / "run.json", directory / BAG)

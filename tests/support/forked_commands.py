@@ -28,7 +28,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from msg_agents.processes.fork_server import LONGEST, MOST_DESCRIPTORS, adopt_orphans, serve
+from msg_agents.cli.node_server import serve_waiting
+from msg_agents.processes.fork_server import leave_one_waiting, serve
+from msg_analysis.common.forked_processes import ALL_FORKED, LONGEST, adopt_orphans
 
 MARK = "MSG_AGENTS_TEST"
 LENGTH_OF_MARK = 32
@@ -123,11 +125,14 @@ class _Forker:
             return _fork_exec(*arguments)  # type: ignore[misc]
         if self._control is None:
             self._control = self._start()
-        message = json.dumps(request).encode()
+        descriptors = descriptors_of(request, arguments)
+        message = json.dumps([[request, list(range(len(descriptors)))]]).encode()
         if len(message) > LONGEST or _fixed(request["environment"]) != self._environment:
             return _fork_exec(*arguments)  # type: ignore[misc]
-        socket.send_fds(self._control, [message], descriptors_of(request, arguments))
-        return int(self._control.recv(LONGEST)) or _fork_exec(*arguments)  # type: ignore[misc]
+        socket.send_fds(self._control, [message], descriptors)
+        pid = int(self._control.recv(LONGEST))
+        assert self._control.recv(LONGEST) == ALL_FORKED
+        return pid
 
     def _start(self) -> socket.socket:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -155,35 +160,7 @@ def run(request: dict[str, Any], descriptors: list[int]) -> None:
     """What a forked process does."""
     if request["namespace"] is not None:
         _enter(request["namespace"])
-    waiting = _leave_one_waiting(descriptors) if request["command"][1] in ("run", "host") else None
-    (waiting or become(request, descriptors))()
-
-
-def _leave_one_waiting(descriptors: list[int]) -> Callable[[], None] | None:
-    """Fork a child of this process, from which the fork server of its network is made; in it, what it is to do."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    pid = os.fork()
-    if pid == 0:
-        ours.close()
-        for descriptor in descriptors:
-            os.close(descriptor)
-        with theirs:
-            message, descriptors, _, _ = socket.recv_fds(theirs, LONGEST, MOST_DESCRIPTORS)
-        if not message:
-            os._exit(0)
-        return become(json.loads(message), descriptors)
-    theirs.close()
-
-    def fork_exec(*arguments: Any) -> int:
-        request = request_of(arguments[0], arguments)
-        if request is None or request["command"][1:3] != OF_NODE_SERVER or ours.fileno() == -1:
-            return _fork_exec(*arguments)  # type: ignore[misc]
-        with ours:
-            socket.send_fds(ours, [json.dumps(request).encode()], descriptors_of(request, arguments))
-        return pid
-
-    subprocess._fork_exec = fork_exec  # type: ignore[attr-defined]
-    return None
+    become(request, descriptors)()
 
 
 def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None]:
@@ -219,6 +196,8 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
         sys.argv = command[2:]
         return importlib.import_module(NODE_SERVER).main  # type: ignore[no-any-return]
     sys.argv = command
+    if command[1:2] in (["run"], ["host"]):
+        leave_one_waiting(serve_waiting, request["kept"])
     place, name = PROGRAMS[Path(command[0]).name]
     return lambda: sys.exit(getattr(importlib.import_module(place), name)())
 
@@ -259,7 +238,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for name in PREPARED:
         importlib.import_module(name)
-    importlib.import_module(NODE_SERVER)._import_all()
+    importlib.import_module(NODE_SERVER).prepare()
     serve(socket.socket(fileno=int(sys.argv[1])), run)
 
 

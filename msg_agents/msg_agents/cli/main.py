@@ -34,6 +34,7 @@ from msg_analysis.cli.storage_options import storage, storage_options
 from msg_analysis.common.exit_codes import ExitCode
 
 if TYPE_CHECKING:
+    from msg_agents.running.runner import ReportWhen
     from msg_analysis.bags.format.storage_options import Compression
 
 
@@ -45,6 +46,16 @@ def main() -> None:
 
 _no_analyse = click.option(
     "--no-analyse", is_flag=True, help="Do not compare the bag with the prediction: no verdict, no report."
+)
+_no_fork = click.option(
+    "--no-fork", is_flag=True, help="Start every process on its own, not forked from one that has imported everything."
+)
+_write_report = click.option(
+    "--write-report",
+    type=click.Choice(["always", "on-failure", "never"]),
+    default="always",
+    show_default=True,
+    help="When to write report.html: on-failure means that the verdict is not `agrees`.",
 )
 
 
@@ -66,6 +77,7 @@ _no_analyse = click.option(
 )
 @click.option("--no-record", is_flag=True, help="Do not record: no bag, no verdict.")
 @_no_analyse
+@_write_report
 @seed_option
 @duration_option
 @click.option(
@@ -106,9 +118,7 @@ _no_analyse = click.option(
     default=True,
     help="Pin each process to one core if there are more processes than cores: faster (lockstep).",
 )
-@click.option(
-    "--no-fork", is_flag=True, help="Start every process on its own, not forked from one that has imported everything."
-)
+@_no_fork
 @storage_options
 @web_options
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
@@ -119,6 +129,7 @@ def run(
     out: Path,
     no_record: bool,
     no_analyse: bool,
+    write_report: ReportWhen,
     seed: int | None,
     duration: float | None,
     pace: str | None,
@@ -162,7 +173,7 @@ def run(
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
             )
-        finish(result, as_json, view.display.end, analyse=not no_analyse)
+        finish(result, as_json, view.display.end, analyse=not no_analyse, report=write_report)
 
 
 @main.command(epilog=examples("msg-agents check runs/line_ring_20250101_120000", "msg-agents check"))
@@ -246,6 +257,8 @@ def prepare(experiment: Path) -> None:
     help="How often, in total, killed processes of this host are restarted.",
 )
 @_no_analyse
+@_write_report
+@_no_fork
 @click.option(
     "--profile", "only_profile", is_flag=True, help="Only print the discovery profile, for other ROS 2 tools."
 )
@@ -261,6 +274,8 @@ def host(
     patience: float,
     restarts: int,
     no_analyse: bool,
+    write_report: ReportWhen,
+    no_fork: bool,
     only_profile: bool,
     compression: Compression,
     split_size: float | None,
@@ -294,12 +309,13 @@ def host(
             domain=places.domain,
             restarts=restarts,
             storage=storage(compression, split_size),
+            fork=not no_fork,
             view=view,
             environment=places.environment(what, folder),
             record=record,
             share=share,
         )
-    finish(result, as_json, analyse=not no_analyse)
+    finish(result, as_json, analyse=not no_analyse, report=write_report)
     if not share.home and not as_json:
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
 

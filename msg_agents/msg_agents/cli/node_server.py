@@ -6,49 +6,74 @@ import importlib
 import os
 import socket
 import sys
-from typing import Any
+from typing import Any, NoReturn
 
 MODULES = (
+    "msg_agents.cli.main",
     "msg_agents.nodes.agents.agent_group",
     "msg_agents.nodes.node_process",
     "msg_agents.nodes.recorder",
     "msg_agents.nodes.switcher",
     "numpy.random",
     "rclpy.experimental.events_executor",
+    "setproctitle",
 )
 """What the processes of nodes import, at the latest when they need it."""
 
 
 def main() -> None:
-    """Serve; in a forked process, run its command."""
+    """Import all, and serve."""
+    prepare()
+    serve_nodes(socket.socket(fileno=int(sys.argv[1])))
+
+
+def prepare() -> None:
+    """Import all that nodes need."""
     os.environ["SPT_NOENV"] = "1"  # titles must leave the environment readable: by it, processes of a run are found
-    import numpy as np
-    from setproctitle import setproctitle
-
-    from msg_agents.cli.main import main as command
     from msg_agents.processes.environment import tolerate_warnings
-    from msg_agents.processes.fork_server import LONGEST_TITLE, begin_node, serve
-
-    def run(request: dict[str, Any], descriptors: list[int]) -> None:
-        arguments = begin_node(request, descriptors)
-        title = os.fsencode(f"msg-agents {' '.join(arguments)}")
-        setproctitle(title[:LONGEST_TITLE].decode(errors="ignore"))
-        np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
-        sys.argv = ["msg-agents", *arguments]
-        command(arguments, prog_name="msg-agents")
 
     tolerate_warnings()
-    _import_all()
-    serve(socket.socket(fileno=int(sys.argv[1])), run)
-
-
-def _import_all() -> None:
     for name in MODULES:
         importlib.import_module(name)
     from msg_agents.nodes.ros.lean_node import load_type_support
     from msg_analysis.wire.topics import DIAGNOSTICS, EXPERIMENT, GRAPH, PROGRESS, STATE, STATES
 
     load_type_support((DIAGNOSTICS, EXPERIMENT, GRAPH, PROGRESS, STATE, STATES))
+
+
+def serve_nodes(control: socket.socket) -> NoReturn:
+    """Fork nodes; in a forked process, run the command of one."""
+    from msg_agents.processes.fork_server import begin_node, serve
+
+    def run(request: dict[str, Any], descriptors: list[int]) -> None:
+        run_command(begin_node(request, descriptors))
+
+    serve(control, run)
+
+
+def serve_waiting(control: socket.socket) -> NoReturn:
+    """The same in a process that has waited for its network: see ``fork_server.leave_one_waiting``."""
+    from setproctitle import setproctitle
+
+    from msg_agents.processes.fork_server import PROGRAM
+
+    setproctitle(" ".join(PROGRAM))
+    serve_nodes(control)
+
+
+def run_command(arguments: list[str]) -> None:
+    """Run a command of ``msg-agents`` in a forked process, which ``ps`` then shows by it."""
+    import numpy as np
+    from setproctitle import setproctitle
+
+    from msg_agents.cli.main import main as command
+    from msg_analysis.common.forked_processes import LONGEST_TITLE
+
+    title = os.fsencode(f"msg-agents {' '.join(arguments)}")
+    setproctitle(title[:LONGEST_TITLE].decode(errors="ignore"))
+    np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
+    sys.argv = ["msg-agents", *arguments]
+    command(arguments, prog_name="msg-agents")
 
 
 if __name__ == "__main__":

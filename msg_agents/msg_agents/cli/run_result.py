@@ -16,12 +16,17 @@ from msg_analysis.common.long_work import watched
 from msg_analysis.common.text.json_numbers import json_text
 
 if TYPE_CHECKING:
-    from msg_agents.running.runner import RunResult
+    from msg_agents.running.runner import ReportWhen, RunResult
     from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
 def finish(
-    result: RunResult, as_json: bool, say: Callable[[dict[str, Any]], None] = lambda _: None, *, analyse: bool = True
+    result: RunResult,
+    as_json: bool,
+    say: Callable[[dict[str, Any]], None] = lambda _: None,
+    *,
+    analyse: bool = True,
+    report: ReportWhen = "always",
 ) -> None:
     """Print the failures, judge what was recorded, show the result, and exit with its code."""
     from msg_agents.running.runner import conclude
@@ -32,7 +37,7 @@ def finish(
     if analyse and not result.interrupted:
         try:
             with WorkProgress() as progress, watched(progress):
-                conclude(result)
+                conclude(result, report)
         except KeyboardInterrupt:
             result.interrupt(signal.SIGINT, "while the run was compared with the prediction")
             complain(result.failures[0], "failed:")
@@ -63,8 +68,6 @@ def _ending(result: RunResult) -> dict[str, Any]:
 
 def _show(result: RunResult, as_json: bool) -> None:
     """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
-    from msg_agents.running.runner import REPORT_FILE
-
     document: dict[str, Any] = {"verdict": "incomplete" if _incomplete(result) else None}  # None: nothing to judge
     if result.comparison is not None:
         document = dict(result.comparison.to_json())
@@ -72,7 +75,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         document |= _without_comparison(result.experiment)
     document |= {
         "bag": str(result.bag) if result.recorded else None,
-        "report": str(result.bag / REPORT_FILE) if result.bag and result.comparison else None,
+        "report": str(result.report) if result.report else None,
         "rate": result.rate,
         "wall_time": result.wall_time,
         "restarts": result.restarts,
@@ -88,7 +91,9 @@ def _show(result: RunResult, as_json: bool) -> None:
         from msg_analysis.report.terminal.comparison_text import print_comparison
 
         print_comparison(document, result_console())
-        click.echo(f"bag:    {document['bag']}\nreport: {document['report']}")
+        click.echo(f"bag:    {document['bag']}")
+        if result.report:
+            click.echo(f"report: {result.report}")
     elif document["bag"]:
         click.echo(f"bag: {document['bag']}")
         if result.interrupted and result.reached > 0:

@@ -1,229 +1,174 @@
-"""A process that has imported everything and forks the processes of a network, so that each starts sooner.
+"""A process that has imported everything and forks others: nodes for a network, or runs for a sweep.
 
-Every forked process is a child of the process that asked for it, which waits for it as for any other: the fork server
-may end, or be killed, at any time.
+What asks for them is in ``msg_analysis.common.forked_processes``.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import ctypes
 import functools
 import gc
 import json
 import os
 import socket
-import subprocess
 import sys
 import threading
+import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NoReturn, Protocol, Self
+from typing import IO, Any, NoReturn
 
-PROGRAM = "msg_agents.cli.node_server"  # calls ``serve``
-LONGEST_TITLE = 200  # bytes; ROS names a log file by the title, and a longer name than 255 cannot be written
-LONGEST = 1 << 16  # bytes of a request
-MOST_DESCRIPTORS = 8  # that come with a request
-PATIENCE = 60.0  # s for an answer; the first comes after all imports
-PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # of linux/prctl.h
+from msg_analysis.common.forked_processes import (
+    ALL_FORKED,
+    LONGEST,
+    MOST_DESCRIPTORS,
+    ForkedProcess,
+    ForkServer,
+    Process,
+)
+
+PROGRAM = [sys.executable, "-m", "msg_agents.cli.node_server"]  # calls ``serve``
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
+ADOPTION = 1e-4  # s between two looks whether a forked process has its new parent
 _ending_at_once = False  # see ``ends_at_once``
+_forked_by = 0  # see ``await_adoption``
+_waiting: tuple[int, socket.socket] | None = None  # see ``leave_one_waiting``
 
 
-class Process(Protocol):
-    """A started process: what ``subprocess.Popen`` and ``ForkedProcess`` share."""
+@dataclass(frozen=True, slots=True)
+class NodeStart:
+    """A process that is to be started."""
 
-    @property
-    def pid(self) -> int:
-        """Its number."""
-
-    def poll(self) -> int | None:
-        """Its exit code, or minus the signal that killed it; None while it runs."""
-
-    def wait(self) -> int:
-        """The same, once it has ended."""
-
-    def send_signal(self, sig: int) -> None:
-        """Send a signal, unless it has ended."""
+    arguments: Sequence[str]  # of its command
+    descriptors: Mapping[str, int]  # by options, which get the numbers that they have in the new process
+    output: int  # descriptor for what it prints
+    core: int | None  # to which it keeps
 
 
-class ForkServerError(Exception):
-    """The fork server cannot be used, or not any more: start the process in another way."""
-
-
-class ForkedProcess:
-    """A child of this process that the fork server has made."""
-
-    def __init__(self, pid: int) -> None:
-        self.pid = pid
-        self._code: int | None = None
-
-    def poll(self) -> int | None:
-        """Its exit code, or minus the signal that killed it; None while it runs."""
-        self._reap(os.WNOHANG)
-        return self._code
-
-    def wait(self) -> int:
-        """The same, once it has ended."""
-        while self._code is None:
-            self._reap(0)
-        return self._code
-
-    def send_signal(self, sig: int) -> None:
-        """Send a signal, unless it has ended."""
-        if self.poll() is None:
-            os.kill(self.pid, sig)
-
-    def _reap(self, options: int) -> None:
-        if self._code is None:
-            try:
-                pid, status = os.waitpid(self.pid, options)
-            except ChildProcessError:  # this program ignores SIGCHLD, and nobody knows any more: as in Popen
-                self._code = 0
-            else:
-                self._code = os.waitstatus_to_exitcode(status) if pid else None
-
-
-class ForkServer:
-    """The fork server, as seen by the process that uses it: a context, at whose end it is gone.
-
-    It imports while its user goes on; the first ``fork`` waits for that. It leaves no process behind but those that it
-    has forked. Where the system cannot do it, or the server cannot start, every ``fork`` fails.
-    """
+class NodeServer(ForkServer):
+    """The fork server of a network, as seen by the process that runs it."""
 
     def __init__(self, environment: Mapping[str, str], log: Path) -> None:
-        self._environment = environment
-        self._log = log
-        self._control: socket.socket | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        super().__init__(PROGRAM, environment, log)
 
-    def __enter__(self) -> Self:
-        self._adopted = adopt_orphans(adopt=True)
-        if self._adopted is None:
-            return self
-        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._control.settimeout(PATIENCE)
-        with theirs, self._log.open("ab") as output:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", PROGRAM, str(theirs.fileno()), " " * LONGEST_TITLE],  # room for titles
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env=dict(self._environment),
-                pass_fds=[theirs.fileno()],
-                start_new_session=True,
-            )
-        return self
+    def fork_nodes(self, nodes: Sequence[NodeStart]) -> list[ForkedProcess]:
+        """Fork processes, each in a session of its own; see ``fork``."""
+        return self.fork(
+            [
+                (
+                    {"arguments": node.arguments, "options": list(node.descriptors), "core": node.core},
+                    [node.output, *node.descriptors.values()],
+                )
+                for node in nodes
+            ]
+        )
 
-    @property
-    def pid(self) -> int | None:
-        """Its number; None if it was never started."""
-        return None if self._process is None else self._process.pid
-
-    def fork(
-        self,
-        arguments: Sequence[str],
-        descriptors: Mapping[str, int],  # by options, which get the numbers that they have in the new process
-        output: int,  # descriptor for what it prints
-        core: int | None,  # to which it keeps
-    ) -> ForkedProcess:
-        """Fork a process, in a session of its own, that runs the command with these arguments.
-
-        ForkServerError: it could not be done.
-        """
-        request = json.dumps({"arguments": arguments, "options": list(descriptors), "core": core}).encode()
-        if self._control is None or len(request) > LONGEST:
-            raise ForkServerError
-        try:
-            socket.send_fds(self._control, [request], [output, *descriptors.values()])
-            pid = int(self._control.recv(LONGEST) or b"0")
-        except OSError:
-            pid = 0
-        if not pid:
-            self._stop()
-            raise ForkServerError
-        return ForkedProcess(pid)
-
-    def _stop(self) -> None:
-        if self._process is not None and self._control is not None:
-            self._control.close()
-            self._control = None
-            self._process.kill()
-            self._process.wait()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stop()
-        if self._adopted is False:
-            adopt_orphans(adopt=False)
-        with contextlib.suppress(OSError):
-            if not self._log.stat().st_size:
-                self._log.unlink()
+    def _start(self, control: socket.socket, output: IO[bytes]) -> Process:
+        return _wake(self._environment, control, output) or super()._start(control, output)
 
 
-def adopt_orphans(*, adopt: bool) -> bool | None:
-    """Whether this process becomes the parent of processes below it whose own parent has ended: set it.
+def leave_one_waiting(serve_nodes: Callable[[socket.socket], NoReturn], unneeded: Iterable[int]) -> None:
+    """Fork a process that becomes the fork server of the run that this process will make, if it has imported all.
 
-    Returns what was set before; None where the system has no such setting.
+    To be called before there are threads. ``unneeded``: descriptors that are not for that process.
     """
-    if sys.platform != "linux":
-        return None
+    global _waiting
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
-        prctl = ctypes.CDLL(None).prctl
-    except (OSError, AttributeError):
+        pid = os.fork()
+    except OSError:  # the fork server will start as without this function
+        ours.close()
+        theirs.close()
+        return
+    if pid:
+        theirs.close()
+        _waiting = (pid, ours)
+        return
+    ours.close()
+    for descriptor in unneeded:
+        os.close(descriptor)
+    with theirs:
+        message, descriptors, _, _ = socket.recv_fds(theirs, LONGEST, MOST_DESCRIPTORS)
+    if not message:  # no network is run
+        os._exit(0)
+    control, output = descriptors
+    os.setsid()
+    environment = json.loads(message)
+    for name in environment["removed"]:
+        del os.environ[name]
+    os.environ.update(environment["changed"])
+    print_to(output)
+    serve_nodes(socket.socket(fileno=control))
+
+
+def _wake(environment: Mapping[str, str], control: socket.socket, output: IO[bytes]) -> ForkedProcess | None:
+    """Make the waiting process the fork server; None if there is none."""
+    global _waiting
+    if _waiting is None:
         return None
-    before = ctypes.c_int()
-    if prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(before), 0, 0, 0) or prctl(PR_SET_CHILD_SUBREAPER, adopt, 0, 0, 0):
-        return None
-    return bool(before.value)
+    (pid, theirs), _waiting = _waiting, None
+    changed = {name: value for name, value in environment.items() if os.environ.get(name) != value}
+    message = json.dumps({"changed": changed, "removed": list(os.environ.keys() - environment.keys())}).encode()
+    with theirs:
+        if len(message) > LONGEST:
+            return None
+        socket.send_fds(theirs, [message], [control.fileno(), output.fileno()])
+    return ForkedProcess(pid)
 
 
 def serve(control: socket.socket, run: Callable[[Any, list[int]], object]) -> NoReturn:
-    """Fork a process for each request from the other side, and end when that does.
+    """Fork processes as the other side requests it, and end when that does.
 
-    The forked process does ``run`` with the request and the descriptors that came with it.
+    A forked process does ``run`` with its request and its descriptors. It is a child of our parent.
     """
     gc.collect()
     gc.freeze()  # the collector writes to the objects that it looks at, and their memory would be copied
+    # Python 3.12 warns of threads, whose locks might be held. Here, only the library of a tracer (LTTng) has any.
+    warnings.filterwarnings("ignore", ".*fork", DeprecationWarning, __name__)
     while True:
         message, descriptors, _, _ = socket.recv_fds(control, LONGEST, MOST_DESCRIPTORS)
         if not message:
             os._exit(0)
-        pid = _fork_orphan()
-        if pid is None:
-            control.close()
-            run_and_end(functools.partial(run, json.loads(message), descriptors))
+        try:
+            between = os.fork()  # the parent of those that it forks, until it ends
+        except OSError:
+            os._exit(1)
+        if not between:
+            _fork_each(control, json.loads(message), descriptors, run)
         for descriptor in descriptors:
             os.close(descriptor)
-        control.send(str(pid).encode())
+        if os.waitpid(between, 0)[1]:
+            os._exit(1)
+        control.send(ALL_FORKED)
 
 
-def _fork_orphan() -> int | None:
-    """Fork a process that is a child of our parent: its number, 0 if that failed; in itself, None."""
-    ours, theirs = socket.socketpair()
-    with warnings.catch_warnings(), ours, theirs:
-        # Python 3.12 warns of threads, whose locks might be held. Here, only the library of a tracer (LTTng) has any.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        try:
-            between = os.fork()
-        except OSError:
-            return 0
-        if between:
-            theirs.close()
-            os.waitpid(between, 0)  # now the process has its new parent
-            return int(ours.recv(LONGEST) or b"0")
+def _fork_each(
+    control: socket.socket, requests: list[Any], descriptors: list[int], run: Callable[[Any, list[int]], object]
+) -> NoReturn:
+    """Fork a process for each request, say its number, and end; exit code 1: that could not be done for all."""
+    global _forked_by
+    _forked_by = os.getpid()
+    for request, places in requests:
         try:
             pid = os.fork()
         except OSError:
             os._exit(1)
-        if pid:
-            theirs.send(str(pid).encode())
-            os._exit(0)
-        return None
+        if not pid:
+            control.close()
+            for descriptor in {*descriptors} - {descriptors[place] for place in places}:
+                os.close(descriptor)
+            run_and_end(functools.partial(run, request, [descriptors[place] for place in places]))
+        control.send(str(pid).encode())
+    os._exit(0)
+
+
+def await_adoption() -> None:
+    """Wait until this forked process is a child of the process that asked for it."""
+    while os.getppid() == _forked_by:
+        time.sleep(ADOPTION)
 
 
 def run_and_end(run: Callable[[], object]) -> NoReturn:
@@ -261,13 +206,18 @@ def ends_at_once() -> bool:
     return _ending_at_once
 
 
+def print_to(output: int) -> None:
+    """Make a descriptor, which is closed, stdout and stderr of this process."""
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(output, stream.fileno())
+    os.close(output)
+
+
 def begin_node(request: dict[str, Any], descriptors: list[int]) -> list[str]:
     """Make a forked process one of its own; the arguments of its command."""
     output, *others = descriptors
     os.setsid()
-    for stream in (sys.stdout, sys.stderr):
-        os.dup2(output, stream.fileno())
-    os.close(output)
+    print_to(output)
     if request["core"] is not None:
         with contextlib.suppress(OSError):  # the core has been taken from us
             os.sched_setaffinity(0, {request["core"]})

@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from msg_agents.processes.core_pinning import place
 from msg_agents.processes.environment import RESTARTS
-from msg_agents.processes.fork_server import ForkServer
+from msg_agents.processes.fork_server import NodeServer
 from msg_agents.processes.process_plan import (
     MOST_PROCESSES,
     MOST_UNAIDED,
@@ -45,6 +45,7 @@ from msg_analysis.wire.receiving import state_frame
 if TYPE_CHECKING:
     from msg_analysis.inference.verdict.comparison import Comparison
 
+ReportWhen = Literal["always", "on-failure", "never"]
 POLL = 0.05  # s
 REPORT_FILE = "report.html"
 
@@ -77,6 +78,8 @@ class RunResult:
         states of the bag; None if there is none, or it could not be read, or the run was interrupted
     comparison
         with the prediction; None before ``conclude``
+    report
+        file of the report; None: not written
     """
 
     experiment: ValidExperiment
@@ -90,6 +93,7 @@ class RunResult:
     reached: int = -1
     trajectory: Trajectory | None = None
     comparison: Comparison | None = None
+    report: Path | None = None
 
     @property
     def recorded(self) -> bool:
@@ -188,7 +192,7 @@ def run_network(
     try:
         with workshop() as folder, surroundings(folder, domain, environment or {}, processes + 2) as around:
             variables = around.environment
-            with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
+            with NodeServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 record = record or new_record(experiment)
                 run_file = folder / "run.json"
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
@@ -357,7 +361,7 @@ def _settle(bag: Path, result: RunResult) -> None:
         )
 
 
-def conclude(result: RunResult) -> None:
+def conclude(result: RunResult, report: ReportWhen = "always") -> None:
     """Compare the bag of a run with its prediction, and write report.html into the bag.
 
     Does nothing if there is no bag, or it was not read.
@@ -366,6 +370,8 @@ def conclude(result: RunResult) -> None:
     ----------
     result
         from ``run_network``; its ``comparison`` is set
+    report
+        when the report is written; "on-failure": if the verdict is not "agrees"
 
     Raises
     ------
@@ -375,9 +381,12 @@ def conclude(result: RunResult) -> None:
     if result.trajectory is None or result.bag is None:
         return
     from msg_analysis.inference.verdict.compare import compare
-    from msg_analysis.report.html.report_page import write_report
 
     comparison = compare(result.trajectory)
-    report = result.bag / REPORT_FILE
-    write_report(comparison, result.trajectory, report, restarts=result.restarts, strangers=result.strangers)
+    if report == "always" or (report == "on-failure" and comparison.verdict != "agrees"):
+        from msg_analysis.report.html.report_page import write_report
+
+        file = result.bag / REPORT_FILE
+        write_report(comparison, result.trajectory, file, restarts=result.restarts, strangers=result.strangers)
+        result.report = file
     result.comparison = comparison

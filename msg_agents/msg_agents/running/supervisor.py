@@ -17,13 +17,15 @@ from typing import Self
 
 from msg_agents.discovery.introducer import Introducer
 from msg_agents.processes.core_pinning import keep_to
-from msg_agents.processes.fork_server import ForkServer, ForkServerError, Process
+from msg_agents.processes.fork_server import NodeServer, NodeStart
 from msg_agents.processes.process_plan import RECORDER, SWITCHER, ProcessPlan
 from msg_agents.processes.status_file import Account, read_accounts, read_steps
+from msg_analysis.common.forked_processes import Process
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
 """Signals and the seconds that a process has to obey each."""
 
+AT_ONCE = 50  # processes that are started together: so many log files are then open
 POLL = 0.02  # s
 SILENCE = 3.0  # s; accounts are written once a second
 EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
@@ -110,7 +112,7 @@ class Supervisor:
     steps: list[int] = field(default_factory=list)  # newest step of every agent, as reported
     cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
     last_step: int = 0  # of the run
-    fork_server: ForkServer | None = None  # without one, or when it has ended, every child starts on its own
+    fork_server: NodeServer | None = None  # without one, or when it has ended, every child starts on its own
     introducer: Introducer | None = None  # without one, the children look for each other
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
@@ -118,16 +120,34 @@ class Supervisor:
     def start(self, plans: Sequence[ProcessPlan]) -> None:
         """Start all processes."""
         self._lifeline = os.pipe()
-        self.children += [self._start(plan) for plan in plans]
+        for first in range(0, len(plans), AT_ONCE):
+            self.children += self._start([(plan, 1) for plan in plans[first : first + AT_ONCE]])
 
     def restart(self, child: Child) -> None:
         """Start a process that has ended again; the new child takes its place in ``children``."""
-        self.children[self.children.index(child)] = self._start(child.plan, child.number + 1)
+        place = self.children.index(child)
+        self.children[place : place + 1] = self._start([(child.plan, child.number + 1)])
 
-    def _start(self, plan: ProcessPlan, number: int = 1) -> Child:
-        log = self.logs / f"{plan.name}.log"
+    def _start(self, plans: Sequence[tuple[ProcessPlan, int]]) -> list[Child]:
+        """Start processes; the numbers count the starts of each."""
+        (self.logs / ACCOUNTS).mkdir(exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            logs = [stack.enter_context(self._log(plan).open("ab")) for plan, _ in plans]
+            starts = [self._node_start(*each, log.fileno()) for each, log in zip(plans, logs, strict=True)]
+            processes: list[Process] = []
+            if self.fork_server is not None:
+                processes += self.fork_server.fork_nodes(starts)
+            processes += [self._spawn(start) for start in starts[len(processes) :]]
+        return [
+            Child(plan, process, self._log(plan), number)
+            for (plan, number), process in zip(plans, processes, strict=True)
+        ]
+
+    def _log(self, plan: ProcessPlan) -> Path:
+        return self.logs / f"{plan.name}.log"
+
+    def _node_start(self, plan: ProcessPlan, number: int, output: int) -> NodeStart:
         account = self.logs / ACCOUNTS / f"{plan.name}.{number}.json"
-        account.parent.mkdir(exist_ok=True)
         self._accounts.append(account)
         arguments = [*plan.arguments, "--account", str(account)]
         if plan.name == SWITCHER:
@@ -135,28 +155,22 @@ class Supervisor:
         descriptors = {"--lifeline": self._lifeline[0]}
         if self.introducer is not None:
             descriptors["--introduction"] = self.introducer.descriptor
-        with log.open("ab") as output:
-            process = self._launch(arguments, descriptors, output.fileno(), self.cores.get(plan.name))
-        return Child(plan, process, log, number)
+        return NodeStart(arguments, descriptors, output, self.cores.get(plan.name))
 
-    def _launch(
-        self, arguments: Sequence[str], descriptors: Mapping[str, int], output: int, core: int | None
-    ) -> Process:
-        if self.fork_server is not None:
-            with contextlib.suppress(ForkServerError):
-                return self.fork_server.fork(arguments, descriptors, output, core)
-        options = [word for option, number in descriptors.items() for word in (option, str(number))]
+    def _spawn(self, node: NodeStart) -> Process:
+        """Start a process that is not forked."""
+        options = [word for option, number in node.descriptors.items() for word in (option, str(number))]
         process = subprocess.Popen(
-            [sys.executable, "-m", "msg_agents", *arguments, *options],
+            [sys.executable, "-m", "msg_agents", *node.arguments, *options],
             stdin=subprocess.DEVNULL,
-            stdout=output,
+            stdout=node.output,
             stderr=subprocess.STDOUT,
             env=dict(self.environment),
-            pass_fds=list(descriptors.values()),
+            pass_fds=list(node.descriptors.values()),
             start_new_session=True,
         )
-        if core is not None:
-            keep_to(process.pid, core)
+        if node.core is not None:
+            keep_to(process.pid, node.core)
         return process
 
     def read_status(self) -> None:

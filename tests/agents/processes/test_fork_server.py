@@ -17,8 +17,9 @@ from waiting import gone, participants, record_of_two, wait_for
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import LONGEST_TITLE, ForkedProcess, ForkServer, ForkServerError
+from msg_agents.processes.fork_server import NodeServer, NodeStart
 from msg_analysis.common.cores import available_cores
+from msg_analysis.common.forked_processes import LONGEST_TITLE, ForkedProcess
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="this machine: not Linux")
 
@@ -30,8 +31,8 @@ def domain() -> Iterator[int]:
 
 
 @pytest.fixture
-def server(tmp_path: Path, domain: int) -> Iterator[ForkServer]:
-    with ForkServer(node_environment(domain), tmp_path / "server.log") as server:
+def server(tmp_path: Path, domain: int) -> Iterator[NodeServer]:
+    with NodeServer(node_environment(domain), tmp_path / "server.log") as server:
         yield server
     assert not (tmp_path / "server.log").exists()  # it had nothing to say
 
@@ -43,10 +44,11 @@ def waiting(tmp_path: Path) -> list[str]:
     return ["agent", str(file), "--agent", "1"]
 
 
-def start(server: ForkServer, log: Path, *arguments: str, core: int | None = None, **descriptors: int) -> ForkedProcess:
+def start(server: NodeServer, log: Path, *arguments: str, core: int | None = None, **descriptors: int) -> ForkedProcess:
     with log.open("ab") as output:
         options = {f"--{name}": number for name, number in descriptors.items()}
-        return server.fork(arguments, options, output.fileno(), core)
+        (process,) = server.fork_nodes([NodeStart(arguments, options, output.fileno(), core)])
+        return process
 
 
 def title(process: ForkedProcess) -> Sequence[str]:
@@ -59,7 +61,7 @@ def status(process: ForkedProcess, key: str) -> str:
     return next(line.split(":")[1].strip() for line in lines if line.startswith(f"{key}:"))
 
 
-def test_what_a_command_prints_and_how_it_ends(server: ForkServer, tmp_path: Path) -> None:
+def test_what_a_command_prints_and_how_it_ends(server: NodeServer, tmp_path: Path) -> None:
     """Two exit codes at the same time, each from the right process."""
     good, bad = tmp_path / "good.log", tmp_path / "bad.log"
     processes = start(server, good, "agent", "--help"), start(server, bad, "agent", "nothing", "--agent", "1")
@@ -71,7 +73,7 @@ def test_what_a_command_prints_and_how_it_ends(server: ForkServer, tmp_path: Pat
 
 
 def test_a_forked_process_is_like_any_child(
-    server: ForkServer, tmp_path: Path, waiting: list[str], domain: int
+    server: NodeServer, tmp_path: Path, waiting: list[str], domain: int
 ) -> None:
     core = available_cores()[-1]
     process = start(server, tmp_path / "log", *waiting, core=core)
@@ -87,7 +89,7 @@ def test_a_forked_process_is_like_any_child(
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
-def test_it_ends_when_its_lifeline_closes(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
+def test_it_ends_when_its_lifeline_closes(server: NodeServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
     reading, writing = os.pipe()
     process = start(server, tmp_path / "log", *waiting, lifeline=reading)
     os.close(reading)
@@ -97,7 +99,7 @@ def test_it_ends_when_its_lifeline_closes(server: ForkServer, tmp_path: Path, wa
     assert process.wait() == 3
 
 
-def test_a_command_of_any_length(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
+def test_a_command_of_any_length(server: NodeServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
     """A process of many agents: its node starts, although ROS names a log file by what ``ps`` shows."""
     command, file, *rest = waiting
     foreign = Path(file).rename(tmp_path / f"{'ж' * 100}.json")
@@ -109,17 +111,15 @@ def test_a_command_of_any_length(server: ForkServer, tmp_path: Path, waiting: li
 
 
 def test_processes_outlive_a_killed_fork_server(
-    server: ForkServer, tmp_path: Path, waiting: list[str], domain: int
+    server: NodeServer, tmp_path: Path, waiting: list[str], domain: int
 ) -> None:
     """How they end is known all the same; no more can be forked."""
     process = start(server, tmp_path / "log", *waiting)
     wait_for(lambda: participants(domain))
     assert server.pid is not None
     os.kill(server.pid, signal.SIGKILL)
-    with pytest.raises(ForkServerError):
-        start(server, tmp_path / "log", "agent", "--help")
-    with pytest.raises(ForkServerError):
-        start(server, tmp_path / "log", "agent", "--help")
+    for _ in range(2):
+        assert server.fork_nodes([NodeStart(["agent", "--help"], {}, 1, None)]) == []
     assert process.poll() is None
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
@@ -128,8 +128,8 @@ def test_processes_outlive_a_killed_fork_server(
 def test_a_fork_server_that_cannot_import(tmp_path: Path) -> None:
     (tmp_path / "msg_agents.py").write_text("raise ImportError('broken')")
     log = tmp_path / "server.log"
-    with ForkServer(os.environ | {"PYTHONPATH": str(tmp_path)}, log) as server, pytest.raises(ForkServerError):
-        start(server, tmp_path / "log", "agent", "--help")
+    with NodeServer(os.environ | {"PYTHONPATH": str(tmp_path)}, log) as server:
+        assert server.fork_nodes([NodeStart(["agent", "--help"], {}, 1, None)]) == []
     assert "broken" in log.read_text()
 
 
@@ -137,10 +137,11 @@ PARENT = """
 import sys, time
 from pathlib import Path
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import ForkServer
+from msg_agents.processes.fork_server import NodeServer, NodeStart
 log = Path(sys.argv[1])
-with ForkServer(node_environment(0), log / "server.log") as server, (log / "log").open("w") as output:
-    server.fork(["agent", "--help"], {}, output.fileno(), None).wait()
+with NodeServer(node_environment(0), log / "server.log") as server, (log / "log").open("w") as output:
+    (process,) = server.fork_nodes([NodeStart(["agent", "--help"], {}, output.fileno(), None)])
+    process.wait()
     print(server.pid, flush=True)
     time.sleep(600)
 """

@@ -1,6 +1,6 @@
-"""Replaces itself by a command that gets SIGTERM when its parent process has ended. Arguments: PARENT_PID COMMAND...
+"""Lets a process get SIGTERM when its parent has ended. As a program: does so, and becomes a command.
 
-The signal is Linux only (PR_SET_PDEATHSIG); elsewhere the command runs without it.
+Arguments: PARENT_PID COMMAND... The signal is Linux only (PR_SET_PDEATHSIG); elsewhere the command runs without it.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import sys
 PR_SET_PDEATHSIG = 1
 
 
-def main() -> None:
-    """Ask for the signal, and become the command."""
+def end_with_parent(parent: int) -> None:
+    """Ask for the signal; if the parent has ended already, end."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM))
-    if os.getppid() != int(sys.argv[1]):  # it has ended already
+    if os.getppid() != parent:
         sys.exit(1)
-    os.execv(sys.argv[2], sys.argv[2:])
 
 
 if __name__ == "__main__":
-    main()
+    end_with_parent(int(sys.argv[1]))
+    os.execv(sys.argv[2], sys.argv[2:])

@@ -6,6 +6,7 @@ Nothing of ROS is imported here: only the process that is started needs it.
 from __future__ import annotations
 
 import fcntl
+import functools
 import json
 import os
 import shutil
@@ -14,15 +15,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from msg_analysis.common.forked_processes import ForkServer, Process
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.job import Job, NetworkOptions, NetworkStoppedError
 
 PROGRAM = "msg-agents"
+RUN_SERVER = "msg_agents.cli.run_server"
+# There is a worker for every core, or the agents of a network need the cores.
+SINGLE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 POLL = 0.1  # s
 # Signals, and the seconds that a run then has to end: it ends its own processes in order.
 ESCALATION = ((signal.SIGINT, 30.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 5.0))
@@ -89,18 +94,10 @@ def _run(
     options: NetworkOptions, file: Path, directory: Path, slot: int, stopping: Callable[[], bool]
 ) -> tuple[dict[str, Any] | None, str, int]:
     """Its result (None: not JSON), what it wrote to stderr, and its exit code."""
-    command = [options.program, "run", str(file), "--out", str(directory), "--json"]
+    report = "always" if options.keep else "on-failure"
+    arguments = ["run", str(file), "--out", str(directory), "--write-report", report, "--json"]
     with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
-        # A session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The slot is
-        # inherited: if this worker is killed, the next network waits until this one has ended.
-        process = subprocess.Popen(
-            [sys.executable, str(_LEASH), str(os.getpid()), *command],
-            stdin=subprocess.DEVNULL,
-            stdout=stdout,
-            stderr=stderr,
-            start_new_session=True,
-            pass_fds=[slot],
-        )
+        process = _start(options.program, arguments, [stdout.fileno(), stderr.fileno(), slot])
         try:
             while process.poll() is None:
                 time.sleep(POLL)
@@ -115,18 +112,41 @@ def _run(
             document: dict[str, Any] | None = json.loads(stdout.read())
         except ValueError:
             document = None
-    return document, said, process.returncode
+    return document, said, process.wait()
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def _start(program: str, arguments: Sequence[str], descriptors: Sequence[int]) -> Process:
+    """Start the command; the descriptors are for its stdout, its stderr and the slot."""
+    # In a session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The slot is
+    # inherited: if this worker is killed, the next network waits until this one has ended.
+    if forked := _fork_server(program).fork([({"arguments": arguments, "parent": os.getpid()}, descriptors)]):
+        return forked[0]
+    stdout, stderr, slot = descriptors
+    return subprocess.Popen(
+        [sys.executable, str(_LEASH), str(os.getpid()), program, *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=stdout,
+        stderr=stderr,
+        start_new_session=True,
+        pass_fds=[slot],
+    )
+
+
+@functools.cache
+def _fork_server(program: str) -> ForkServer:
+    """What forks the runs of this worker. It is there until the worker ends, and ends with it."""
+    python = _interpreter(Path(program)) or sys.executable
+    return ForkServer([python, "-P", "-m", RUN_SERVER], {**os.environ, **SINGLE_THREAD}).__enter__()
+
+
+def _end(process: Process) -> None:
     for number, patience in ESCALATION:
+        process.send_signal(number)
+        deadline = time.monotonic() + patience
+        while process.poll() is None and time.monotonic() < deadline:
+            time.sleep(POLL)
         if process.poll() is not None:
             return
-        process.send_signal(number)
-        try:
-            process.wait(patience)
-        except subprocess.TimeoutExpired:
-            continue
 
 
 @contextmanager

@@ -1,0 +1,53 @@
+"""``python -m msg_agents.cli.run_server SOCKET``: imports all that a run and its nodes need, and forks runs.
+
+A worker of a sweep starts it (``msg_analysis.sweep.jobs.network_run``): a network is then running in a fraction of the
+time.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import socket
+import sys
+from typing import Any
+
+MODULES = (
+    "msg_agents.running.runner",
+    "msg_agents.watching.run_view",
+    "msg_analysis.cli.progress",
+    "msg_analysis.inference.verdict.compare",
+)
+"""What a run and its verdict import, at the latest when they need it."""
+
+
+def main() -> None:
+    """Import all, and serve."""
+    from msg_agents.cli.node_server import prepare
+    from msg_agents.processes.fork_server import serve
+
+    prepare()
+    for name in MODULES:
+        importlib.import_module(name)
+    serve(socket.socket(fileno=int(sys.argv[1])), _run)
+
+
+def _run(request: dict[str, Any], descriptors: list[int]) -> None:
+    """In a forked process: run the command."""
+    from msg_agents.cli.node_server import run_command, serve_waiting
+    from msg_agents.processes.fork_server import await_adoption, leave_one_waiting
+    from msg_analysis.sweep.jobs.end_with_parent import end_with_parent
+
+    os.setsid()
+    await_adoption()
+    end_with_parent(request["parent"])
+    stdout, stderr, *kept = descriptors
+    for source, target in ((stdout, sys.stdout), (stderr, sys.stderr)):
+        os.dup2(source, target.fileno())
+        os.close(source)
+    leave_one_waiting(serve_waiting, kept)
+    run_command(request["arguments"])
+
+
+if __name__ == "__main__":
+    main()
