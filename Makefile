@@ -85,6 +85,7 @@ bench: setup ## Measure speed side by side with the bare middleware, other solve
 	$(BIN)/python benchmarks/startup.py
 	$(BIN)/python benchmarks/restart.py
 	$(BIN)/python benchmarks/network.py
+	$(BIN)/python benchmarks/dense.py
 	$(BIN)/python benchmarks/precision.py
 	$(BIN)/python benchmarks/moments.py
 	$(BIN)/python benchmarks/leaders.py

@@ -142,6 +142,28 @@ class Absurd:
         return self._chance.choice([data, data, data[: self._chance.randrange(1, len(data) - 8)]])
 
 
+def test_batches_that_processes_read(network: Any) -> None:
+    """In a dense network, where agents hear each other by them."""
+    run_of_three = {"dt": 0.01, "duration": 3, "processes": 3, "start": "zero"}
+    dense = {"agents": 24, "graphs": {"all": {"complete": True}}, "switching": {"generator": [[0]]}}
+    record = new_record(network.experiment(**dense, run=run_of_three))
+    run, other = record.run.bytes, bytes(16)
+    good = {"agent": 12, "step": 3, "mode": 1, "state": np.zeros(2)}
+    bad: list[dict[str, Any]] = [{"agent": 25}, {"step": 2**40}, {"mode": 2}, {"state": np.array([0, np.nan])}]
+    forged = [encode_batch(run, [AgentState(0, run, **(good | fields)).encode()]) for fields in bad]
+    forged += [encode_batch(other, [AgentState(0, other, **good).encode()]), b"\0\1\0\0"]
+    trajectory, _, refused = run_beside(network, record, [("states", data) for data in forged], of_batches=4)
+    unharmed(record, trajectory)
+    for node in ("agent_1", "agent_9", "agent_17", "recorder"):
+        assert refused[node, "states", "unknown agent"] == 1
+        assert refused[node, "states", "other run"] == 1
+        assert refused[node, "states", "undecodable"] == 1
+    for node in ("agent_1", "agent_8", "agent_17", "agent_24"):  # whoever hears agent 12
+        assert refused[node, "agent_12/state", "a step that a peer cannot have reached"] == 1
+        assert refused[node, "agent_12/state", "unknown mode"] == 1
+        assert refused[node, "agent_12/state", "not finite"] == 1
+
+
 @pytest.mark.parametrize("pace", PACES)
 def test_absurd_fields(network: Any, pace: str, rng: random.Random) -> None:
     """2,000 of each kind, half of them while the run goes on."""

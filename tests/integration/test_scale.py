@@ -6,11 +6,14 @@ import contextlib
 import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from msg_agents.processes.environment import node_environment
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 
@@ -45,6 +48,70 @@ def test_a_killed_process_of_many_agents_comes_back(network: Any) -> None:
     assert (len(result["restarts"]), result["failures"]) == (1, []), stderr
     outcome = check(read_bag(result["bag"]))
     assert (outcome.difference, outcome.missing) == (None, 0)
+
+
+def complete(agents: int) -> dict[str, Any]:
+    """Everybody hears everybody, or those on a ring."""
+    return {"agents": agents, "graphs": {"all": {"complete": True}, "ring": {"cycle": [*range(1, agents + 1)]}}}
+
+
+def first_third_hears_all(agents: int) -> dict[str, Any]:
+    """Of three processes, the first hears the agents of both others, and they hear only those of the first."""
+    third = agents // 3
+    links = [[i, j] for i in range(1, third + 1) for j in range(i + 1, agents + 1)]
+    return {"agents": agents, "graphs": {"third": {"edges": links}, "path": {"path": [*range(1, third + 1)]}}}
+
+
+@pytest.mark.parametrize(
+    ("experiment", "processes"),
+    [(complete(24), 3), (first_third_hears_all(24), 3), (complete(18), "one_per_agent")],
+    ids=["24 in 3", "a third", "18 in 18"],
+)
+def test_processes_that_hear_most_of_a_network(network: Any, experiment: Any, processes: Any) -> None:
+    """A process is killed and comes back: all is there, and as the twin says."""
+    run = {"duration": 30 if processes == 3 else 10, "start": "zero", "processes": processes, "replicas": 16}
+    process = network.record(network.file(**experiment, run=run), "--restarts", "1", "--json")
+    network.wait_until_moving()
+    network.processes("agent")[-1].kill()
+    result = network.completed(process)
+    assert (len(result["restarts"]), result["strangers"]) == (1, [])
+
+
+@pytest.mark.parametrize(
+    ("experiment", "of_batches", "of_first", "of_last"),
+    [(complete(24), [1, 9, 17], [], []), (first_third_hears_all(24), [1], [*range(9, 25)], [])],
+    ids=["all", "a third"],
+)
+def test_who_reads_batches(
+    network: Any, domain: int, experiment: Any, of_batches: list[int], of_first: list[int], of_last: list[int]
+) -> None:
+    """Processes that hear most of the network, on the node of their first agent, and no topic of single agents."""
+    wanted = {
+        "/states": sorted(["recorder", *(f"agent_{i}" for i in of_batches)]),
+        "/agent_1/state": sorted(f"agent_{i}" for i in of_first),
+        "/agent_24/state": sorted(f"agent_{i}" for i in of_last),
+    }
+    run = network.record(network.file(**experiment, run={"duration": 10_000, "processes": 3}), "--domain", str(domain))
+    network.wait_until_moving()
+    command = [sys.executable, "-P", "-c", READERS, json.dumps(wanted)]
+    visitor = subprocess.run(
+        command, env=node_environment(domain), capture_output=True, text=True, timeout=60, check=False
+    )
+    run.terminate()
+    run.communicate(timeout=60)
+    assert json.loads(visitor.stdout) == wanted, visitor.stderr
+
+
+READERS = """
+import json, sys, time, rclpy
+wanted, found, end = json.loads(sys.argv[1]), {}, time.monotonic() + 20
+rclpy.init()
+node = rclpy.create_node("visitor")
+while found != wanted and time.monotonic() < end:
+    time.sleep(0.1)
+    found = {topic: sorted(r.node_name for r in node.get_subscriptions_info_by_topic(topic)) for topic in wanted}
+print(json.dumps(found))
+"""
 
 
 def cores_of(pid: int) -> set[int]:

@@ -34,14 +34,14 @@ from std_msgs.msg import String
 from msg_agents.nodes.ros.qos import ros_profile
 from msg_analysis.wire.topics import LATCHED, STREAM
 
-AGENTS, PROCESSES = 5, 2
+AGENTS, PROCESSES, OF_BATCHES = int(sys.argv[3]), 2, int(sys.argv[4])
 latched, stream = ros_profile(LATCHED), ros_profile(STREAM)
 rclpy.init()
 node = rclpy.create_node("stranger", enable_rosout=False)
 kinds = dict.fromkeys(("progress", "end", "epoch", "resend"), Progress)
 kinds |= {"graph": ActiveGraph, "experiment": String, "states": StateBatch}
 readers = {"graph": PROCESSES + 1, "progress": 1, "end": PROCESSES + 1, "epoch": PROCESSES, "experiment": 1}
-readers |= {"resend": PROCESSES, "states": 1}
+readers |= {"resend": PROCESSES, "states": OF_BATCHES}
 messages = [line.split() for line in Path(sys.argv[1]).read_text().splitlines()]
 recorder = "agent_1/state" in dict(messages)  # it reads the agents' own topics when it sees a stranger on this one
 readers |= {f"agent_{i}/state": recorder + 1 for i in (1, 2, 3, 5)}  # the neighbour in the other process
@@ -71,18 +71,23 @@ Refused = Counter[tuple[str, str, str]]
 
 
 def run_beside(
-    network: Any, record: RunRecord, early: Sequence[Forgery], meanwhile: Sequence[Forgery] = ()
+    network: Any,
+    record: RunRecord,
+    early: Sequence[Forgery],
+    meanwhile: Sequence[Forgery] = (),
+    *,
+    of_batches: int = 1,
 ) -> tuple[Trajectory, dict[str, str], Refused]:
     """Run a network of five agents in two processes while a stranger's messages meet every reader before its own.
 
-    More are sent ``meanwhile``. What comes back: trajectory, logs by process, and what was refused by (node, topic,
-    reason).
+    More are sent ``meanwhile``. In another network, only batches can be sent, for so many readers. What comes back:
+    trajectory, logs by process, and what was refused by (node, topic, reason).
     """
     directory: Path = network.directory
     (directory / "forged").write_text("".join(f"{topic} {data.hex()}\n" for topic, data in [*early, *meanwhile]))
     with (
         free_domain() as domain,
-        _stranger(directory / "forged", len(early), node_environment(domain)),
+        _stranger([directory / "forged", len(early), record.experiment.agents, of_batches], node_environment(domain)),
         network_awaiting("referee", record, directory, domain) as nodes,
     ):
         network.wait_for(lambda: not nodes.running or nodes.failures, 90, "the end of the run")
@@ -93,8 +98,8 @@ def run_beside(
 
 
 @contextmanager
-def _stranger(file: Path, early: int, environment: dict[str, str]) -> Iterator[None]:
-    command = [sys.executable, "-P", "-c", STRANGER, str(file), str(early)]
+def _stranger(arguments: Sequence[Path | int], environment: dict[str, str]) -> Iterator[None]:
+    command = [sys.executable, "-P", "-c", STRANGER, *map(str, arguments)]
     with subprocess.Popen(command, env=environment) as process:
         try:
             yield

@@ -91,7 +91,8 @@ STATE = Topic(
 TRUTH = Topic(f"agent_{_NUMBER}/truth", schemas.AGENT_STATE, STREAM, "agent", "live", recorded=True)
 # The same messages for the recorder, which records them under the topics above: many in one message, since each message
 # costs a reader as much as recording a hundred states. The first agent of every process publishes them.
-STATES = Topic("states", schemas.STATE_BATCH, STREAM, "agent", "recorder")
+# Processes that hear most of the network read STATES as well.
+STATES = Topic("states", schemas.STATE_BATCH, STREAM, "agent", "recorder, agents of dense networks")
 TRUTHS = Topic("truths", schemas.STATE_BATCH, STREAM, "agent", "recorder")
 PROGRESS = Topic("progress", schemas.PROGRESS, LATCHED, "agents, recorder", "switcher")
 RESEND = Topic("resend", schemas.PROGRESS, LATCHED, "agents", "agents")

@@ -9,8 +9,10 @@ the agent that is furthest behind is ahead of none, and all that it waits for ha
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from operator import itemgetter
+from typing import Any, Self
 
 from msg_agents.stepping.agent_inputs import AgentInputs, Value
 from msg_analysis.wire.refusals import Refusal
@@ -34,20 +36,42 @@ class _Known:
     last: int
 
 
+@dataclass(frozen=True, slots=True)
+class _Uses:
+    """The places in a row of the values that a step uses."""
+
+    flags: tuple[bool, ...]  # by place, whether it is one of them
+    pick: Callable[[list[Any]], Sequence[Any]] = field(compare=False)  # the values of a row that are used
+
+    @classmethod
+    def of(cls, places: Sequence[int], peers: int) -> Self:
+        """These places, ascending, of so many."""
+        flags = tuple(place in set(places) for place in range(peers))
+        if len(places) > 1:
+            return cls(flags, itemgetter(*places))
+        first = places[0] if places else 0
+        return cls(flags, itemgetter(slice(first, first + len(places))))  # a list, too, of none or one
+
+
 class Synchronizer(AgentInputs[Value]):
     """The lockstep of one agent; it may be ``window`` steps (>= 0) ahead of a peer. Other options as in AgentInputs."""
 
     def __init__(self, *, window: int = LOCKSTEP_WINDOW, **options: Any) -> None:
         super().__init__(**options)
         self._window = window
-        self._buffers: dict[int, dict[int, Value]] = {j: {} for j in self._newest}
+        self._places = {j: place for place, j in enumerate(self._newest)}  # of the peers in a row
+        # The values of a step are in the row (step modulo the number of rows): None where there is none. The rows are
+        # those of the last steps, for which values are kept, and of those to come.
+        self._number_of_rows = KEPT_AFTER_USE + window + 2
+        self._rows: list[list[Value | None]] = [[None] * len(self._places) for _ in range(self._number_of_rows)]
+        self._uses = [_Uses.of([self._places[j] for j in row], len(self._places)) for row in self._inputs]
         self._limit = window - 1 if self._newest else self.steps
         self._known: deque[_Known] = deque()
         # Number of the next sojourn; None: any, since a process that takes over starts in the middle.
         self._sequence: int | None = 0 if self.step == 0 else None
         self._unplanned = self.step  # first step whose graph is not known
         self._mode = 0  # of the next step, if its graph is known
-        self._needed: tuple[int, ...] = ()  # by the next step
+        self._needed: _Uses | None = None  # by the next step
         self._missing = 1  # of them; never 0 while the graph is not known
 
     def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
@@ -73,31 +97,36 @@ class Synchronizer(AgentInputs[Value]):
 
     def offer(self, agent: int, step: int, value: Value) -> str | None:
         """Take x_agent(step); None if taken, else a ``Refusal``."""
-        buffer = self._buffers.get(agent)
-        if buffer is None:
+        place = self._places.get(agent)
+        if place is None:
             return Refusal.NOT_A_PEER
-        if step < self.step or step in buffer:
+        ahead = step - self.step
+        if ahead > self._window + 1:
+            return Refusal.TOO_NEW
+        row = self._rows[step % self._number_of_rows]
+        known = row[place] if ahead >= -KEPT_AFTER_USE else None
+        if ahead < 0 or known is not None:
             # Also of a peer that is behind: its value is of no use, but it shows the progress of the peer.
-            if step in buffer and buffer[step] != value:
+            if known is not None and known != value:
                 return Refusal.CONTRADICTION
-            if step < self.step - self._window - RESEND_LIMIT:
+            if ahead < -self._window - RESEND_LIMIT:
                 return Refusal.TOO_OLD
             if step <= self._newest[agent]:
                 return Refusal.REPEATED
             self._newest[agent] = step
             return None
-        if step > self.step + self._window + 1:
-            return Refusal.TOO_NEW
-        buffer[step] = value
+        row[place] = value
         if step > self._newest[agent]:
             self._newest[agent] = step
-        if step == self.step and agent in self._needed:
+        if not ahead and self._needed and self._needed.flags[place]:
             self._missing -= 1
         return None
 
     def known(self, agent: int, step: int) -> Value:
         """x_agent(step), which was taken not long ago."""
-        return self._buffers[agent][step]
+        value = self._row(step)[self._places[agent]]
+        assert value is not None
+        return value
 
     def ready(self) -> bool:
         """Whether the next step can be made now."""
@@ -105,14 +134,13 @@ class Synchronizer(AgentInputs[Value]):
 
     def inputs(self) -> tuple[int, list[Value]]:
         """Mode of the step that is ready, and the states x_j(step) of the agents that its row uses, j ascending."""
-        step, buffers = self.step, self._buffers
-        return self._mode, [buffers[j][step] for j in self._needed]
+        assert self._needed is not None
+        return self._mode, list(self._needed.pick(self._rows[self.step % self._number_of_rows]))
 
     def advance(self) -> None:
         """Move on to x(step + 1): the step that was ready has been made."""
         step = self.step
-        for buffer in self._buffers.values():
-            buffer.pop(step - KEPT_AFTER_USE, None)
+        self._rows[(step - KEPT_AFTER_USE) % self._number_of_rows] = [None] * len(self._places)
         self.step = step + 1
         if self._known[0].last <= step:
             self._known.popleft()
@@ -121,14 +149,14 @@ class Synchronizer(AgentInputs[Value]):
     def _plan(self) -> None:
         """Find out which agents the next step needs, and count those whose state is missing."""
         if not self._known or self.step >= self.steps:
-            self._needed, self._missing = (), 1
+            self._needed, self._missing = None, 1
             return
         self._mode = self._known[0].mode
-        self._needed = self._inputs[self._mode]
-        self._missing = 0
-        for j in self._needed:
-            if self.step not in self._buffers[j]:
-                self._missing += 1
+        self._needed = self._uses[self._mode]
+        self._missing = self._needed.pick(self._rows[self.step % self._number_of_rows]).count(None)
+
+    def _row(self, step: int) -> list[Value | None]:
+        return self._rows[step % self._number_of_rows]
 
     def _within_window(self) -> bool:
         self._limit = min(self._newest.values()) + self._window
@@ -141,15 +169,25 @@ class Synchronizer(AgentInputs[Value]):
         if not self._known:
             return f"the graph of step {self.step}"
         inputs = self._inputs[self._known[0].mode]
-        missing = [j for j in inputs if self.step not in self._buffers[j]]
+        missing = [j for j in inputs if self._row(self.step)[self._places[j]] is None]
         if missing:
             return f"step {self.step} of " + ", ".join(f"agent {j + 1}" for j in missing)
-        behind = [j for j, newest in self._newest.items() if newest + self._window < self.step]
-        if behind:
+        if behind := self._behind():
             return "agents too far behind: " + ", ".join(f"{j + 1}" for j in behind)
         return "nothing"
+
+    def lacking(self) -> list[int]:
+        """Peers of which it lacks a state, as far as it knows what the next step needs."""
+        needed = self._needed.flags if self._needed else ()
+        row = self._row(self.step)
+        missing = [j for j, flag, value in zip(self._places, needed, row, strict=False) if flag and value is None]
+        return sorted({*missing, *self._behind()})
+
+    def _behind(self) -> list[int]:
+        return [j for j, newest in self._newest.items() if newest + self._window < self.step]
 
     @property
     def buffered(self) -> int:
         """Most values held of any one peer for steps to come; never more than window + 2."""
-        return max((sum(k >= self.step for k in buffer) for buffer in self._buffers.values()), default=0)
+        to_come = [self._row(self.step + ahead) for ahead in range(self._window + 2)]
+        return max((sum(value is not None for value in values) for values in zip(*to_come, strict=True)), default=0)

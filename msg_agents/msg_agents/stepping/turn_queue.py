@@ -22,12 +22,18 @@ class TurnQueue:
     """Gives turns in the order in which they were asked for, once all ``members`` (a number) have joined.
 
     A step of one agent lets others step, and theirs others again: the queue replaces nested calls, which would go as
-    deep as the run is long. ``defer`` runs a callback after what is already waiting in the executor.
+    deep as the run is long.
     """
 
-    def __init__(self, members: int, defer: Callable[[Callable[[], None]], object]) -> None:
+    def __init__(
+        self,
+        members: int,
+        defer: Callable[[Callable[[], None]], object],  # runs a callback after what is already waiting in the executor
+        after: Callable[[], None] = lambda: None,  # is called when turns have been given
+    ) -> None:
         self._absent = members
         self._defer = defer
+        self._after = after
         self._queue: deque[Member] = deque()
         self._given = True  # turns are being given, or will be: ``ask`` need not start that
 
@@ -50,6 +56,8 @@ class TurnQueue:
         while queue:
             queue.popleft().advance()
             if time.monotonic() > until and queue:
+                self._after()
                 self._defer(self._give)
                 return
+        self._after()
         self._given = False

@@ -310,6 +310,21 @@ def test_another_value_is_noticed_for_as_long_as_the_true_one_can_take() -> None
     assert node.buffered == 0
 
 
+def test_whose_states_are_lacking() -> None:
+    """Those that the next step needs, and those that are too far behind; before the graph is known only these."""
+    node: Synchronizer[str] = Synchronizer(agent=0, steps=9, inputs=[[1, 2], [2], []], peers=[1, 2, 4], window=1)
+    assert node.lacking() == []
+    node.learn(0, 0, 0, 0)
+    assert node.lacking() == [1, 2]
+    node.offer(1, 0, "0")
+    assert node.lacking() == [2]
+    node.offer(2, 0, "0")
+    node.learn(1, 2, 1, 8)  # nobody is heard
+    make_step(node)
+    assert not node.ready()
+    assert node.lacking() == [4]  # which has not begun
+
+
 def test_what_is_long_past_is_no_repetition() -> None:
     node: Synchronizer[str] = Synchronizer(
         agent=0, steps=10**6, inputs=[[1]], peers=[1], start=RESEND_LIMIT + 100, window=LOCKSTEP_WINDOW

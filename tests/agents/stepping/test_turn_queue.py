@@ -25,10 +25,14 @@ class Player:
 class Game:
     def __init__(self, players: int, length: int) -> None:
         self.deferred: list[Callable[[], None]] = []
-        self.turns = TurnQueue(players, self.deferred.append)
+        self.turns = TurnQueue(players, self.deferred.append, self.end)
         self.seen: list[int] = []
+        self.ended: list[int] = []  # how many turns had been given when no more were
         self.length = length
         self.players = [Player(self, number) for number in range(players)]
+
+    def end(self) -> None:
+        self.ended.append(len(self.seen))
 
 
 def test_nobody_before_all_have_joined() -> None:
@@ -41,6 +45,7 @@ def test_nobody_before_all_have_joined() -> None:
     assert game.seen == [2, 2, 0, 1]
     game.turns.ask(game.players[1])
     assert game.seen == [2, 2, 0, 1, 1]
+    assert game.ended == [4, 5]
     assert game.deferred == []
 
 
@@ -68,6 +73,7 @@ def test_the_middleware_gets_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(game.seen) == before
         game.deferred.pop()()
         assert len(game.seen) == before + 1
+        assert game.ended[-1] == before + 1
         assert len(game.deferred) <= 1
         slices += 1
         if slices == 4:

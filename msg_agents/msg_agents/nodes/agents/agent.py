@@ -29,6 +29,7 @@ from msg_analysis.wire.topics import Qos, agent_name
 
 RETURN_TIME = 2.0  # s for which states are not repeated yet, because a reader is missing
 RETURN_POLL = 0.02  # s
+ANSWER_PERIOD = 0.5  # s between two repetitions of states for peers
 
 
 class Group(Protocol):
@@ -58,6 +59,12 @@ class Group(Protocol):
     def ask_again(self, agent: int, step: int) -> None:
         """See AgentGroup."""
 
+    def reached(self) -> frozenset[str]:
+        """See AgentGroup."""
+
+    def hears_all(self) -> bool:
+        """See AgentGroup."""
+
     def fail(self, error: Exception) -> None:
         """See AgentGroup."""
 
@@ -70,6 +77,7 @@ class Agent(NetworkNode):
     """
 
     hears: Qos | None = None  # of its subscriptions to the states of others; None: that of the topic
+    hears_batches = False  # whether it may hear them by the batches of their processes instead
 
     def __init__(
         self,
@@ -96,19 +104,25 @@ class Agent(NetworkNode):
         self._inputs = [self._law.neighbours(mode) for mode in range(model.modes)]
         self._peers = list(peers)
         near = set(peers).intersection(colleagues)
-        self._far = [j for j in peers if j not in near]
+        self.far = [j for j in peers if j not in near]
         self._near = [j for j in peers if j in near]
         self._listeners: list[Callable[[int, int, int, bytes, bytes], str | None]] = []
         # The recorder reads the batches of the process instead.
-        self._expected = [*map(agent_name, self._far), *(name for name in readers if name != RECORDER)]
+        self._expected = [*map(agent_name, self.far), *(name for name in readers if name != RECORDER)]
         self._next_progress = 0.0
         self._stall = StallDetector()
         self._far_states: list[Subscription] = []
         self._owed: int | None = None  # step from which on states are to be repeated
+        self._answered = -ANSWER_PERIOD  # time at which they were repeated last [s of the monotonic clock]
         self._states = self.publisher_of(topics.STATE, agent)
         self._truth: Publisher | None = None
         if experiment.truth:
             self._truth = self.publisher_of(topics.TRUTH, agent)
+
+    @property
+    def number(self) -> int:
+        """Its number, from 1."""
+        return self._law.agent + 1
 
     @property
     def step(self) -> int:
@@ -116,9 +130,12 @@ class Agent(NetworkNode):
         return self._law.step
 
     def connect(self, colleagues: Mapping[int, Agent]) -> None:
-        """Connect to the peers: agents of this process (by index) by direct calls, the others by topics."""
+        """Connect to the peers in this process (by index) by direct calls."""
         self._listeners = [colleagues[j].hear for j in self._near]
-        for j in self._far:
+
+    def subscribe_to_far(self) -> None:
+        """Connect to the peers in other processes by their topics."""
+        for j in self.far:
             self._far_states.append(self.subscribe(topics.STATE, self._receiver(j), agent=j, qos=self.hears))
 
     def create_shared(self, agents: Sequence[Agent]) -> None:
@@ -126,13 +143,20 @@ class Agent(NetworkNode):
 
     def discovered_all(self) -> bool:
         """See NetworkNode. One that comes back will ask for messages at once, so it must be ready for them."""
-        if self.resumed and not all(states.get_publisher_count() for states in self._far_states):
+        if self.resumed and not (
+            all(states.get_publisher_count() for states in self._far_states) and self._group.hears_all()
+        ):
             return False
-        return self.has_readers(self._states, self._expected) and not self._group.missing_recorder()
+        return self.has_readers(self._states, self._awaited()) and not self._group.missing_recorder()
 
     def missing_nodes(self) -> list[str]:
         """See NetworkNode."""
-        return self.missing_readers(self._states, self._expected) + self._group.missing_recorder()
+        return self.missing_readers(self._states, self._awaited()) + self._group.missing_recorder()
+
+    def _awaited(self) -> list[str]:
+        """Names of the nodes that must read its topic: not those that its batches reach."""
+        reached = self._group.reached()
+        return [name for name in self._expected if name not in reached] if reached else self._expected
 
     def finish(self, *, complete: bool, deadline: float) -> None:
         """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""
@@ -146,7 +170,7 @@ class Agent(NetworkNode):
         if self._published.found:
             # All that is kept, for the recorder and for readers outside the run; peers have what is older.
             self._repeat(0, heard_since=0 if self.has_other_readers(self._states) else self._missed_since())
-            self._ask_again()
+            self._ask_again(self.far)
         if not self._law.step:
             self._publish_state(0)
         self._report()
@@ -199,7 +223,8 @@ class Agent(NetworkNode):
     def send_again(self, since: int) -> None:
         """Repeat the states from step ``since`` on, for a peer that may have missed them, once all readers are there.
 
-        One that has come back, and asks, may not have been matched yet. Requests are latched, and may be old.
+        One that has come back, and asks, may not have been matched yet. Requests are latched, and may be old. In a
+        dense network that has stood still, many ask: they are answered together.
         """
         since = max(since, self._missed_since())
         if self._owed is not None:
@@ -209,9 +234,12 @@ class Agent(NetworkNode):
         self._send_owed(time.monotonic() + RETURN_TIME)
 
     def _send_owed(self, deadline: float) -> None:
-        if time.monotonic() < deadline and not self.has_readers(self._states, self._expected):
+        now = time.monotonic()
+        too_soon = now < self._answered + ANSWER_PERIOD
+        if too_soon or (now < deadline and not self.has_readers(self._states, self._awaited())):
             after(self, RETURN_POLL, partial(self._send_owed, deadline))
             return
+        self._answered = now
         since, self._owed = self._owed, None
         assert since is not None
         self._repeat(since)
@@ -227,10 +255,11 @@ class Agent(NetworkNode):
             self._send(step, frame[2], frame[3], message, heard=step >= heard_since)
         self._group.send_batches()
 
-    def _ask_again(self) -> None:
-        """Ask the peers in other processes for states that may have been missed."""
-        for j in self._far:
-            self._group.ask_again(j, self._missed_since())
+    def _ask_again(self, agents: Sequence[int]) -> None:
+        """Ask those of these agents that are in other processes for states that may have been missed."""
+        for j in agents:
+            if j not in self._near:
+                self._group.ask_again(j, self._missed_since())
 
     def _missed_since(self) -> int:
         """The first step whose state a peer may still need after a restart, of this agent or of itself."""

@@ -8,9 +8,11 @@ from pathlib import Path
 from rclpy.publisher import Publisher
 
 from msg_agents.nodes.agents.agent import Agent
+from msg_agents.nodes.agents.batch_links import BatchLinks, Listener, hears_most
 from msg_agents.nodes.agents.lockstep_agent import LockstepAgent
 from msg_agents.nodes.agents.realtime_agent import RealtimeAgent
 from msg_agents.nodes.agents.state_batches import StateBatches
+from msg_agents.nodes.network_node import NOT_AN_AGENT
 from msg_agents.processes.process_plan import RECORDER
 from msg_agents.stepping.turn_queue import TurnQueue
 from msg_analysis.model.run.record import RunRecord
@@ -38,7 +40,7 @@ class AgentGroup:
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None = None,  # directory of the published states, from which agents resume
     ) -> None:
-        self.turns = TurnQueue(len(agents), self._defer)
+        self.turns = TurnQueue(len(agents), self._defer, self._end_turns)
         self.progress_period = max(PROGRESS_PERIOD, model.agents / MOST_REPORTS)
         listens = model.listens()
         exchanges = listens | listens.T
@@ -56,20 +58,41 @@ class AgentGroup:
                 group=self,
             )
         self.nodes = list(self._agents.values())  # in the order of ``agents``
-        for agent in self.nodes:
-            agent.connect(self._agents)
         self._host = self.nodes[0]
+        self._states = StateBatches(self._host, topics.STATES)
+        self._links = BatchLinks(self._host, self._states.publisher, agents)
+        self._connect()
         self._host.create_shared(self.nodes)
         self._progress = self._host.publisher_of(topics.PROGRESS)
         self._awaits_recorder = RECORDER in readers
-        self._states = StateBatches(self._host, topics.STATES)
         self._truths = StateBatches(self._host, topics.TRUTHS) if record.experiment.truth else None
         self._resend: Publisher | None = None
+        self._sending = False  # whether ``_send_states`` will be called
+        self._asked: dict[int, int] = {}  # agents (from 0) that are to be asked for their states from a step on
         if any(agent.resumed for agent in self.nodes):  # which will ask: in time to be discovered with the rest
             self._resend = self._host.publisher_of(topics.RESEND)
         self._host.subscribe(topics.GRAPH, self._receive_graph)
         self._host.subscribe(topics.RESEND, self._receive_resend)
         self._host.finish_at_end(self.nodes)
+
+    def _connect(self) -> None:
+        listeners: dict[int, list[Listener]] = {}
+        for agent in self.nodes:
+            agent.connect(self._agents)
+            for j in agent.far:
+                listeners.setdefault(j, []).append(Listener(agent.hear, agent.refuse))
+        if not (self._host.hears_batches and self._links.listen(listeners)):
+            for agent in self.nodes:
+                agent.subscribe_to_far()
+
+    def _end_turns(self) -> None:
+        if self._links.heard and not self._sending:  # other processes wait for these states
+            self._sending = True
+            self._defer(self._send_states)  # after what has come meanwhile, which may let others step
+
+    def _send_states(self) -> None:
+        self._sending = False
+        self._states.send()
 
     def _defer(self, callback: Callable[[], None]) -> None:
         self._host.executor.create_task(callback)
@@ -113,16 +136,36 @@ class AgentGroup:
         self._host.publish(self._progress, self._host.progress(topics.PROGRESS, agent + 1, step))
 
     def ask_again(self, agent: int, step: int) -> None:
-        """Ask an agent of another process (index from 0) for its states from a step on."""
+        """Ask an agent of another process (index from 0) for its states from a step on, once for all that hear it."""
+        if not self._asked:
+            self._defer(self._send_requests)
+        self._asked[agent] = min(step, self._asked.get(agent, step))
+
+    def _send_requests(self) -> None:
+        asked, self._asked = self._asked, {}
         if self._resend is None:  # rarely needed; latched, so a late discovery only takes its time
             self._resend = self._host.publisher_of(topics.RESEND)
-        self._host.publish(self._resend, self._host.progress(topics.RESEND, agent + 1, step))
+        if hears_most(len(asked), self._host.record.experiment.agents - len(self.nodes)):
+            self._host.publish(self._resend, self._host.progress(topics.RESEND, NOT_AN_AGENT, min(asked.values())))
+            return
+        for agent, step in asked.items():
+            self._host.publish(self._resend, self._host.progress(topics.RESEND, agent + 1, step))
+
+    def reached(self) -> frozenset[str]:
+        """Names of the agents of other processes that hear those of this one by batches."""
+        return self._links.reached()
+
+    def hears_all(self) -> bool:
+        """Whether all processes that this one hears by batches have been discovered."""
+        return self._links.hears_all()
 
     def _receive_resend(self, data: bytes) -> None:
         request = self._host.decode_progress(data, topics.RESEND)
-        agent = request and self._agents.get(request.agent - 1)
-        if request and agent:
-            agent.send_again(request.step)
+        if request is None:
+            return
+        for agent in self.nodes:
+            if request.agent in (NOT_AN_AGENT, agent.number):
+                agent.send_again(request.step)
 
     def _receive_graph(self, data: bytes) -> None:
         self._host.rules.forget(min(agent.step for agent in self.nodes))

@@ -18,6 +18,8 @@ from msg_analysis.wire.refusals import Refusal
 class LockstepAgent(Agent):
     """Connects topics, synchronizer and law; options as in Agent."""
 
+    hears_batches = True
+
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._turns = self._group.turns
@@ -54,7 +56,7 @@ class LockstepAgent(Agent):
             )  # the others have started without this one
         elif overdue:
             self.get_logger().warning(f"no step for {stall.stalled:.0f} s at step {step}: waiting for {waiting}")
-            self._ask_again()
+            self._ask_again(self._synchronizer.lacking())
         return Health(f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting})
 
     def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002

@@ -1,4 +1,7 @@
-"""The states of the agents of a process on their way to the recorder: few messages with many states each."""
+"""The states of the agents of a process on their way to the recorder: few messages with many states each.
+
+Processes that hear most of a network read them, too: see ``batch_links``.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ class StateBatches:
 
     def __init__(self, node: NetworkNode, topic: Topic) -> None:
         self._node = node
-        self._publisher: Publisher = node.publisher_of(topic)
+        self.publisher: Publisher = node.publisher_of(topic)
         self._messages: list[bytes] = []
         self._size, self._due = 0, 0.0
         self._found = False
@@ -46,9 +49,9 @@ class StateBatches:
             batch = encode_batch(self._node.run, self._messages)
             self._messages.clear()
             self._size = 0
-            self._node.publish(self._publisher, batch)
+            self._node.publish(self.publisher, batch)
 
     def missing_nodes(self) -> list[str]:
         """The recorder, until it has been discovered."""
-        self._found = self._found or self._node.has_readers(self._publisher, [RECORDER])
+        self._found = self._found or self._node.has_readers(self.publisher, [RECORDER])
         return [] if self._found else [RECORDER]
