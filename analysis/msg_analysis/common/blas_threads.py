@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
+SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+"""Environment of processes whose arithmetic is too small for threads: they would only compete for the cores."""
+
 LARGE = 500  # smallest number of agents with which more than one thread pays on a quiet machine
 
 

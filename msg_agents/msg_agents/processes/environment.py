@@ -8,12 +8,11 @@ import warnings
 from pathlib import Path
 
 from msg_agents.discovery.profiles import LOOPBACK_PROFILE, UDP_PROFILE
+from msg_analysis.common.blas_threads import SINGLE_THREAD
 from msg_analysis.errors import InputError
 
 TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
 RESTARTS = 3  # of killed processes in a run, by default
-# The arithmetic of one agent is far too small for threads, which would only compete for the cores.
-SINGLE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
 DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
 SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"

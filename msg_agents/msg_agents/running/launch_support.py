@@ -12,12 +12,12 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from msg_agents.processes.environment import SINGLE_THREAD
 from msg_agents.processes.process_plan import ProcessPlan, plan_network
 from msg_agents.running.experiment_overrides import load_with_overrides
 from msg_agents.running.run_folder import make_bag_directory, workshop
 from msg_agents.running.runner import REPORT_FILE
 from msg_agents.running.supervisor import failure_of
+from msg_analysis.common.blas_threads import SINGLE_THREAD
 from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment

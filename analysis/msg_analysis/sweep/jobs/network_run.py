@@ -20,14 +20,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from msg_analysis.common.blas_threads import SINGLE_THREAD
 from msg_analysis.common.forked_processes import ForkServer, Process
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.job import Job, NetworkOptions, NetworkStoppedError
 
 PROGRAM = "msg-agents"
 RUN_SERVER = "msg_agents.cli.run_server"
-# There is a worker for every core, or the agents of a network need the cores.
-SINGLE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 POLL = 0.1  # s
 # Signals, and the seconds that a run then has to end: it ends its own processes in order.
 ESCALATION = ((signal.SIGINT, 30.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 5.0))
@@ -119,7 +118,8 @@ def _start(program: str, arguments: Sequence[str], descriptors: Sequence[int]) -
     """Start the command; the descriptors are for its stdout, its stderr and the slot."""
     # In a session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The slot is
     # inherited: if this worker is killed, the next network waits until this one has ended.
-    if forked := _fork_server(program).fork([({"arguments": arguments, "parent": os.getpid()}, descriptors)]):
+    server = _fork_server(program)
+    if server and (forked := server.fork([({"arguments": arguments, "parent": os.getpid()}, descriptors)])):
         return forked[0]
     stdout, stderr, slot = descriptors
     return subprocess.Popen(
@@ -133,9 +133,11 @@ def _start(program: str, arguments: Sequence[str], descriptors: Sequence[int]) -
 
 
 @functools.cache
-def _fork_server(program: str) -> ForkServer:
-    """What forks the runs of this worker. It is there until the worker ends, and ends with it."""
-    python = _interpreter(Path(program)) or sys.executable
+def _fork_server(program: str) -> ForkServer | None:
+    """What forks the runs of this worker, until the worker ends; None where the program is no script of Python."""
+    python = _interpreter(Path(program))
+    if python is None:
+        return None
     return ForkServer([python, "-P", "-m", RUN_SERVER], {**os.environ, **SINGLE_THREAD}).__enter__()
 
 

@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from msg_analysis.common.blas_threads import one_blas_thread
+from msg_analysis.common.blas_threads import SINGLE_THREAD, one_blas_thread
 from msg_analysis.common.cores import count_cores
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.software import installed_software
@@ -45,7 +45,6 @@ _QUIET = {
     "distributed.admin.system-monitor.interval": "10s",
     "distributed.admin.tick.interval": "1s",
 }
-_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 _NEEDED = ("msg_analysis.theory.prediction", "msg_analysis.inference.verdict.compare", "msg_analysis.twin.simulate")
 
 # What is done with an item; the second argument says whether the work is being ended.
@@ -72,7 +71,7 @@ def warm_up() -> None:
         return
     from multiprocessing import forkserver
 
-    with _environment(dict.fromkeys(_THREADS, "1")), _ignoring(signal.SIGINT):
+    with _environment(SINGLE_THREAD), _ignoring(signal.SIGINT):
         multiprocessing.get_context("forkserver").set_forkserver_preload(["distributed", *_NEEDED])
         forkserver.ensure_running()
 

@@ -58,6 +58,7 @@ class BatchLinks:
         self._graphs = len(host.record.experiment.graph_list)
         self._listeners: Mapping[int, Sequence[Listener]] = {}
         self._subscription: Subscription | None = None
+        self.heard = False  # whether agents of other processes have ever been found to hear this one by batches
         self._reached: frozenset[str] = frozenset()
         self._looked = -FRESH
 
@@ -69,17 +70,13 @@ class BatchLinks:
         self._subscription = self._host.subscribe(STATES, self._receive)
         return True
 
-    @property
-    def heard(self) -> bool:
-        """Whether agents of other processes hear those of this one by batches, as far as is known."""
-        return bool(self._reached)
-
     def reached(self) -> frozenset[str]:
         """Names of the agents of other processes whose process reads the batches of this one."""
         now = time.monotonic()
         if len(self._others) >= FEWEST and now >= self._looked + FRESH:
             self._looked = now
             self._reached = self._find_reached()
+            self.heard = self.heard or bool(self._reached)
         return self._reached
 
     def _find_reached(self) -> frozenset[str]:
