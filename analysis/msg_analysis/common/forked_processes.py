@@ -6,6 +6,7 @@ may end, or be killed, at any time.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
@@ -153,8 +154,9 @@ class ForkServer:
         self.stop()
         if self._adopted is False:
             adopt_orphans(adopt=False)
-        if self._log.is_file() and not self._log.stat().st_size:
-            self._log.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            if self._log.is_file() and not self._log.stat().st_size:
+                self._log.unlink()
 
 
 def _messages(requests: Sequence[Request]) -> Iterator[tuple[bytes, list[int]]]:

@@ -115,7 +115,10 @@ def _wake(environment: Mapping[str, str], control: socket.socket, output: IO[byt
     with theirs:
         if len(message) > LONGEST:
             return None
-        socket.send_fds(theirs, [message], [control.fileno(), output.fileno()])
+        try:
+            socket.send_fds(theirs, [message], [control.fileno(), output.fileno()])
+        except OSError:  # it has been killed
+            return None
     return ForkedProcess(pid)
 
 
