@@ -165,11 +165,11 @@ class NetworkNode(LeanNode):
         # Reading the names inspects every endpoint of the network: only once enough readers are there.
         return publisher.get_subscription_count() >= len(expected) and not self.missing_readers(publisher, expected)
 
-    def has_other_readers(self, publisher: Publisher) -> bool:
-        """Whether a node that is not part of the run reads a topic of this node reliably."""
+    def has_other_readers(self, publisher: Publisher, *, reliable: bool = True) -> bool:
+        """Whether a node that is not part of the run reads a topic of this node, reliably or with best effort."""
         own = {RECORDER, *map(agent_name, range(self.record.experiment.agents))}
         return any(
-            reader.node_name not in own and reader.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+            reader.node_name not in own and (reader.qos_profile.reliability == ReliabilityPolicy.RELIABLE) == reliable
             for reader in self.get_subscriptions_info_by_topic(publisher.topic_name)
         )
 

@@ -29,6 +29,7 @@ from msg_analysis.wire.topics import Qos, agent_name
 
 RETURN_TIME = 2.0  # s for which states are not repeated yet, because a reader is missing
 RETURN_POLL = 0.02  # s
+PASSIVE_GRACE = 0.3  # s that a reader with best effort has for the last state before its writer leaves
 ANSWER_PERIOD = 0.5  # s between two repetitions of states for peers
 
 
@@ -112,6 +113,7 @@ class Agent(NetworkNode):
         self._next_progress = 0.0
         self._stall = StallDetector()
         self._far_states: list[Subscription] = []
+        self._last_sent = 0.0  # time at which the last state was sent [s of the monotonic clock]
         self._owed: int | None = None  # step from which on states are to be repeated
         self._answered = -ANSWER_PERIOD  # time at which they were repeated last [s of the monotonic clock]
         self._states = self.publisher_of(topics.STATE, agent)
@@ -161,9 +163,13 @@ class Agent(NetworkNode):
     def finish(self, *, complete: bool, deadline: float) -> None:
         """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""
         self._group.send_batches()
-        for writer in (self._states, self._truth):
-            if complete and writer is not None and self.has_other_readers(writer):
+        for writer in (self._states, self._truth) if complete else ():
+            if writer is None:
+                continue
+            if self.has_other_readers(writer):
                 writer.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
+            if self.has_other_readers(writer, reliable=False):  # it forgets what comes after the news that we have left
+                time.sleep(max(0.0, min(deadline, self._last_sent + PASSIVE_GRACE) - time.monotonic()))
 
     def begin(self) -> None:
         """Publish x(0); after a takeover, repeat what others may have missed, and ask the peers to repeat theirs."""
@@ -213,6 +219,7 @@ class Agent(NetworkNode):
         for hear in self._listeners if heard else ():
             hear(self._law.agent, step, mode, state, message)
         if step == self._last:
+            self._last_sent = time.monotonic()
             self._group.send_batches()
 
     @property
