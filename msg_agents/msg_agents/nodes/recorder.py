@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -22,6 +23,10 @@ LEAST_WRITE, MOST_WRITE = 2**15, 2**18
 """Bytes of states after which they are written: 4 kB for each agent, within these bounds. Many at once cost a fraction
 of one by one, but in longer turns the recorder delays agents on the same core."""
 WRITE_PERIOD = 0.1  # s of wall time after which fewer are written, in slow runs and at the end
+UNNAMED = "_NODE_NAME_UNKNOWN_"
+"""What ROS 2 says of a writer as long as it does not know its node: of our agents, too, in the first moments."""
+
+UNNAMED_TIME = 5.0  # s after which such a writer is taken for one of another node
 LOOK_PERIOD = 0.5  # s of wall time between two looks for other nodes that publish states
 FLUSH_PERIOD = 1.0
 """s of wall time: a killed recorder loses at most so much, even if a chunk takes longer to fill."""
@@ -52,6 +57,7 @@ class Recorder(NetworkNode):
         for kind in self._kinds:
             self.subscribe(kind.topic, self._collector(kind.add))
         self._reads_single = False  # also the agents' own topics
+        self._unnamed_since: float | None = None  # since when a writer of states has had no name
         self._progress = self.publisher_of(topics.PROGRESS)
         self.finish_at_end()
         self.bag = BagWriter(directory, recorded, record=record.to_json(), storage=storage)
@@ -75,8 +81,13 @@ class Recorder(NetworkNode):
         for kind in () if self._reads_single else self._kinds:
             name = kind.of.of(0)
             if self.count_publishers(name):
-                writers = self.get_publishers_info_by_topic(self.resolve_topic_name(name))
-                if any(writer.node_name != first for writer in writers):
+                names = {w.node_name for w in self.get_publishers_info_by_topic(self.resolve_topic_name(name))}
+                if UNNAMED not in names:
+                    self._unnamed_since = None
+                elif self._unnamed_since is None:
+                    self._unnamed_since = time.monotonic()
+                nameless = self._unnamed_since is not None and time.monotonic() > self._unnamed_since + UNNAMED_TIME
+                if nameless or names - {first, UNNAMED}:
                     self._read_single()
                     return
 
