@@ -13,13 +13,12 @@ from statistics import median
 
 import networkx as nx
 
-from msg_agents.nodes.agents.batch_links import THRESHOLD_VARIABLE
+from msg_agents.nodes.agents.batch_links import ONLY_TOPICS
 from msg_agents.running.runner import run_network
 from msg_analysis.model.experiment.experiment import ValidExperiment
 
 NETWORKS = ((24, 3, 23), (40, 4, 39), (100, 4, 6), (100, 4, 20), (100, 4, 99))  # agents, processes, neighbours
 HOPELESS = (100, 4, 99)  # with topics
-NEVER = "1000000"
 
 
 def experiment(agents: int, processes: int, neighbours: int, steps: int) -> ValidExperiment:
@@ -62,7 +61,7 @@ def main() -> None:
     print("|---:|---:|---:|---:|---:|---:|---:|")
     for network in NETWORKS:
         what = experiment(*network, arguments.steps)
-        kinds: list[dict[str, str]] = [{THRESHOLD_VARIABLE: NEVER}, {}]
+        kinds: list[dict[str, str]] = [{ONLY_TOPICS: "1"}, {}]
         found = [[measure(what, kind) for kind in kinds[network == HOPELESS :]] for _ in range(arguments.rounds)]
         starts = [f"{median(values):.1f}" for values in zip(*([s for s, _ in row] for row in found), strict=True)]
         rates = [f"{median(values):.0f}" for values in zip(*([r for _, r in row] for row in found), strict=True)]

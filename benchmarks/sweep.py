@@ -2,7 +2,8 @@
 
 First a sweep of 200 predictions at m = 50, n = 3: both what the predictions take once the workers are there, and the
 whole command from its start to its end, of which some seconds (imports, starting and ending the workers) do not shrink
-with their number. Then networks of 5 agents and 400 steps, whose verdicts and reports are included.
+with their number. Then networks of 5 agents and 400 steps with their
+verdicts; alone, also with the report, which a sweep writes only for a run that does not agree.
 """
 
 from __future__ import annotations

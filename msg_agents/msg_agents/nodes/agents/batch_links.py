@@ -19,8 +19,8 @@ from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.state_batches import decode_batch
 from msg_analysis.wire.topics import STATE, STATES, agent_name
 
-THRESHOLD_VARIABLE = "MSG_AGENTS_BATCHES_FROM"  # for comparison only
-FEWEST = int(os.environ.get(THRESHOLD_VARIABLE, "16"))
+ONLY_TOPICS = "MSG_AGENTS_ONLY_TOPICS"  # variable that turns this off where it is set, for comparison
+FEWEST = 16
 """Agents of other processes that a process must hear to read batches: below, it reads a topic of each, which is seen in
 the ROS graph, and costs little."""
 
@@ -40,7 +40,7 @@ def hears_most(far: int, others: int) -> bool:
 
     It then reads at most twice as many states as it needs, in as many messages as there are processes.
     """
-    return far >= FEWEST and 2 * far > others
+    return far >= FEWEST and 2 * far > others and ONLY_TOPICS not in os.environ
 
 
 class BatchLinks:
