@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-import scipy.linalg
 from scipy import stats
 
 from msg_analysis.inference.hypothesis_tests import innovations as module
 from msg_analysis.inference.hypothesis_tests.gain_regression import regressors
-from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations, quadratic_form
+from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
@@ -152,13 +151,3 @@ def test_replicas_with_the_same_noise_are_found():
     copied = observe()
     copied.states[:] = copied.states[:, :, :1]
     assert InnovationSums(copied).tests().p_whiteness < 1e-6
-
-
-def test_quadratic_form_ignores_dependent_and_dead_entries():
-    random = np.random.default_rng(1)
-    a = random.standard_normal((3, 3))
-    covariance, v = a @ a.T, random.standard_normal(3)
-    mix = np.vstack([np.eye(3), [[1.0, 1.0, 0.0]], np.zeros((1, 3))]) * np.array([1, 1e6, 1e-3, 5, 1])[:, None]
-    chi2, dof = quadratic_form(mix @ v, mix @ covariance @ mix.T)
-    assert dof == 3
-    assert chi2 == pytest.approx(v @ scipy.linalg.solve(covariance, v), rel=1e-8)

@@ -8,9 +8,10 @@ import pytest
 from scipy import stats
 
 from msg_analysis.errors import InputError
-from msg_analysis.inference.hypothesis_tests.innovations import innovations, quadratic_form
+from msg_analysis.inference.hypothesis_tests.innovations import innovations
 from msg_analysis.inference.hypothesis_tests.switching import Transitions
 from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.statistics.known_covariance import quadratic_form
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.inference.verdict.evidence import Evidence
 from msg_analysis.inference.verdict.pool import compare_pooled

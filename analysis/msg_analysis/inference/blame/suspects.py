@@ -14,6 +14,7 @@ from msg_analysis.inference.hypothesis_tests.gain_regression import Term
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
 from msg_analysis.inference.observed.heard_values import NO_NOISE
 from msg_analysis.inference.statistics.forward_selection import Candidate
+from msg_analysis.inference.statistics.known_covariance import pseudo_inverse
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 MIN_SAMPLES = 30  # fewest innovations for a variance
@@ -50,7 +51,7 @@ def gains(sums: InnovationSums, pardoned: Iterable[int]) -> Suspects | None:
     if not kept.size:
         return None
     square = np.ix_(kept, kept)
-    inverse = _inverse(sums.covariance[square])
+    inverse = pseudo_inverse(sums.covariance[square])
     back = sums.gram[square] @ inverse
     score, information = np.zeros(len(sums.terms)), np.zeros_like(sums.gram)
     score[kept], information[square] = back @ sums.score[kept], back @ sums.gram[square]
@@ -124,7 +125,7 @@ def noise(sums: InnovationSums, pardoned: Iterable[int], change: FloatArray) -> 
     # Cells of different graphs are independent; their entries here are not used.
     correlation = sums.noises[graph[:, None], agent[:, None], agent] / (root[:, None] * root)
     covariance = np.where(graph[:, None] == graph, 2.0 * correlation**2 / sums.samples[graph][:, None], 0.0)
-    information = _inverse(covariance)
+    information = pseudo_inverse(covariance)
     classes = [
         [Candidate("agent", int(i), (agent == i) * 1.0) for i in np.unique(agent)],
         [Candidate("agent in graph", (int(i), int(g)), np.eye(len(cells))[c]) for c, (g, i) in enumerate(cells)],
@@ -177,12 +178,3 @@ def _explained(sums: InnovationSums, change: FloatArray) -> FloatArray:
         less = c[place] * (2.0 * sums.score[a] - gram[place] @ c)
         explained[:, term.agent] += less * (shares if term.graph is None else np.arange(n) == term.graph)
     return explained
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Pseudo-inverse of a covariance, with the rank judged on the correlations."""
-    deviation = np.sqrt(np.diag(matrix))
-    alive = deviation > 1e-12 * deviation.max(initial=0.0)
-    scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=alive)
-    outer = np.outer(scale, scale)
-    return np.asarray(outer * np.linalg.pinv(matrix * outer, rcond=1e-10, hermitian=True))

@@ -9,9 +9,9 @@ import numpy as np
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.inference.errors.time_means import TimeMeans
-from msg_analysis.inference.hypothesis_tests.innovations import quadratic_form
 from msg_analysis.inference.statistics.distributions import chi2_tail, two_sided
 from msg_analysis.inference.statistics.holm import holm
+from msg_analysis.inference.statistics.known_covariance import quadratic_form
 from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 

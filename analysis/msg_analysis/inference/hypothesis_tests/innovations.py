@@ -20,7 +20,8 @@ from msg_analysis.inference.observed.heard_values import (
     full_reception_noise,
 )
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.statistics.distributions import chi2_tail, two_sided
+from msg_analysis.inference.statistics.distributions import chi2_tail
+from msg_analysis.inference.statistics.known_covariance import direction_p, quadratic_form
 from msg_analysis.inference.statistics.normal_covariance import covariance_statistic
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.types import FloatArray, IntArray
@@ -133,10 +134,7 @@ class InnovationSums:
         size = np.diagonal(self.noises, axis1=1, axis2=2).mean(axis=0)[agents]
         weights = np.array([term.weight if term.kind in ("link", "pull") else 0.0 for term in self.terms])
         weights = np.divide(weights, size, out=np.zeros_like(weights), where=size > NO_NOISE * size.max(initial=0.0))
-        variance = float(weights @ self.covariance @ weights)
-        if variance <= 0.0:
-            return None
-        return float(two_sided(float(weights @ self.score) / np.sqrt(variance)))
+        return direction_p(weights, self.score, self.covariance)
 
     def _add(self, observation: Observation, regression: StateRegression | HeardRegression) -> None:
         """One pass over the run."""
@@ -270,22 +268,3 @@ class Whiteness:
             chi2 += float((self._pairs**2 / size**2).sum() / pairs)
             dof += self.rank
         return float(chi2_tail(chi2, dof))
-
-
-def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, int]:
-    """(v^T C^+ v, rank C), with the rank judged on the correlations (eigenvalues above 1e-10), whatever the units.
-
-    Parameters
-    ----------
-    vector
-        (q,)
-    covariance
-        (q, q)
-    """
-    variances = np.diag(covariance)
-    alive = np.flatnonzero(variances > 1e-24 * variances.max(initial=0.0))
-    deviation = np.sqrt(variances[alive])
-    values, vectors = np.linalg.eigh(covariance[np.ix_(alive, alive)] / np.outer(deviation, deviation))
-    keep = values > 1e-10
-    scores = vectors[:, keep].T @ (vector[alive] / deviation)
-    return float((scores**2 / values[keep]).sum()), int(keep.sum())
