@@ -24,6 +24,8 @@ _PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
 _KEY_HASH, _STATUS_INFO, _SENTINEL, _DISCOVERY_LOCATOR = 0x70, 0x71, 0x01, 0x32
 _PARAMETERS_LITTLE_ENDIAN = b"\x00\x03"
 _DISPOSED_UNREGISTERED = b"\x00\x00\x00\x03"
+_PROTOCOL_VERSION, _VENDOR, _LEASE, _GUID, _DEFAULT_LOCATOR, _BUILTIN_ENDPOINTS = 0x15, 0x16, 0x02, 0x50, 0x31, 0x58
+_UDP_V4, _ANNOUNCER_AND_DETECTOR = 1, 0x03
 _LATE = 1 << 30  # sequence number: higher than that of any announcement that the participant made itself
 
 
@@ -94,6 +96,29 @@ def _parameters(body: bytes, position: int) -> Iterator[tuple[int, int, int]]:
         key, size = struct.unpack_from("<HH", body, position)
         yield key, position + 4, size if key != _SENTINEL else 0
         position += 4 + size
+
+
+def announcement_message(prefix: bytes, port: int, lease: int) -> bytes:
+    """The message by which a participant without endpoints announces itself.
+
+    ``prefix``: of its GUID, 12 bytes. ``port``: of the loopback address, at which it hears others. ``lease``: time [s]
+    without a message after which others forget it.
+    """
+    locator = struct.pack("<iI12x4s", _UDP_V4, port, socket.inet_aton(LOOPBACK))
+    values = {
+        _PROTOCOL_VERSION: _HEADER[4:6] + bytes(2),
+        _VENDOR: _HEADER[6:8] + bytes(2),
+        _GUID: prefix + _PARTICIPANT,
+        _LEASE: struct.pack("<iI", lease, 0),
+        _DISCOVERY_LOCATOR: locator,
+        _DEFAULT_LOCATOR: locator,
+        _BUILTIN_ENDPOINTS: struct.pack("<I", _ANNOUNCER_AND_DETECTOR),
+        _SENTINEL: b"",
+    }
+    parameters = b"".join(struct.pack("<HH", key, len(value)) + value for key, value in values.items())
+    body = struct.pack("<HH4s4siI", 0, 16, bytes(4), _PARTICIPANT_WRITER, 0, 1) + _PARAMETERS_LITTLE_ENDIAN
+    body += bytes(2) + parameters
+    return _HEADER + prefix + struct.pack("<BBH", _DATA, _LITTLE_ENDIAN | _WITH_DATA, len(body)) + body
 
 
 def disposal_message(prefix: bytes, number: int = _LATE) -> bytes:

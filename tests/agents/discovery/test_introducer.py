@@ -15,7 +15,7 @@ from msg_agents.discovery import introducer
 from msg_agents.discovery.introducer import Introducer, write_introduction
 from msg_agents.discovery.profiles import FIRST_INTRODUCED
 from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.discovery.rtps import discovery_port, disposal_message
+from msg_agents.discovery.rtps import discovery_port, disposal_message, read_announcement
 
 QUIET = 0.2  # s in which nothing comes
 PARTNERS = {"agent_1": {"agent_2", "switcher"}, "agent_2": {"agent_1", "switcher"}, "agent_3": {"switcher"}}
@@ -137,6 +137,50 @@ def test_visitors_are_introduced_to_all(meeting: Introducer, crowd: list[Partici
         each.hears(visitor)
     crowd[3].hears()  # it is not ready
     visitor.socket.close()
+
+
+def test_visitors_are_asked_to_announce_themselves(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Again and again, until the run ends, by a participant of the same machine that listens where processes do."""
+    monkeypatch.setattr(introducer, "PERIOD", 0.0)
+    with ExitStack() as stack:
+        with Introducer(domain) as meeting:
+            meeting.introduce(PARTNERS)
+            visitor, process = Participant(domain, 5), Participant(domain, FIRST_INTRODUCED)
+            for each in (visitor, process):
+                stack.callback(each.socket.close)
+            process.announce()
+            visitor.socket.settimeout(10)
+            asked = visitor.socket.recv(1 << 16)
+            process.announce()
+            assert visitor.socket.recv(1 << 16) == asked
+        asking = read_announcement(asked)
+        assert asking is not None
+        assert asking.port == discovery_port(domain, 0)
+        assert asking.prefix[:4] == process.prefix[:4]
+        assert asking.prefix != process.prefix
+        while (heard := visitor.socket.recv(1 << 16)) == asked:
+            pass
+        assert heard == disposal_message(asking.prefix)
+        process.hears()
+
+
+def test_who_becomes_ready_hears_of_the_visitors(meeting: Introducer, crowd: list[Participant], domain: int) -> None:
+    one, two, *_ = crowd
+    one.announce()
+    visitor, gone = Participant(domain, 5), Participant(domain, 6)
+    visitor.announce()
+    gone.announce()
+    gone.announce(disposal_message(gone.prefix))
+    settle()
+    report(meeting, "agent_1", one)
+    one.hears(visitor)
+    two.announce()
+    settle()
+    report(meeting, "agent_2", two)
+    two.hears(visitor)
+    one.hears(two)
+    visitor.socket.close()
+    gone.socket.close()
 
 
 def test_strangers_among_the_numbers_of_the_run(

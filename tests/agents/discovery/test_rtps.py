@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import socket
 import subprocess
@@ -20,6 +21,7 @@ from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN, free_do
 from msg_agents.discovery.rtps import (
     PEERS_VARIABLE,
     Announcement,
+    announcement_message,
     discovery_port,
     discovery_ports,
     disposal_message,
@@ -54,6 +56,20 @@ ANNOUNCER = """
 import time, rclpy
 rclpy.init()
 node = rclpy.create_node("announcer")
+time.sleep(60)
+"""
+
+ANSWERER = """
+import time, rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node("answerer")
+publisher = node.create_publisher(String, "here", 1)
+(own,) = node.get_publishers_info_by_topic("here")
+time.sleep(1)  # the first announcements are over
+print(bytes(own.endpoint_gid[:12]).hex(), flush=True)
+time.sleep(1)
+print(node.get_node_names(), flush=True)
 time.sleep(60)
 """
 
@@ -132,6 +148,51 @@ def test_the_announcement_of_a_real_participant() -> None:
 
 def test_the_disposal_byte_for_byte() -> None:
     assert disposal_message(PREFIX, 5) == DISPOSAL
+
+
+def test_the_announcement_byte_for_byte() -> None:
+    """Of a participant without endpoints, port 7474 of the loopback address, lease 20 s."""
+    locator = "1800 01000000 321d0000 000000000000000000000000 7f000001"
+    expected = HEADER + bytes.fromhex(
+        "15 05 8c00"
+        "0000 1000 00000000 000100c2 00000000 01000000"
+        "0003 0000"
+        "1500 0400 02030000"
+        "1600 0400 010f0000"
+        "5000 1000 0102030405060708090a0b0c 000001c1"
+        "0200 0800 14000000 00000000"
+        f"3200 {locator}"
+        f"3100 {locator}"
+        "5800 0400 03000000"
+        "0100 0000"
+    )
+    message = announcement_message(PREFIX, 7474, 20)
+    assert message == expected
+    assert read_announcement(message) == Announcement(PREFIX, 7474, message)
+
+
+@pytest.mark.parametrize("reach", ["SUBNET", "LOCALHOST", "our profile"])
+def test_a_real_participant_answers_one_without_endpoints(reach: str) -> None:
+    """By announcing itself where that listens, within less than its own period of 3 s, and it goes on working."""
+    with free_domain() as domain, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener, ExitStack() as stack:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(10)
+        own = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": reach}
+        environment = node_environment(domain) if reach == "our profile" else os.environ | own
+        visitor = stack.enter_context(
+            subprocess.Popen([sys.executable, "-P", "-c", ANSWERER], stdout=subprocess.PIPE, text=True, env=environment)
+        )
+        stack.callback(visitor.kill)
+        assert visitor.stdout is not None
+        prefix = bytes.fromhex(visitor.stdout.readline())
+        asking = announcement_message(prefix[:4] + bytes(range(8)), listener.getsockname()[1], 20)
+        for participant in range(FIRST_INTRODUCED):
+            listener.sendto(asking, ("127.0.0.1", discovery_port(domain, participant)))
+        answer = None
+        while answer is None:
+            answer = read_announcement(listener.recv(1 << 16))
+        assert answer.prefix == prefix
+        assert visitor.stdout.readline() == "['answerer']\n"
 
 
 def test_every_participant_of_the_domain_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
