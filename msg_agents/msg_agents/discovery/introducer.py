@@ -5,11 +5,6 @@ it of each endpoint as it makes them: messages grow with the third power of the 
 (introduced.xml) by which they announce themselves only to the numbers of visitors, one of which is taken here. When a
 process has all its endpoints, its announcement is passed on, as it is, to those that it has to do with, and no other
 process of the run ever hears of it. Visitors, such as the user's tools, are introduced to all.
-
-A visitor answers the first announcement of a process, at once and only once, and a process that has just been made may
-not hear it yet: measured, one of five visitors was not known to the last process for 3 s, longer than many runs. So
-the introducer announces itself to visitors, as a participant without endpoints. They answer it, and it tells every
-process of them as soon as that is ready.
 """
 
 from __future__ import annotations
@@ -137,6 +132,9 @@ class Introducer:
 
     def _announce(self) -> None:
         """Make visitors announce themselves to this program."""
+        # A visitor answers the first announcement of a process, once, and a process that has just been made may not hear
+        # it: it would not know the visitor for 3 s, which is longer than many runs. So they are made to answer this
+        # program, a participant without endpoints, which tells every process of them as soon as that is ready.
         if self._own_prefix is not None:
             self._announced = time.monotonic()
             port = self._socket.getsockname()[1]

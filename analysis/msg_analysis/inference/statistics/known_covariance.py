@@ -53,11 +53,16 @@ def direction_p(direction: FloatArray, vector: FloatArray, covariance: FloatArra
 
 
 def pseudo_inverse(covariance: FloatArray) -> FloatArray:
-    """C^+ in units in which every variance is 1.
+    """C^+, computed from the correlations.
 
     Parameters
     ----------
     covariance
+        (q, q)
+
+    Returns
+    -------
+    FloatArray
         (q, q)
     """
     inverse, correlations = _scaled(covariance)
