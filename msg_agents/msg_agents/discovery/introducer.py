@@ -132,9 +132,9 @@ class Introducer:
 
     def _announce(self) -> None:
         """Make visitors announce themselves to this program."""
-        # A visitor answers the first announcement of a process, once, and a process that has just been made may not hear
-        # it: it would not know the visitor for 3 s, which is longer than many runs. So they are made to answer this
-        # program, a participant without endpoints, which tells every process of them as soon as that is ready.
+        # A visitor answers the first announcement of a process, once, and a process that has just been made may not
+        # hear it: it would not know the visitor for 3 s, which is longer than many runs. So they are made to answer
+        # this program, a participant without endpoints, which tells every process of them as soon as that is ready.
         if self._own_prefix is not None:
             self._announced = time.monotonic()
             port = self._socket.getsockname()[1]
