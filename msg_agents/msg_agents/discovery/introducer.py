@@ -155,9 +155,6 @@ class Introducer:
             self._prefixes[name] = bytes.fromhex(prefix)
             if self._prefixes[name] in self._known:
                 self._pass_on(self._known[self._prefixes[name]])
-                for known in self._known.values():
-                    if self._visits(known) and time.monotonic() < known.heard + FRESH:
-                        self._send(known, name)
 
     def _hear(self, datagram: bytes) -> None:
         heard = read_announcement(datagram)
@@ -180,16 +177,22 @@ class Introducer:
 
     def _visits(self, known: _Known) -> bool:
         """Whether a participant is not of the run: has another number, or is not ready for long."""
-        if known.announcement.prefix in self._prefixes.values():
-            return False
         introduced = known.announcement.port >= discovery_port(self._domain, FIRST_INTRODUCED)
-        return not introduced or time.monotonic() > known.first + PATIENCE
+        if introduced and time.monotonic() <= known.first + PATIENCE:
+            return False
+        return known.announcement.prefix not in self._prefixes.values()
 
     def _pass_on(self, known: _Known) -> None:
-        """Pass an announcement on to those that should know it. Whoever hears it announces itself to its sender."""
+        """Pass an announcement on to those that should know it, and to a process of the run those of the visitors.
+
+        Whoever hears one announces itself to its sender.
+        """
         names = [name for name, prefix in self._prefixes.items() if prefix == known.announcement.prefix]
         if names:
             others = {partner for name in names for partner in self._partners.get(name, ())}
+            for visitor in self._known.values():
+                if self._visits(visitor) and time.monotonic() < visitor.heard + FRESH:
+                    self._send(visitor, names[0])
         elif self._visits(known):
             others = set(self._prefixes)
         else:  # a process of the run that is not ready yet

@@ -174,9 +174,9 @@ def test_who_becomes_ready_hears_of_the_visitors(meeting: Introducer, crowd: lis
     settle()
     report(meeting, "agent_1", one)
     one.hears(visitor)
-    two.announce()
+    report(meeting, "agent_2", two)  # faster than the announcement
     settle()
-    report(meeting, "agent_2", two)
+    two.announce()
     two.hears(visitor)
     one.hears(two)
     visitor.socket.close()
