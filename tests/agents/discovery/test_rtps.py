@@ -219,7 +219,10 @@ def test_ports_are_ports(domain: int) -> None:
     assert ports[0] == discovery_port(domain, 0)
     assert len(ports) == min(FIRST_INTRODUCED + MOST_INTRODUCED, (65535 - ports[0]) // 2 + 1)
     assert ports[-1] < 1 << 16
-    remove_participant(PREFIX, domain)
+
+
+def test_a_farewell_in_the_last_domain() -> None:
+    remove_participant(PREFIX, LAST_DOMAIN)
 
 
 @pytest.mark.parametrize(("participants", "domains"), [(1, 1), (87, 1), (88, 2), (MOST_INTRODUCED, 2), (207, 3)])
