@@ -175,16 +175,16 @@ def _triangular(time: Time, t: ComplexArray, leaving: float, right: ComplexArray
     discrete:   X - (1 - a) W X W^H = F with W = I - T
     """
     d = len(t)
-    columns = np.ascontiguousarray(np.moveaxis(right.reshape(-1, d, d), 0, 2).swapaxes(0, 1))  # (column, row, form)
+    columns = np.moveaxis(right.reshape(-1, d, d), 0, 2).swapaxes(0, 1).copy().reshape(d, -1)  # (column, row and form)
     eye, step, stay = np.eye(d), np.eye(d) - t, 1.0 - leaving
+    rows = (t if time == "continuous" else step).conj()
     for k in range(d - 1, -1, -1):
-        row = t[k] if time == "continuous" else step[k]
-        known = np.tensordot(row[k + 1 :].conj(), columns[k + 1 :], axes=1)
+        known = (rows[k, k + 1 :] @ columns[k + 1 :]).reshape(d, -1)
         if time == "continuous":
-            matrix = t + (row[k].conj() + leaving) * eye
+            matrix = t + (rows[k, k] + leaving) * eye
             known = -known
         else:
-            matrix = eye - (stay * row[k].conj()) * step
+            matrix = eye - (stay * rows[k, k]) * step
             known = stay * (step @ known)
-        columns[k] = scipy.linalg.lapack.ztrtrs(matrix, columns[k] + known)[0]
-    return np.moveaxis(columns.swapaxes(0, 1), 2, 0).reshape(right.shape)
+        columns[k] = scipy.linalg.lapack.ztrtrs(matrix, columns[k].reshape(d, -1) + known)[0].reshape(-1)
+    return np.moveaxis(columns.reshape(d, d, -1).swapaxes(0, 1), 2, 0).reshape(right.shape)
