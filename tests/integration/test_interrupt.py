@@ -84,6 +84,19 @@ def test_while_the_run_is_compared_with_the_prediction(network: Any) -> None:
     assert read_bag(bag).completeness.complete
 
 
+def test_at_any_moment_after_the_network(network: Any) -> None:
+    """As soon as the logs are being kept: whatever is done then, the result is printed, and the bag is whole."""
+    run = network.start("run", network.file(run={"duration": 1}), "--out", network.directory / "runs", "--json")
+    network.wait_for(lambda: list(network.directory.glob("runs/*/log")), 60, "the end of the network")
+    run.send_signal(signal.SIGINT)
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert stderr.splitlines()[-1].startswith("failed: stopped by Ctrl-C while the ")
+    (bag,) = (network.directory / "runs").iterdir()
+    assert json.loads(stdout)["verdict"] == "incomplete"
+    assert read_bag(bag).completeness.complete
+
+
 def test_agents_that_are_interrupted_say_nothing(network: Any) -> None:
     """A signal shuts rclpy down between two calls of a callback, and what is then published is no error of ours."""
     fast = {"duration": 10_000, "replicas": 1, "processes": 2, "pace": "realtime", "speed": 60.0}

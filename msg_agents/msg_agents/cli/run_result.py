@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from msg_agents.terminal.interruption import Interruption
 from msg_analysis.cli.console import complain, print_json, result_console
 from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.files import RESULT_FILE, write_whole
@@ -29,14 +30,17 @@ def finish(
     report: ReportWhen = "always",
 ) -> None:
     """Print the failures, judge what was recorded, show the result, and exit with its code."""
-    from msg_agents.running.runner import conclude
-    from msg_analysis.cli.progress import WorkProgress
-
     for line in result.failures:
         complain(line, "failed:")
     if analyse and not result.interrupted:
+        with Interruption() as interruption:  # an exception in the middle of an import may become another one
+            from msg_agents.running.runner import conclude
+            from msg_analysis.cli.progress import WorkProgress
+
+            progress = WorkProgress()
         try:
-            with WorkProgress() as progress, watched(progress):
+            interruption.check()
+            with progress, watched(progress):
                 conclude(result, report)
         except KeyboardInterrupt:
             result.interrupt(signal.SIGINT, "while the run was compared with the prediction")

@@ -6,7 +6,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -190,7 +190,11 @@ def run_network(
     bag = directory if share is None or share.home else None
     result = RunResult(experiment, bag)
     try:
-        with workshop() as folder, surroundings(folder, domain, environment or {}, processes + 2) as around:
+        with (
+            ExitStack() as to_the_end,
+            workshop() as folder,
+            surroundings(folder, domain, environment or {}, processes + 2) as around,
+        ):
             variables = around.environment
             with NodeServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 record = record or new_record(experiment)
@@ -234,8 +238,11 @@ def run_network(
                     _settle(bag, result)
                 except KeyboardInterrupt:
                     result.interrupt(signal.SIGINT, "while the bag was read")
+            interruption = to_the_end.enter_context(Interruption())  # the rest takes no time: a signal can wait
             if directory is not None:
                 _keep_logs(folder, directory / "log", result)
+        if interruption.caught is not None and not result.interrupted:
+            result.interrupt(interruption.caught, "while the logs were kept")
     finally:
         if directory is not None:
             with suppress(OSError):
