@@ -222,6 +222,7 @@ def test_ports_are_ports(domain: int) -> None:
 
 
 def test_a_farewell_in_the_last_domain() -> None:
+    """No number is tried whose port would be above the last one, which a socket refuses."""
     remove_participant(PREFIX, LAST_DOMAIN)
 
 
