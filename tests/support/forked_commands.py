@@ -24,7 +24,7 @@ import socket
 import subprocess
 import sys
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +55,10 @@ PREPARED = (
     "scipy.stats",
 )
 READ_LATER = re.compile(
-    "(ROS_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_).*|NO_COLOR|COLUMNS|LINES|(OPENBLAS|OMP)_NUM_THREADS|PYTHONSAFEPATH"
+    "(ROS_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_|KMP_).*|NO_COLOR|COLUMNS|LINES|PYTHON(SAFEPATH|UNBUFFERED)|"
+    "(MKL|OMP|OPENBLAS)_NUM_THREADS"
 )
-"""Names of variables that are read after the imports, or are the same for all that is forked."""
+"""Names of variables that are read after the imports, or are the same for all that is forked (libraries set KMP_)."""
 CLONE_NEWNET = 0x40000000  # linux/sched.h
 LONGEST_TITLE = 2000
 FREE = 200  # descriptors from here on are not used
@@ -80,6 +81,11 @@ def installed() -> Iterator[None]:
     finally:
         subprocess._fork_exec = _fork_exec  # type: ignore[attr-defined]
         adopt_orphans(adopt=False)
+
+
+def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
+    """What a forked process must have as its server has it."""
+    return {name: value for name, value in environment.items() if not READ_LATER.fullmatch(name)}
 
 
 def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Sequence[Any]) -> dict[str, Any] | None:
@@ -117,7 +123,7 @@ class _Forker:
     def __init__(self) -> None:
         self._control: socket.socket | None = None
         self._whole = dict(os.environ)  # as it is before any test changes it
-        self._environment = _fixed(self._whole)
+        self._environment = read_at_start(self._whole)
 
     def fork_exec(self, *arguments: Any) -> int:
         request = request_of(arguments[0], arguments)
@@ -127,7 +133,7 @@ class _Forker:
             self._control = self._start()
         descriptors = descriptors_of(request, arguments)
         message = json.dumps([[request, list(range(len(descriptors)))]]).encode()
-        if len(message) > LONGEST or _fixed(request["environment"]) != self._environment:
+        if len(message) > LONGEST or read_at_start(request["environment"]) != self._environment:
             return _fork_exec(*arguments)  # type: ignore[misc]
         socket.send_fds(self._control, [message], descriptors)
         pid = int(self._control.recv(LONGEST))
@@ -150,10 +156,6 @@ class _Forker:
 @functools.cache
 def _forker() -> _Forker:
     return _Forker()
-
-
-def _fixed(environment: Any) -> dict[str, str]:
-    return {name: value for name, value in environment.items() if not READ_LATER.fullmatch(name)}
 
 
 def run(request: dict[str, Any], descriptors: list[int]) -> None:
@@ -213,10 +215,16 @@ def _open_streams() -> None:
     """As Python does it at its start."""
     for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         raw = io.FileIO(number, mode, closefd=False)
-        buffered = io.BufferedReader(raw) if mode == "r" else io.BufferedWriter(raw)
+        at_once = mode == "w" and bool(os.environ.get("PYTHONUNBUFFERED"))
+        buffered = raw if at_once else io.BufferedReader(raw) if mode == "r" else io.BufferedWriter(raw)
         before = getattr(sys, name)
-        at_lines = name == "stderr" or raw.isatty()
-        stream = io.TextIOWrapper(buffered, before.encoding, before.errors, line_buffering=at_lines)
+        stream = io.TextIOWrapper(
+            buffered,  # type: ignore[arg-type]  as Python does it
+            before.encoding,
+            before.errors,
+            line_buffering=name == "stderr" or raw.isatty(),
+            write_through=at_once,
+        )
         setattr(sys, name, stream)
         setattr(sys, f"__{name}__", stream)
 
