@@ -58,7 +58,12 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Child]]:
     def start_child(code: str, name: str = "agent_1", *, number: int = 1, resumes: bool = False) -> Child:
         log = tmp_path / f"{name}.log"
         with log.open("wb") as output:
-            process = subprocess.Popen([sys.executable, "-P", "-c", code], stdout=output, stderr=output)
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-c", code],
+                env={**os.environ, "PYTHONUNBUFFERED": "1"},  # as nodes have it: what is written first stands first
+                stdout=output,
+                stderr=output,
+            )
         child = Child(ProcessPlan(name, (), resumes=resumes), process, log, number)
         children.append(child)
         wait_for(lambda: "ready" in log.read_text() or not child.running)
