@@ -1,5 +1,6 @@
-"""How long `--help` takes, of both command lines and of every command, beside Python that does nothing; and a network
-of one step, whose processes are forked or start on their own.
+"""How long `--help` takes, of both command lines and of every command, beside Python that does nothing; a network of
+one step, as a command; and how long the processes of a network need from the call to the last x(0), forked or on their
+own.
 
 python benchmarks/startup.py
 
@@ -19,9 +20,12 @@ from pathlib import Path
 import yaml
 
 from msg_agents.cli.main import main as agents
+from msg_agents.running.runner import run_network
 from msg_analysis.cli.main import main as analysis
+from msg_analysis.model.experiment.experiment import ValidExperiment
 
 ROUNDS = 7
+STARTS = 3  # of each network
 NETWORKS = (5, 20, 40, 90)  # agents, each with a process of its own
 BIN = Path(sys.executable).parent
 
@@ -40,13 +44,32 @@ def main() -> None:
             commands[f"{program} {name}".strip()] = [str(BIN / program), *([name] if name else []), "--help"]
     report(commands)
     with tempfile.TemporaryDirectory() as directory:
-        networks: dict[str, list[str]] = {}
-        for size in NETWORKS:
-            file = Path(directory) / f"{size}.yaml"
-            file.write_text(yaml.safe_dump(network(size)))
-            command = [str(BIN / "msg-agents"), "run", str(file), "--no-record"]
-            networks |= {f"{size} agents": command, f"{size} agents, --no-fork": [*command, "--no-fork"]}
-        report(networks, rounds=2)
+        file = Path(directory) / "network.yaml"
+        file.write_text(yaml.safe_dump(network(NETWORKS[0])))
+        command = [str(BIN / "msg-agents"), "run", str(file), "--no-record"]
+        report(
+            {f"run, {NETWORKS[0]} agents": command, f"run, {NETWORKS[0]} agents, --no-fork": [*command, "--no-fork"]}
+        )
+    print("\nagents   from the call to the last x(0): forked   on their own   ratio")
+    for size in NETWORKS:
+        forked, alone = (min(values) for values in zip(*(both(size) for _ in range(STARTS)), strict=True))
+        print(f"{size:6} {forked:39.2f} s {alone:12.2f} s {alone / forked:7.1f}", flush=True)
+
+
+def both(agents: int) -> tuple[float, float]:
+    """Start-up times [s] of a network: its processes are forked, or each starts on its own."""
+    return start_up(agents, fork=True), start_up(agents, fork=False)
+
+
+def start_up(agents: int, *, fork: bool) -> float:
+    """Seconds until all agents have their x(0), as ``run_network`` reports it."""
+    what = ValidExperiment.parse(network(agents))
+    ready: list[float] = []
+    begun = time.perf_counter()
+    result = run_network(what, None, fork=fork, on_progress=lambda _: ready.append(time.perf_counter()))
+    if result.failures or not ready:
+        raise SystemExit("\n".join(result.failures) or "the run was over before it was seen")
+    return ready[0] - begun
 
 
 def network(agents: int) -> dict[str, object]:

@@ -23,6 +23,9 @@ from msg_analysis.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
+# Our models have no plugins. pydantic would look for some in all packages that are installed: 30 ms of each command.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "true")
+
 NOT_WRITTEN = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF}
 
 

@@ -81,6 +81,21 @@ Request = tuple[Mapping[str, Any], Sequence[int]]
 """What a forked process is to do, and the descriptors of which it gets copies."""
 
 
+def start_server(
+    command: Sequence[str], environment: Mapping[str, str], control: socket.socket, output: IO[bytes] | int
+) -> subprocess.Popen[bytes]:
+    """Start the process of a fork server, which gets the number of its socket, and room for titles, as arguments."""
+    return subprocess.Popen(
+        [*command, str(control.fileno()), " " * LONGEST_TITLE],
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        env=dict(environment),
+        pass_fds=[control.fileno()],
+        start_new_session=True,
+    )
+
+
 class ForkServer:
     """The fork server, as seen by the process that uses it: a context, at whose end it is gone.
 
@@ -90,7 +105,7 @@ class ForkServer:
 
     def __init__(
         self,
-        command: Sequence[str],  # which then has the number of its socket as argument, and room for titles
+        command: Sequence[str],  # see ``start_server``
         environment: Mapping[str, str],
         log: Path | None = None,  # of what the server itself prints
     ) -> None:
@@ -111,15 +126,7 @@ class ForkServer:
         return self
 
     def _start(self, control: socket.socket, output: IO[bytes]) -> Process:
-        return subprocess.Popen(
-            [*self._command, str(control.fileno()), " " * LONGEST_TITLE],
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env=dict(self._environment),
-            pass_fds=[control.fileno()],
-            start_new_session=True,
-        )
+        return start_server(self._command, self._environment, control, output)
 
     @property
     def pid(self) -> int | None:

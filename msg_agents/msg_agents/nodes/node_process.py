@@ -30,8 +30,8 @@ from msg_agents.processes.fork_server import ends_at_once
 from msg_agents.recovery.takeover import Takeover
 from msg_analysis.errors import InputError
 
-GATE_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine, but for its beginning
-FIRST_POLL = 0.02  # s
+FIRST_POLL, GATE_POLL = 0.02, 0.2  # s; a tight loop on the ROS graph starves discovery where many processes look
+PAUSE_PER_LOOK = 40  # times as long as a look took, which is longer the more processes compete for the cores
 SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wakes up
 GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collections find nothing
 LEAVE_GRACE = 5  # s
@@ -208,9 +208,10 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
     Readers are identified by name: with duplicates, a run might start without the node that belongs to it.
     """
     deadline = time.monotonic() + timeout
-    waiting, pause = list(nodes), FIRST_POLL
+    waiting = list(nodes)
     warned = False
     while True:
+        begun = time.monotonic()
         waiting = [node for node in waiting if not node.discovered_all() or node.missing_clock()]
         late = time.monotonic() > deadline
         twice = nodes[0].duplicate_names() if late or not waiting else []
@@ -230,6 +231,4 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
             )
         if not rclpy.ok():
             raise ExternalShutdownException
-        time.sleep(pause)
-        if not nodes[0].resumed:  # else few look at the same time
-            pause = min(2 * pause, GATE_POLL)
+        time.sleep(min(max(FIRST_POLL, PAUSE_PER_LOOK * (time.monotonic() - begun)), GATE_POLL))

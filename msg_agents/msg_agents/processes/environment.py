@@ -61,19 +61,23 @@ def tolerate_warnings() -> None:
     warnings.filterwarnings("ignore", "module 'sre_", DeprecationWarning)
 
 
+def start_environment() -> dict[str, str]:
+    """Our environment with what is read at the start of a process of nodes, whatever its network."""
+    return {
+        **SINGLE_THREAD,
+        **os.environ,
+        "PYTHONUNBUFFERED": "1",
+        # ``python -m`` would look for msg_agents in the working directory first, and find our source tree's folder.
+        "PYTHONSAFEPATH": "1",
+    }
+
+
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
     """Our environment with what the nodes need; another discovery range or profile of the user's is kept.
 
     A discovery server is not used: with one, the nodes of a run on this machine would not find each other without it.
     """
-    environment = {
-        **SINGLE_THREAD,
-        **os.environ,
-        "ROS_DOMAIN_ID": str(domain),
-        "PYTHONUNBUFFERED": "1",
-        # ``python -m`` would look for msg_agents in the working directory first, and find our source tree's folder.
-        "PYTHONSAFEPATH": "1",
-    }
+    environment = start_environment() | {"ROS_DOMAIN_ID": str(domain)}
     local = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST") == "LOCALHOST"
     if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
         environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SYSTEM_DEFAULT"  # the profile decides

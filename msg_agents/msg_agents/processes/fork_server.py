@@ -11,7 +11,9 @@ import functools
 import gc
 import json
 import os
+import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -21,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NoReturn
 
+from msg_agents.processes.environment import start_environment
 from msg_analysis.common.forked_processes import (
     ALL_FORKED,
     LONGEST,
@@ -28,14 +31,16 @@ from msg_analysis.common.forked_processes import (
     ForkedProcess,
     ForkServer,
     Process,
+    start_server,
 )
 
 PROGRAM = [sys.executable, "-m", "msg_agents.cli.node_server"]  # calls ``serve``
+EARLY = "--early"  # argument of a server that is there before its run
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
 ADOPTION = 1e-4  # s between two looks whether a forked process has its new parent
 _ending_at_once = False  # see ``ends_at_once``
 _forked_by = 0  # see ``await_adoption``
-_waiting: tuple[int, socket.socket] | None = None  # see ``leave_one_waiting``
+_waiting: tuple[Process, socket.socket] | None = None  # a fork server that is there before its run
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +75,26 @@ class NodeServer(ForkServer):
         return _wake(self._environment, control, output) or super()._start(control, output)
 
 
+def start_early() -> None:
+    """Start the fork server of the run that this process will make: it imports while this one goes on.
+
+    Nothing is done if one is waiting already. If there is no run, it ends with this process.
+    """
+    global _waiting
+    if _waiting is None and sys.platform == "linux":
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            _waiting = start_server([*PROGRAM, EARLY], start_environment(), theirs, subprocess.DEVNULL), ours
+        atexit.register(_end_waiting)
+
+
+def _end_waiting() -> None:
+    """End it at once, although it is still importing."""
+    if _waiting is not None:
+        _waiting[0].send_signal(signal.SIGKILL)
+        _waiting[0].wait()
+
+
 def leave_one_waiting(serve_nodes: Callable[[socket.socket], NoReturn], unneeded: Iterable[int]) -> None:
     """Fork a process that becomes the fork server of the run that this process will make, if it has imported all.
 
@@ -85,31 +110,37 @@ def leave_one_waiting(serve_nodes: Callable[[socket.socket], NoReturn], unneeded
         return
     if pid:
         theirs.close()
-        _waiting = (pid, ours)
+        _waiting = (ForkedProcess(pid), ours)
         return
     ours.close()
     for descriptor in unneeded:
         os.close(descriptor)
-    with theirs:
-        message, descriptors, _, _ = socket.recv_fds(theirs, LONGEST, MOST_DESCRIPTORS)
+    serve_nodes(await_run(theirs))
+
+
+def await_run(early: socket.socket) -> socket.socket:
+    """In a process that was there before its run: take that one's environment and log; the socket to serve at."""
+    with early:
+        message, descriptors, _, _ = socket.recv_fds(early, LONGEST, MOST_DESCRIPTORS)
     if not message:  # no network is run
         os._exit(0)
     control, output = descriptors
-    os.setsid()
+    if os.getsid(0) != os.getpid():
+        os.setsid()
     environment = json.loads(message)
     for name in environment["removed"]:
         del os.environ[name]
     os.environ.update(environment["changed"])
     print_to(output)
-    serve_nodes(socket.socket(fileno=control))
+    return socket.socket(fileno=control)
 
 
-def _wake(environment: Mapping[str, str], control: socket.socket, output: IO[bytes]) -> ForkedProcess | None:
+def _wake(environment: Mapping[str, str], control: socket.socket, output: IO[bytes]) -> Process | None:
     """Make the waiting process the fork server; None if there is none."""
     global _waiting
     if _waiting is None:
         return None
-    (pid, theirs), _waiting = _waiting, None
+    (server, theirs), _waiting = _waiting, None
     changed = {name: value for name, value in environment.items() if os.environ.get(name) != value}
     message = json.dumps({"changed": changed, "removed": list(os.environ.keys() - environment.keys())}).encode()
     with theirs:
@@ -119,7 +150,7 @@ def _wake(environment: Mapping[str, str], control: socket.socket, output: IO[byt
             socket.send_fds(theirs, [message], [control.fileno(), output.fileno()])
         except OSError:  # it has been killed
             return None
-    return ForkedProcess(pid)
+    return server
 
 
 def serve(control: socket.socket, run: Callable[[Any, list[int]], object]) -> NoReturn:
@@ -127,8 +158,8 @@ def serve(control: socket.socket, run: Callable[[Any, list[int]], object]) -> No
 
     A forked process does ``run`` with its request and its descriptors. It is a child of our parent.
     """
-    gc.collect()
     gc.freeze()  # the collector writes to the objects that it looks at, and their memory would be copied
+    gc.enable()
     # Python 3.12 warns of threads, whose locks might be held. Here, only the library of a tracer (LTTng) has any.
     warnings.filterwarnings("ignore", ".*fork", DeprecationWarning, __name__)
     while True:
