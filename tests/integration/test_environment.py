@@ -35,7 +35,7 @@ def undisturbed(network: Any, run: subprocess.Popen[str]) -> None:
 @pytest.mark.parametrize(
     "variables",
     [
-        {"HOME": None, "PYTHONWARNINGS": "error"},
+        {"HOME": None, "PYTHONWARNINGS": "error", "PYTHONPATH": "/nowhere"},
         {"HOME": "/dev/null/home", "ROS_LOG_DIR": "/dev/null/logs", "ROS_DISCOVERY_SERVER": "127.0.0.1:11811"},
     ],
     ids=["no home", "nothing can be written"],

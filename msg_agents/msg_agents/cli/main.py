@@ -17,7 +17,7 @@ from msg_agents.cli import nodes, replay
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.web_options import WebCommand, announce, page, web_options
 from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS
-from msg_agents.processes.fork_server import start_early
+from msg_agents.processes.fork_server import early_server
 from msg_analysis.cli.console import CommandGroup, examples, print_json, print_text
 from msg_analysis.cli.options import (
     BAG,
@@ -153,7 +153,7 @@ def run(
     On a terminal, a panel shows the progress; with --web, a page for browsers does, too.
     """
     if not no_fork:
-        start_early()
+        click.get_current_context().with_resource(early_server())
     from msg_agents.running.experiment_overrides import load_with_overrides
     from msg_agents.running.runner import run_network
     from msg_agents.watching.run_view import RunView
@@ -290,7 +290,7 @@ def host(
     host compares the record with the theory, as `msg-agents run` does; the others end with the run.
     """
     if not (no_fork or only_profile):
-        start_early()
+        click.get_current_context().with_resource(early_server())
     from msg_agents.processes.hosts import Hosts, this_host
     from msg_agents.running.run_folder import workshop
     from msg_agents.running.runner import run_network

@@ -1,6 +1,6 @@
 """``python -m msg_agents.cli.node_server [--early] SOCKET``: imports all that nodes need and forks their processes.
 
-With ``--early`` it is told of its run later: see ``fork_server.start_early``.
+With ``--early`` it is told of its run later: see ``fork_server.early_server``.
 """
 
 from __future__ import annotations

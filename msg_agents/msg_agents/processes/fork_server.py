@@ -11,14 +11,13 @@ import functools
 import gc
 import json
 import os
-import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NoReturn
@@ -75,24 +74,28 @@ class NodeServer(ForkServer):
         return _wake(self._environment, control, output) or super()._start(control, output)
 
 
-def start_early() -> None:
-    """Start the fork server of the run that this process will make: it imports while this one goes on.
+@contextlib.contextmanager
+def early_server() -> Iterator[None]:
+    """Start the fork server of a run that is made within: it imports while this process goes on.
 
-    Nothing is done if one is waiting already. If there is no run, it ends with this process.
+    Nothing is done if one is waiting already.
     """
     global _waiting
-    if _waiting is None and sys.platform == "linux":
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            _waiting = start_server([*PROGRAM, EARLY], start_environment(), theirs, subprocess.DEVNULL), ours
-        atexit.register(_end_waiting)
-
-
-def _end_waiting() -> None:
-    """End it at once, although it is still importing."""
-    if _waiting is not None:
-        _waiting[0].send_signal(signal.SIGKILL)
-        _waiting[0].wait()
+    if _waiting is not None or sys.platform != "linux":
+        yield
+        return
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        server = start_server([*PROGRAM, EARLY], start_environment(), theirs, subprocess.DEVNULL)
+    _waiting = server, ours
+    try:
+        yield
+    finally:
+        if _waiting is not None:  # no network was run
+            _waiting = None
+            ours.close()
+            server.kill()
+            server.wait()
 
 
 def leave_one_waiting(serve_nodes: Callable[[socket.socket], NoReturn], unneeded: Iterable[int]) -> None:

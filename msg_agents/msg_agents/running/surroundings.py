@@ -43,9 +43,9 @@ def surroundings(
                 introducer = stack.enter_context(Introducer(domain))
             except OSError:  # many others are in this domain
                 environment = node_environment(domain) | dict(changes)
-        require_middleware(environment)
         if not can_log():
             environment[LOGS_VARIABLE] = str(folder / ROS_LOGS)
+        require_middleware(environment)
         yield Surroundings(domain, environment, introducer)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -17,7 +18,7 @@ from waiting import gone, participants, record_of_two, wait_for
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, start_early
+from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, early_server
 from msg_analysis.common.cores import available_cores
 from msg_analysis.common.forked_processes import LONGEST_TITLE, ForkedProcess
 
@@ -137,7 +138,7 @@ PARENT = """
 import sys, time
 from pathlib import Path
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, start_early
+from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, early_server
 log = Path(sys.argv[1])
 with NodeServer(node_environment(0), log / "server.log") as server, (log / "log").open("w") as output:
     (process,) = server.fork_nodes([NodeStart(["agent", "--help"], {}, output.fileno(), None)])
@@ -158,54 +159,61 @@ def test_it_ends_when_its_user_is_killed(tmp_path: Path) -> None:
 
 def early_servers(parent: int) -> list[int]:
     """Processes that a process has started as fork servers of a later run."""
-    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-    return [int(child) for child in children if EARLY in Path(f"/proc/{child}/cmdline").read_text().split("\0")]
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):  # it has just ended
+            of_parent = (entry / "stat").read_text().rpartition(")")[2].split()[1] == str(parent)
+            if of_parent and EARLY in (entry / "cmdline").read_text().split("\0"):
+                found.append(int(entry.name))
+    return found
 
 
 def test_a_server_that_is_there_before_its_run(tmp_path: Path, waiting: list[str], domain: int) -> None:
     """Its processes are those of the run all the same: in its domain, with their titles."""
-    start_early()
-    start_early()  # there is one
-    (early,) = early_servers(os.getpid())
-    with NodeServer(node_environment(domain), tmp_path / "server.log") as server:
-        assert server.pid == early
-        process = start(server, tmp_path / "log", *waiting)
-        wait_for(lambda: participants(domain))
-        assert title(process) == ["msg-agents", *waiting]
-        process.send_signal(signal.SIGINT)
-        assert process.wait() == 3
-    assert gone(early)
+    with early_server(), early_server():  # the second is not needed
+        (early,) = early_servers(os.getpid())
+        with NodeServer(node_environment(domain), tmp_path / "server.log") as server:
+            assert server.pid == early
+            process = start(server, tmp_path / "log", *waiting)
+            wait_for(lambda: participants(domain))
+            assert title(process) == ["msg-agents", *waiting]
+            process.send_signal(signal.SIGINT)
+            assert process.wait() == 3
+        assert gone(early)
 
 
 def test_an_early_server_is_killed(tmp_path: Path) -> None:
     """The run has another one."""
-    start_early()
-    (early,) = early_servers(os.getpid())
-    os.kill(early, signal.SIGKILL)
-    wait_for(lambda: gone(early))
-    with NodeServer(node_environment(0), tmp_path / "server.log") as server:
-        assert server.pid != early
-        assert start(server, tmp_path / "log", "agent", "--help").wait() == 0
+    with early_server():
+        (early,) = early_servers(os.getpid())
+        os.kill(early, signal.SIGKILL)
+        wait_for(lambda: gone(early))
+        with NodeServer(node_environment(0), tmp_path / "server.log") as server:
+            assert server.pid != early
+            assert start(server, tmp_path / "log", "agent", "--help").wait() == 0
+
+
+def test_an_early_server_without_a_run() -> None:
+    with early_server():
+        (early,) = early_servers(os.getpid())
+    assert gone(early)
 
 
 WITHOUT_RUN = """
 import time
-from msg_agents.processes.fork_server import start_early
-start_early()
-print(flush=True)
-time.sleep(%d)
+from msg_agents.processes.fork_server import early_server
+with early_server():
+    print(flush=True)
+    time.sleep(600)
 """
 
 
-@pytest.mark.parametrize("killed", [False, True])
-def test_an_early_server_ends_with_its_process(*, killed: bool) -> None:
-    command = [sys.executable, "-P", "-c", WITHOUT_RUN % (600 if killed else 1)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+def test_an_early_server_whose_process_is_killed() -> None:
+    with subprocess.Popen([sys.executable, "-P", "-c", WITHOUT_RUN], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         process.stdout.readline()
         (early,) = early_servers(process.pid)
-        if killed:
-            process.kill()
+        process.kill()
     wait_for(lambda: gone(early))
 
 
