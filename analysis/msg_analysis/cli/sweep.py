@@ -79,22 +79,26 @@ def sweep(
     if workers and scheduler:
         raise InputError("--workers: not together with --scheduler, which has workers of its own: give one of them")
     require_libraries()
-    if not scheduler:
-        from msg_analysis.sweep.jobs.workers import warm_up
-
-        warm_up()  # the workers import while the points are checked
     from msg_analysis.cli.progress import SweepProgress
+    from msg_analysis.sweep.jobs.workers import warm_up
+    from msg_analysis.sweep.plan import load_sweep
+
+    with SweepProgress("checking the points") as checking:
+
+        def checked(done: int, total: int) -> None:
+            if done == 1 and not scheduler:
+                warm_up()  # the file can be read: the workers import while its points are checked
+            checking.checked(done, total)
+
+        plan = load_sweep(sweep_file, checked)
     from msg_analysis.report.figures.sweep_figure import write_figure
     from msg_analysis.report.terminal.sweep_text import describe_sweep, print_sweep
     from msg_analysis.sweep.conduct import judge_sweep
     from msg_analysis.sweep.figure_series import picture
     from msg_analysis.sweep.jobs.network_run import options
     from msg_analysis.sweep.outcome_store import OutcomeStore
-    from msg_analysis.sweep.plan import load_sweep
     from msg_analysis.sweep.table import rows_of, write_tables
 
-    with SweepProgress("checking the points") as checking:
-        plan = load_sweep(sweep_file, checking.checked)
     directory = out or Path("sweeps") / plan.name
     network = options(directory, keep_bags, workers or 1) if plan.kind == "network" else None
     with OutcomeStore.open(directory) as store:
