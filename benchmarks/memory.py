@@ -2,6 +2,9 @@
 
 The recorder gets batches of made-up states by hand, as fast as it takes them. Agents and switcher are those of a real
 network. The comparison reads bags of the offline twin. All values are resident memory [MB].
+
+--hour: recorder and switcher over an hour of 1000 agents, at the speed that they have on two cores. The switcher is a
+real process, whose agents say that they have reached a step as soon as they know its graph.
 """
 
 from __future__ import annotations
@@ -17,18 +20,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rclpy
 
+from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.nodes.network_node import NetworkNode
+from msg_agents.nodes.ros.lean_node import LeanNode
+from msg_agents.processes.environment import node_environment
 from msg_agents.running.runner import run_network
 from msg_agents.stepping.state_receiver import StateReceiver
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.record import RunRecord
 from msg_analysis.twin.simulate import new_record, simulate
 from msg_analysis.wire.messages import StateCodec
 from msg_analysis.wire.state_batches import encode_batch
-from msg_analysis.wire.topics import STATE, STATES, network_topics
+from msg_analysis.wire.topics import GRAPH, PROGRESS, STATE, STATES, agent_name, network_topics
 
 POINTS = 5
+AGENTS, STEPS_IN_AN_HOUR = 1000, 360_000
+TOGETHER = 25  # sojourns after which made-up agents tell their steps
 
 
 def ring(agents: int, steps: int, **run: Any) -> ValidExperiment:
@@ -106,6 +117,58 @@ def network(steps: int) -> None:
         )
 
 
+class MadeUpAgents(NetworkNode):
+    """The first agent, which speaks for all: each is as far as the graph is known."""
+
+    def __init__(self, record: RunRecord) -> None:
+        super().__init__(agent_name(0), record=record)
+        self.reached, self._sojourns = 0, 0
+        self._progress = self.publisher_of(PROGRESS)
+        self.subscribe(GRAPH, self._receive)
+        self.finish_at_end()
+
+    def begin(self) -> None:
+        """Say that all agents have started."""
+        self._tell(0)
+
+    def _receive(self, data: bytes) -> None:
+        graph = self.decode_graph(data)
+        self._sojourns += 1
+        last = self.record.experiment.steps
+        if graph and (self._sojourns % TOGETHER == 0 or graph.last_step == last - 1):
+            self._tell(graph.last_step + 1)
+
+    def _tell(self, step: int) -> None:
+        self.reached = step
+        for agent in range(self.record.experiment.agents):
+            self._progress.publish(self.progress(PROGRESS, agent + 1, step))
+
+
+def switcher(agents: int, steps: int) -> None:
+    """The switcher of so many agents, which take no time."""
+    record = new_record(ring(agents, steps))
+    shown: list[str] = []
+    with tempfile.TemporaryDirectory() as folder, free_domain() as domain:
+        file = Path(folder) / "run.json"
+        file.write_text(record.to_json(with_key=True), encoding="utf-8")
+        os.environ.update(node_environment(domain))
+        with subprocess.Popen([sys.executable, "-m", "msg_agents", "switcher", str(file)]) as process:
+            rclpy.init()
+            node = MadeUpAgents(record)
+            others = [LeanNode(agent_name(i)) for i in range(1, agents)]
+            while "switcher" not in node.get_node_names() or not node.count_publishers(GRAPH.name):
+                time.sleep(0.1)
+            node.begin()
+            while not node.done.done():
+                rclpy.spin_once(node, timeout_sec=1.0)
+                if node.reached >= steps * (len(shown) + 1) // POINTS:
+                    shown.append(f"{resident(process.pid):.0f}")
+            for other in [node, *others]:
+                other.destroy_node()
+            rclpy.shutdown()
+    print(f"| switcher, {agents} agents, {steps} steps | {' | '.join(shown)} |", flush=True)
+
+
 def comparison(steps: int) -> None:
     """`msg-analysis compare` with a report, of 20 agents with 16 replicas."""
     with tempfile.TemporaryDirectory() as folder:
@@ -129,9 +192,14 @@ def main() -> None:
     parser.add_argument("--states", type=int, default=20_000_000, help="states that the recorder gets")
     parser.add_argument("--steps", type=int, default=1_000_000, help="of the network")
     parser.add_argument("--longest", type=int, default=350_000, help="steps of the longest bag that is compared")
+    parser.add_argument("--hour", action="store_true", help="only an hour of 1000 agents: a quarter of an hour")
     arguments = parser.parse_args()
     print(f"| resident memory [MB] after | {' | '.join(f'{100 * (i + 1) // POINTS} %' for i in range(POINTS))} |")
     print(f"|---|{'---:|' * POINTS}")
+    if arguments.hour:
+        switcher(AGENTS, STEPS_IN_AN_HOUR)
+        recorder(AGENTS, STEPS_IN_AN_HOUR)
+        return
     for agents in (10, 100, 1000):
         recorder(agents, arguments.states // agents)
     network(arguments.steps)
