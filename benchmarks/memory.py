@@ -140,6 +140,7 @@ class MadeUpAgents(NetworkNode):
 
     def _tell(self, step: int) -> None:
         self.reached = step
+        self.rules.forget(step)
         for agent in range(self.record.experiment.agents):
             self._progress.publish(self.progress(PROGRESS, agent + 1, step))
 
