@@ -4,6 +4,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+BUILT := $(VENV)/built
 INTERFACES := ros_ws/src/msg_agents_interfaces
 EXAMPLES := ros_ws/src/msg_agents_example_protocols
 EXPERIMENTS := ros_ws/src/msg_agents_bringup/experiments
@@ -21,7 +22,7 @@ help: ## Say what can be made
 
 setup: $(VENV)/.packages ## Set up .venv with everything
 
-$(VENV)/.locked: requirements/lock.txt requirements/uv.txt requirements/install.py
+$(VENV)/.locked: requirements/lock.txt requirements/interfaces.txt requirements/uv.txt requirements/install.py
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("error: %s is Python %d.%d: need 3.11 or newer, give PYTHON=..." % (sys.executable, *sys.version_info[:2]))'
 	@echo "Setting up $(VENV) (about a minute, once)" >&2
 	$(PYTHON) -m venv $(VENV)
@@ -29,7 +30,8 @@ $(VENV)/.locked: requirements/lock.txt requirements/uv.txt requirements/install.
 	@touch $@
 
 $(VENV)/.interfaces: $(VENV)/.locked $(wildcard $(INTERFACES)/msg/*) $(INTERFACES)/CMakeLists.txt $(INTERFACES)/package.xml $(INTERFACES)/pyproject.toml
-	$(PIP) install $(LOCAL) --force-reinstall ./$(INTERFACES)
+	$(PIP) install $(LOCAL) --force-reinstall $(or $(wildcard $(BUILT)/*.whl),./$(INTERFACES))
+	@rm -rf $(BUILT)
 	@touch $@
 
 # Compat: folders on the path, where the default is a program that runs at each start of Python.
@@ -130,6 +132,7 @@ COMPILE := pip compile --universal --python-version 3.11 --generate-hashes --no-
 
 lock: setup ## Pin the newest versions
 	cd requirements && ../$(BIN)/uv $(COMPILE) --output-file lock.txt runtime.in build.in dev.in
+	cd requirements && ../$(BIN)/uv $(COMPILE) --constraint lock.txt --output-file interfaces.txt interfaces.in
 	cd requirements && ../$(BIN)/uv $(COMPILE) --output-file uv.txt uv.in
 
 clean: ## Remove all that was made, runs excepted

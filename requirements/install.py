@@ -1,7 +1,8 @@
 """Installs the packages of lock.txt into the environment of this Python: by uv, or by pip where uv cannot do it.
 
 uv, several times as fast, is a package like the others (uv.txt). It does not read pip's settings, so it gets those that
-say where packages are. Both check the hash of every file, and neither writes outside of the environment.
+say where packages are. Both check the hash of every file, and neither writes outside of the environment. uv installs
+first what builds the package of the messages (interfaces.txt), which is then built while the rest is being installed.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 HERE = Path(__file__).resolve().parent
+INTERFACES = HERE.parent / "ros_ws" / "src" / "msg_agents_interfaces"
+BUILT = Path(sys.prefix) / "built"  # folder for its wheel, which the Makefile installs
 PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-cache-dir"]
 BY_PIP = "pip installs the packages, which takes a minute longer"
 SETTINGS = {
@@ -34,7 +37,7 @@ def main() -> None:
     """Install; the exit code is that of the program that did it."""
     if subprocess.run([*PIP, "install", "--quiet", *hashed("uv.txt")]).returncode:
         print(f"uv cannot be had: {BY_PIP}", file=sys.stderr)
-    elif not install_by_uv():
+    elif not install_in_two_parts():
         return
     else:
         print(f"uv has failed: {BY_PIP}", file=sys.stderr)
@@ -46,19 +49,33 @@ def hashed(file: str) -> list[str]:
     return ["--require-hashes", "--requirement", str(HERE / file)]
 
 
-def install_by_uv() -> int:
+def install_in_two_parts() -> int:
+    """Exit code of uv."""
+    cache = Path(sys.prefix) / "uv_cache"  # from where it links files to their places
+    try:
+        code = install_by_uv("interfaces.txt", cache)
+        if code:
+            return code
+        # If it fails, the Makefile builds it again, and says why.
+        build = [*PIP, "wheel", "--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--wheel-dir", str(BUILT)]
+        quiet = subprocess.DEVNULL
+        with subprocess.Popen([*build, str(INTERFACES)], stdin=quiet, stdout=quiet, stderr=quiet):
+            return install_by_uv("lock.txt", cache)
+    finally:
+        shutil.rmtree(cache, ignore_errors=True)
+
+
+def install_by_uv(file: str, cache: Path) -> int:
     """Its exit code; what it prints, without the names of all packages."""
     uv = str(Path(sysconfig.get_path("scripts")) / "uv")
     # Which of several indexes a file is from does not matter: its hash is checked.
     command = [uv, "pip", "install", "--python", sys.executable, "--index-strategy", "unsafe-best-match"]
-    cache = Path(sys.prefix) / "uv_cache"  # from where it links files to their places
     variables = {"UV_CACHE_DIR": str(cache)} | variables_of_uv() | os.environ
-    with subprocess.Popen([*command, *hashed("lock.txt")], env=variables, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([*command, *hashed(file)], env=variables, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         for line in process.stderr:
             if not line.startswith((" + ", " - ", " ~ ")):
                 print(f"  {line}", end="", file=sys.stderr)
-    shutil.rmtree(cache, ignore_errors=True)
     return process.returncode
 
 

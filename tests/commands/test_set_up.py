@@ -52,3 +52,23 @@ def test_settings_of_pip(install: Any, tmp_path: Path, monkeypatch: pytest.Monke
         "UV_HTTP_TIMEOUT": "60",
         "SSL_CERT_FILE": str(tmp_path / "some.pem"),
     }
+
+
+def pinned(file: str) -> dict[str, list[str]]:
+    """Hashes by package, version, and the Pythons that it is for."""
+    found: dict[str, list[str]] = {}
+    for line in (FILE.parent / file).read_text().splitlines():
+        words = line.rstrip(" \\").strip()
+        if words.startswith("--hash="):
+            found[name].append(words)
+        elif "==" in words and not words.startswith("#"):
+            name = words
+            found[name] = []
+    return found
+
+
+def test_what_is_installed_first_is_what_is_installed_in_the_end() -> None:
+    first, everything = pinned("interfaces.txt"), pinned("lock.txt")
+    assert "scikit-build-core" in " ".join(first)
+    assert all(first.values())
+    assert first.items() <= everything.items()
