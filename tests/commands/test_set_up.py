@@ -57,6 +57,7 @@ def test_settings_of_pip(install: Any, tmp_path: Path, monkeypatch: pytest.Monke
 def pinned(file: str) -> dict[str, list[str]]:
     """Hashes by package, version, and the Pythons that it is for."""
     found: dict[str, list[str]] = {}
+    name = ""
     for line in (FILE.parent / file).read_text().splitlines():
         words = line.rstrip(" \\").strip()
         if words.startswith("--hash="):
