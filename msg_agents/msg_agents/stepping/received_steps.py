@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+
+import numpy as np
 
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
+from msg_analysis.types import IntArray
 from msg_analysis.wire.refusals import Refusal
 
+_MASK = 0x3FFFFFFF  # of the bits of a content that are in its mark
 CONSECUTIVE = 64
 """Steps in a row after which those before them are taken for lost: the reader came late, for example."""
+
+
+def marks_of(contents: IntArray) -> array[int]:
+    """Marks of so many contents: numbers of 30 bits, not 0."""
+    return array("i", ((contents & _MASK) + 1).astype(np.int32).tobytes())
 
 
 class ReceivedSteps:
@@ -42,7 +50,7 @@ class ReceivedSteps:
                 self._move(step - 1)
         if step > self.row + RESEND_LIMIT:
             return Refusal.TOO_NEW
-        slot, mark = step % len(self._marks), (content & 0x3FFFFFFF) + 1
+        slot, mark = step % len(self._marks), (content & _MASK) + 1
         known = self._marks[slot]
         if not known:
             self._marks[slot] = mark
@@ -54,14 +62,14 @@ class ReceivedSteps:
         self._marks[slot] = -known
         return Refusal.CONTRADICTION
 
-    def take_row(self, first: int, contents: Sequence[int]) -> bool:
+    def take_row(self, first: int, marks: array[int]) -> bool:
         """Take the steps from ``first`` on at once, if they follow ``row`` and all are new; else False, and none."""
-        size, last = len(self._marks), first + len(contents) - 1
+        size, last = len(self._marks), first + len(marks) - 1
         slot = first % size
-        end = slot + len(contents)
+        end = slot + len(marks)
         if first != self.row + 1 or last > self._last or end > size or any(self._marks[slot:end]):
             return False
-        self._marks[slot:end] = array("i", [(content & 0x3FFFFFFF) + 1 for content in contents])
+        self._marks[slot:end] = marks
         self._move(last)
         while self.row < self._last and self._marks[(self.row + 1) % size]:
             self._move(self.row + 1)

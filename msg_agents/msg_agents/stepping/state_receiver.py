@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_agents.stepping.received_steps import ReceivedSteps
+from msg_agents.stepping.received_steps import ReceivedSteps, marks_of
 from msg_analysis.bags.format.mcap_chunks import gather
 from msg_analysis.bags.state_columns import States, own_layout, run_number
 from msg_analysis.model.run.record import RunRecord
-from msg_analysis.types import AnyArray, BoolArray, IntArray
+from msg_analysis.types import BoolArray, IntArray
 from msg_analysis.wire.cdr_fields import CdrError
 from msg_analysis.wire.receiving import fault_of, state_frame, why_refused
 from msg_analysis.wire.refusals import Refusal
@@ -78,30 +78,38 @@ class StateReceiver:
         data, start, size = self._messages(refused)
         states, _ = own_layout(data, start, size, np.arange(len(start)))
         good = self._possible(states)
-        kept = np.zeros(len(start), np.bool_)
-        kept[states.position[good]] = True
-        for index in np.flatnonzero(~kept).tolist():
-            refused.append(self._fault(data[start[index] : start[index] + size[index]]))
-        states = states[good]
+        if not good.all() or len(states) < len(start):
+            kept = np.zeros(len(start), np.bool_)
+            kept[states.position[good]] = True
+            for index in np.flatnonzero(~kept).tolist():
+                refused.append(self._fault(data[start[index] : start[index] + size[index]]))
+            states = states[good]
         agent, step = states.agent - 1, states.step
-        new = self._take(agent, step, self._marks(data, states.start, size[states.position]), refused)
-        states = states[new]
+        new = self._take(agent, step, self._contents(data, states.start, size[states.position]), refused)
+        if not new.all():
+            states, agent, step = states[new], agent[new], step[new]
         time = np.maximum(states.stamp, 0)
-        return Received(data, states.start, size[states.position], agent[new], step[new], time, refused)
+        return Received(data, states.start, size[states.position], agent, step, time, refused)
 
-    def _take(self, agent: IntArray, step: IntArray, marks: AnyArray, refused: list[tuple[str, str]]) -> BoolArray:
+    def _take(self, agent: IntArray, step: IntArray, contents: IntArray, refused: list[tuple[str, str]]) -> BoolArray:
         """(states,) which of them to write: those that have not come before, and of contradicting ones two."""
         new = np.ones(len(agent), np.bool_)
         if not len(agent):
             return new
         order = np.argsort(agent, kind="stable")
-        present, first = np.unique(agent[order], return_index=True)
-        for i, its in zip(present.tolist(), np.split(order, first[1:]), strict=True):
-            received, steps = self._received[i], step[its]
-            if (np.diff(steps) == 1).all() and received.take_row(int(steps[0]), marks[its].tolist()):
+        agents, steps, marks = agent[order], step[order], marks_of(contents[order])
+        first = np.flatnonzero(np.diff(agents, prepend=-1))  # of each agent
+        follows = np.diff(steps, prepend=0) == 1
+        follows[first] = True
+        in_a_row = np.logical_and.reduceat(follows, first).tolist()
+        ends = [*first[1:].tolist(), len(agents)]
+        for i, begin, end, row in zip(agents[first].tolist(), first.tolist(), ends, in_a_row, strict=True):
+            received = self._received[i]
+            if row and received.take_row(int(steps[begin]), marks[begin:end]):
                 continue  # as nearly always
-            for index, k, mark in zip(its.tolist(), steps.tolist(), marks[its].tolist(), strict=True):
-                refusal = received.take(k, mark)
+            its = order[begin:end]
+            for index, k, content in zip(its.tolist(), step[its].tolist(), contents[its].tolist(), strict=True):
+                refusal = received.take(k, content)
                 if refusal:
                     refused.append((self.names[i], refusal))
                     # Of a contradiction one is forged: the reader of the bag takes neither.
@@ -137,8 +145,8 @@ class StateReceiver:
         good &= (states.replicas == frame.replicas) & (states.heard_count <= frame.most_heard)
         good &= (states.agent >= 1) & (states.agent <= len(self.names))
         good &= (mode <= self._graphs) & ((mode == 0) == (step == 0))
-        found = np.flatnonzero(good)
-        good[found] = np.isfinite(states[found].state(frame.replicas)).all(axis=1)
+        found = states if good.all() else states[good]
+        good[good] = np.isfinite(found.state(frame.replicas)).all(axis=1)
         return good
 
     def _fault(self, data: bytes) -> tuple[str, str]:
@@ -148,11 +156,11 @@ class StateReceiver:
             return self.topic.name, why_refused(data, self._record, None, self._frame)
         return self.names[frame[0] - 1], fault_of(*frame[1:], self._graphs) or Refusal.OTHER_LAYOUT
 
-    def _marks(self, data: bytes, start: IntArray, size: IntArray) -> AnyArray:
-        """(states,) a mark of every message: messages with different marks differ."""
-        marks = np.zeros(len(start), np.uint64)
+    def _contents(self, data: bytes, start: IntArray, size: IntArray) -> IntArray:
+        """(states,) a number of every message: messages with different numbers differ."""
+        sums = np.zeros(len(start), np.uint64)
         for length in np.unique(size).tolist():
             alike = np.flatnonzero(size == length)
             words = gather(data, start[alike], length).view("<u4").reshape(len(alike), -1)
-            marks[alike] = words.astype(np.uint64) @ self._weights[: words.shape[1]]
-        return marks >> _MARK_SHIFT
+            sums[alike] = words.astype(np.uint64) @ self._weights[: words.shape[1]]
+        return (sums >> _MARK_SHIFT).astype(np.int64)
