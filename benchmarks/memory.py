@@ -16,6 +16,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +31,16 @@ from msg_agents.running.runner import run_network
 from msg_agents.stepping.state_receiver import StateReceiver
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.bags.writer import BagWriter
+from msg_analysis.model.arithmetic.step_clock import SECOND, StepClock
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.twin.simulate import new_record, simulate
-from msg_analysis.wire.messages import StateCodec
+from msg_analysis.wire.messages import STATE_HEAD, StateCodec
 from msg_analysis.wire.state_batches import encode_batch
 from msg_analysis.wire.topics import GRAPH, PROGRESS, STATE, STATES, agent_name, network_topics
 
 POINTS = 5
-AGENTS, STEPS_IN_AN_HOUR = 1000, 360_000
+AGENTS, STEPS_IN_AN_HOUR = 1000, 210_000  # at 58 steps a second, docs/scale.md
 TOGETHER = 25  # sojourns after which made-up agents tell their steps
 
 
@@ -61,31 +63,46 @@ def resident(process: int | str = "self") -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def batches(record: RunRecord, steps: int, rounds: int) -> Iterator[bytes]:
+    """Batches of so many steps of all agents; from the second on the same bytes, with other steps and stamps."""
+    agents = record.experiment.agents
+    codecs = [StateCodec(record.run.bytes, i + 1, 1, 0.05) for i in range(agents)]
+    payloads = np.random.default_rng(0).random((agents, 8)).tobytes()
+    messages: list[bytes] = []
+    for first in (0, rounds):
+        messages = [
+            codec.wrap(k, min(k, 1), payloads[8 * (i + k % 8) : 8 * (i + k % 8) + 8])
+            for k in range(first, first + rounds)
+            for i, codec in enumerate(codecs)
+        ]
+        yield encode_batch(record.run.bytes, messages)
+    length = len(messages[0])
+    batch = bytearray(encode_batch(record.run.bytes, messages))
+    rest = f"V{length - STATE_HEAD.itemsize}"
+    states = np.frombuffer(batch, [("head", STATE_HEAD), ("rest", rest)], offset=len(batch) - length * len(messages))
+    clock, head = StepClock(0.05), states["head"]
+    for first in range(2 * rounds, steps, rounds):
+        head["step"] += np.uint64(rounds)
+        times = [clock.nanoseconds(k) for k in range(first, first + rounds)]
+        head["seconds"], head["nanoseconds"] = np.repeat(np.divmod(times, SECOND), agents, axis=1)
+        yield bytes(batch)
+
+
 def recorder(agents: int, steps: int, rounds: int = 20) -> None:
     """Record so many steps, ``rounds`` of each agent in a batch, and print the memory on the way."""
     record = new_record(ring(agents, steps))
-    codecs = [StateCodec(record.run.bytes, i + 1, 1, 0.05) for i in range(agents)]
-    payloads = np.random.default_rng(0).random((agents, 8)).tobytes()
     receiver = StateReceiver(record, STATES, STATE, "/")
     shown = []
     with (
         tempfile.TemporaryDirectory() as folder,
         BagWriter(Path(folder) / "bag", network_topics(agents), record=record.to_json()) as bag,
     ):
-        for first in range(0, steps, rounds):
-            receiver.add(
-                encode_batch(
-                    record.run.bytes,
-                    [
-                        codec.wrap(k, min(k, 1), payloads[8 * (i + k % 8) : 8 * (i + k % 8) + 8])
-                        for k in range(first, first + rounds)
-                        for i, codec in enumerate(codecs)
-                    ],
-                )
-            )
+        for number, batch in enumerate(batches(record, steps, rounds)):
+            receiver.add(batch)
             found = receiver.take()
+            assert not found.refused
             bag.write_many(receiver.names, found.agent, found.time, found.data, found.start, found.size)
-            if (first + rounds) % (steps // POINTS) < rounds:
+            if (number + 1) * rounds % (steps // POINTS) < rounds:
                 shown.append(f"{resident():.0f}")
     print(f"| recorder, {agents} agents, {steps} steps | {' | '.join(shown)} |", flush=True)
 
