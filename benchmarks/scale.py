@@ -87,7 +87,7 @@ def children_memory() -> int:
 
 def measure(agents: int, processes: int) -> Point:
     """Run a network of a few seconds."""
-    what = experiment(agents, processes, steps=max(100, min(10_000, 40_000 // agents)))
+    what = experiment(agents, processes, steps=max(300, min(10_000, 300_000 // agents)))
     start, memory = 0.0, 0
 
     def look(_: int) -> None:
