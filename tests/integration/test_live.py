@@ -115,6 +115,19 @@ def test_a_run_of_which_no_state_comes_is_over(network: Any, domain: int) -> Non
     assert "no complete step yet" in stdout
 
 
+@pytest.mark.parametrize("options", [(), ("--reliable",)])
+def test_the_player_does_not_wait_for_a_watcher_that_has_left(
+    network: Any, domain: int, options: tuple[str, ...]
+) -> None:
+    """The watcher ends with the run, long before the middleware asks it what it has got."""
+    bag = network.directory / "bag"
+    write_trajectory(simulate(network.experiment()), bag)
+    live = network.start("live", *options)
+    _, said = ended(network.start("play", bag, "--rate", "max", "--await", "live"))
+    assert "waiting until the readers" not in said
+    assert live.wait(60) in (0, 3)  # with best effort it may have missed the last step
+
+
 def test_a_watcher_that_is_stopped_holds_nobody_up(network: Any, domain: int) -> None:
     """By default nobody waits for it: it misses states, and says how many steps that makes."""
     bag = network.directory / "bag"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import rclpy
@@ -15,7 +16,7 @@ from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from msg_agents.nodes.node_process import SPIN_SLICE, leave, make_executor
+from msg_agents.nodes.node_process import INTERRUPTED_GRACE, SPIN_SLICE, leave, make_executor
 from msg_agents.nodes.ros.lean_node import LeanNode
 from msg_agents.nodes.ros.node_parameters import ros_arguments
 from msg_agents.processes.environment import discovery_scope, without_shared_memory
@@ -149,10 +150,25 @@ def run_watcher(
     finally:
         for node in nodes:
             node.conclude()
-        # After the run no node waits for this one, and leaving while others leave can deadlock: see ``leave``.
-        if not all(node.done.done() for node in nodes):
+        if all(node.done.done() for node in nodes):
+            _stop_reading(nodes, executor)
+        else:
             leave(nodes, executor, complete=False)
     return nodes[0] if nodes else None
+
+
+def _stop_reading(nodes: Sequence[Watcher], executor: Executor | None) -> None:
+    """Remove the readers from the network: who publishes to them would wait until the middleware gives them up, 20 s.
+
+    The participant stays until the end of the process: to remove it while others leave can deadlock, see ``leave``.
+    """
+    faulthandler.dump_traceback_later(INTERRUPTED_GRACE, exit=True)  # should that happen here, too
+    if executor is not None:
+        executor.shutdown()
+    for node in nodes:
+        for subscription in list(node.subscriptions):
+            node.destroy_subscription(subscription)
+    faulthandler.cancel_dump_traceback_later()
 
 
 def _spin(executor: Executor, done: Future, on_look: Callable[[], None]) -> None:
