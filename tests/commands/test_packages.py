@@ -1,0 +1,63 @@
+"""The ROS packages as tools of ROS read them: what they depend on, and what a release of them needs."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import pytest
+import setuptools
+import yaml
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = sorted(file.parent for file in (ROOT / "ros_ws/src").glob("*/package.xml"))
+KEYS = yaml.safe_load((ROOT / "tests/data/rosdep_keys.yaml").read_text())["keys"]
+OF_PYTHON = {"python3-yaml": "pyyaml"}  # packages whose key has another name
+BROUGHT = {"markupsafe"}  # by jinja2, as a package of a distribution, too
+
+
+def manifest(package: Path) -> ET.Element:
+    return ET.parse(package / "package.xml").getroot()
+
+
+def dependencies(package: Path) -> set[str]:
+    return {str(element.text) for element in manifest(package) if element.tag.endswith("depend")}
+
+
+def required(package: Path, monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """What pip would install with it."""
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(setuptools, "setup", given.update)
+    monkeypatch.setattr(sys, "argv", ["setup.py", "install"])
+    monkeypatch.chdir(package)
+    runpy.run_path(str(package / "setup.py"))
+    return {re.split("[<>=]", name)[0] for name in given["install_requires"]}
+
+
+def by_pip() -> set[str]:
+    """What the quick start for ROS users installs by pip."""
+    page = (ROOT / "docs/ros.md").read_text(encoding="utf-8")
+    (words,) = re.findall(r"^    pip install (.*)$", page.replace("\\\n", ""), flags=re.MULTILINE)
+    return {re.split("[<>=]", word.strip("'"))[0] for word in words.split()}
+
+
+def test_there_are_packages() -> None:
+    assert len(PACKAGES) == 5
+
+
+def test_every_dependency_has_a_rosdep_key() -> None:
+    """Without one, ``rosdep install`` refuses the whole workspace. The list has none that is not used."""
+    own = {package.name for package in PACKAGES}
+    used = set().union(*map(dependencies, PACKAGES)) - own
+    assert used == {key for keys in KEYS.values() for key in keys}
+
+
+@pytest.mark.parametrize("package", [p for p in PACKAGES if (p / "setup.py").is_file()], ids=lambda p: p.name)
+def test_what_has_no_key_comes_by_pip(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    keys = {OF_PYTHON.get(key, key.removeprefix("python3-")) for key in KEYS["rosdep/python.yaml"]}
+    assert required(package, monkeypatch) - {p.name for p in PACKAGES} - BROUGHT <= keys | by_pip()
+    assert "pydantic" in by_pip()  # the key gives version 1 on Ubuntu 24.04
