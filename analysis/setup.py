@@ -1,8 +1,12 @@
 import os
+import sys
 
 from setuptools import Extension, find_packages, setup
 
 PACKAGE = "msg_analysis"
+# A wheel puts executables into the user's PATH; colcon and distributions put them into lib/msg_analysis (setup.cfg),
+# where `ros2 run` finds them, and the command line into bin, too.
+WHEEL = {"bdist_wheel", "editable_wheel", "dist_info"} & set(sys.argv)
 
 # Without a compiler the package works all the same, only slower. Fused multiply-adds would change the last bits.
 KERNEL = Extension(
@@ -17,8 +21,8 @@ setup(
     version="0.1.0",
     description="Theory, bags and statistics of networks of agents under Markov-switching graphs, free of ROS",
     license="Apache-2.0",
-    author="The msg_agents authors",
-    maintainer="The msg_agents authors",
+    author="msg_agents maintainers",
+    maintainer="msg_agents maintainers",
     maintainer_email="maintainers@msg-agents.example.org",
     python_requires=">=3.11",
     ext_modules=[KERNEL],
@@ -34,6 +38,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
+        *([] if WHEEL else [("bin", ["bin/msg-analysis"])]),
     ],
     zip_safe=False,
     install_requires=[

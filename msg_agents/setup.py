@@ -5,7 +5,7 @@ from setuptools import find_packages, setup
 PACKAGE = "msg_agents"
 NODES = ("agent", "switcher", "recorder", "player", "live", "markers")
 # A wheel puts executables into the user's PATH, where only the command line belongs; colcon and distributions put them
-# into lib/msg_agents (setup.cfg), where `ros2 run` and `ros2 launch` find them.
+# into lib/msg_agents (setup.cfg), where `ros2 run` and `ros2 launch` find them, and the command line into bin, too.
 WHEEL = {"bdist_wheel", "editable_wheel", "dist_info"} & set(sys.argv)
 
 setup(
@@ -13,8 +13,8 @@ setup(
     version="0.1.0",
     description="Networks of agents under Markov-switching graphs, as ROS 2 nodes",
     license="Apache-2.0",
-    author="The msg_agents authors",
-    maintainer="The msg_agents authors",
+    author="msg_agents maintainers",
+    maintainer="msg_agents maintainers",
     maintainer_email="maintainers@msg-agents.example.org",
     python_requires=">=3.11",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
@@ -22,6 +22,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
+        *([] if WHEEL else [("bin", ["bin/msg-agents"])]),
     ],
     zip_safe=False,
     # rclpy, std_msgs and the interfaces come with ROS 2, as system packages or as wheels: see package.xml.
@@ -31,6 +32,7 @@ setup(
         "console_scripts": [
             "msg-agents = msg_agents.cli.entry_points:msg_agents",
             *(f"{node} = msg_agents.cli.entry_points:{node}" for node in (() if WHEEL else NODES)),
-        ]
+        ],
+        "ros2cli.command": ["msg-agents = msg_agents.cli.entry_points:Verb"],
     },
 )

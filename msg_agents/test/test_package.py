@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,21 @@ def test_executable(name: str) -> None:
     process = subprocess.run([file, "--help"], capture_output=True, text=True, timeout=60)
     assert process.returncode == 0, process.stderr
     assert "Usage: msg-agents" in process.stdout or "Usage: " in process.stdout
+
+
+def test_command_line_on_the_path() -> None:
+    """In ``bin``, which ``setup.bash`` puts on the PATH; without the nodes, which are no commands of the user."""
+    folder = LIBEXEC.parents[1] / "bin"
+    process = subprocess.run([folder / "msg-agents", "--help"], capture_output=True, text=True, timeout=60)
+    assert process.returncode == 0, process.stderr
+    assert "Usage: msg-agents" in process.stdout
+    assert not (folder / "agent").exists()
+
+
+def test_verb() -> None:
+    """What ``ros2 msg-agents`` loads; this entry point is all that ros2cli looks for."""
+    (verb,) = entry_points(group="ros2cli.command", name="msg-agents")
+    assert verb.load().main
 
 
 def test_share() -> None:

@@ -1,11 +1,17 @@
-"""Installed entry points: the command line, and the nodes as executables of the ROS 2 package.
+"""Installed entry points: the command line, the nodes as executables of the ROS 2 package, and the verb of ``ros2``.
 
 Each node is the command of that name of ``msg-agents``: ``ros2 run msg_agents agent --ros-args -p run:=... ...``.
 """
 
 from __future__ import annotations
 
+import os
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+if TYPE_CHECKING:
+    from argparse import ArgumentParser, Namespace
 
 
 def msg_agents() -> None:
@@ -51,3 +57,30 @@ def _run(*command: str) -> None:
 
         sys.exit(INTERRUPTED)
     main([*command, *sys.argv[1:]], prog_name="msg-agents")
+
+
+class Verb:
+    """Networks of agents: the command line msg-agents."""
+
+    # What is above is the line of ``ros2 --help``. ros2cli asks for these two methods, not for a base class of its own,
+    # so that nothing is needed where there is no ros2cli.
+
+    def add_arguments(self, parser: ArgumentParser, cli_name: str) -> None:  # noqa: ARG002  as ros2cli calls it
+        """Take all that follows, options too, even ``--help``: no character begins an option of the verb itself."""
+        parser.prefix_chars = ""
+        parser.add_argument("arguments", nargs="...")
+
+    def main(self, *, parser: ArgumentParser, args: Namespace) -> NoReturn:  # noqa: ARG002  as ros2cli calls it
+        """Become the command line: its signals, streams and exit code are those of ``ros2``."""
+        sys.stdout.flush()
+        program = _program()
+        os.execv(program[0], [*program, *args.arguments])
+
+
+def _program() -> list[str]:
+    """The installed executable, since its Python may be another one than that of ``ros2``; without one, the module."""
+    for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        executable = Path(prefix, "lib", "msg_agents", "msg-agents")
+        if prefix and os.access(executable, os.X_OK):
+            return [str(executable)]
+    return [sys.executable, "-P", "-m", "msg_agents"]
