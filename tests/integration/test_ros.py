@@ -17,7 +17,8 @@ import yaml
 from mcap.reader import make_reader
 
 from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.running.launch_support import NETWORK_ARGUMENTS, LaunchedNetwork, environment
+from msg_agents.running.launch_arguments import NETWORK_ARGUMENTS
+from msg_agents.running.launch_support import ANALYSIS, LaunchedNetwork, environment
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 
@@ -162,15 +163,18 @@ def test_what_the_launch_files_do(network: Any) -> None:
         plan.name: start(plan.arguments[0], *plan.arguments[1:], *ros, environment=environment())
         for plan in launched.processes
     }
-    completed = []
     for name, process in running.items():
+        assert not launched.over
         process.communicate(timeout=90)
-        completed.append(launched.ended(name, process.returncode))
-    assert completed == [False, False, False, True]
-    assert launched.analysis
+        launched.ended(name, process.returncode)
+    assert launched.over
     assert launched.bag
-    analysis = start("msg-analysis", *launched.analysis)
+    comparison = launched.analysis()
+    assert comparison
+    analysis = start("msg-analysis", *comparison)
     stdout, stderr = analysis.communicate(timeout=90)
+    launched.ended(ANALYSIS, analysis.returncode)
+    assert (launched.reason is None) == (analysis.returncode == 0)
     assert analysis.returncode in (0, 1), stderr  # which, is a matter of the seed
     assert "Mean-square error" in stdout
     launched.close()

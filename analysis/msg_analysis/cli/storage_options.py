@@ -6,10 +6,15 @@ from collections.abc import Callable
 
 import click
 
-from msg_analysis.bags.format.storage_options import COMPRESSIONS, DEFAULT_STORAGE, MEGABYTE, Compression, Storage
+from msg_analysis.bags.format.storage_options import (
+    COMPRESSIONS,
+    DEFAULT_STORAGE,
+    MEGABYTE,
+    SMALLEST_SPLIT,
+    Compression,
+    Storage,
+)
 from msg_analysis.errors import InputError
-
-SMALLEST_SPLIT = 0.1  # MB; about the size of a chunk
 
 
 def storage_options(command: Callable[..., None]) -> Callable[..., None]:

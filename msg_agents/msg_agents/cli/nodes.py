@@ -14,6 +14,7 @@ from click.shell_completion import CompletionItem
 
 from msg_agents.cli.ros_command import RosCommand
 from msg_agents.processes.environment import DISCOVERY_TIMEOUT
+from msg_agents.processes.lifeline import hold_pipe
 from msg_analysis.cli.console import examples
 from msg_analysis.cli.options import PATH, RUN_RECORD, PositiveFloat, suggest
 from msg_analysis.cli.storage_options import storage, storage_options
@@ -220,10 +221,10 @@ def _run_nodes(
     parameter_services: bool,  # noqa: ARG001  see LeanNode
     patience: float | None = None,
 ) -> None:
-    from msg_agents.nodes.node_process import hold_lifeline, run_nodes
-
     if lifeline is not None:
-        hold_lifeline(lifeline)
+        hold_pipe(lifeline)
+    from msg_agents.nodes.node_process import run_nodes
+
     executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
     throughput = record.experiment.run.pace == "lockstep"
     if not run_nodes(

@@ -57,13 +57,12 @@ class _Rate(click.types.FloatParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """See click.ParamType."""
+        from msg_agents.replay.bag_clock import parse_rate
+
         try:
-            rate = math.inf if value == "max" else float(value)
+            return parse_rate(value)
         except ValueError:
-            rate = math.nan
-        if not rate > 0 or (isinstance(value, str) and math.isinf(rate) and value != "max"):
             self.fail(f"{value}: expected a positive number, or max (as a parameter, .inf)", param, ctx)
-        return rate
 
 
 @click.command(

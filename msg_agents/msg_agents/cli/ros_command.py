@@ -16,6 +16,8 @@ from msg_agents.nodes.ros.node_parameters import (
     options_of,
 )
 from msg_agents.processes.environment import check_domain, tolerate_warnings
+from msg_agents.processes.lifeline import hold_lock
+from msg_analysis.cli.options import PATH
 
 
 class RosCommand(click.Command):
@@ -27,6 +29,7 @@ class RosCommand(click.Command):
 
     def __init__(self, *args: Any, node_name: str | None = None, **options: Any) -> None:
         super().__init__(*args, **options)
+        self.params.append(click.Option(["--lifeline-lock"], type=PATH, hidden=True))  # given by launch files
         self.node_name = node_name or self.name or ""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -46,6 +49,8 @@ class RosCommand(click.Command):
     def invoke(self, ctx: click.Context) -> Any:
         """As in click; without ``--domain``, ROS_DOMAIN_ID is checked first."""
         tolerate_warnings()
+        if (folder := ctx.params.pop("lifeline_lock", None)) is not None:
+            hold_lock(folder)
         if ctx.params.get("domain") is None:
             check_domain()
         return super().invoke(ctx)

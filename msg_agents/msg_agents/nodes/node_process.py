@@ -9,7 +9,6 @@ import gc
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -36,7 +35,6 @@ SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wak
 GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collections find nothing
 LEAVE_GRACE = 5  # s
 INTERRUPTED_GRACE = 15  # s; longer, because a process that ends by it has failed
-LIFELINE_GRACE = 5.0  # s
 USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
 
 
@@ -72,19 +70,6 @@ def prefer_throughput() -> None:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def hold_lifeline(descriptor: int) -> None:
-    """End this process when the other end of a pipe closes: its parent has ended, for whatever reason."""
-
-    def watch() -> None:
-        while os.read(descriptor, 1):
-            pass
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(LIFELINE_GRACE)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True, name="lifeline").start()
-
-
 def run_nodes(
     make_nodes: Callable[[], Sequence[NetworkNode]],  # called after rclpy.init
     *,
@@ -102,7 +87,8 @@ def run_nodes(
     """
     # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
     # installed on top, ends the spin between two callbacks.
-    signal.signal(signal.SIGINT, lambda *_: None)
+    told: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: told.append(number))
     if throughput:
         prefer_throughput()
     with ros_arguments():
@@ -113,6 +99,8 @@ def run_nodes(
     spinner: Executor | None = None
     complete = False
     try:
+        if told:  # before ROS's handler was there
+            raise ExternalShutdownException
         nodes = make_nodes()
         if introduction is not None:
             prefix = own_prefix(nodes[0])
@@ -146,6 +134,9 @@ def run_nodes(
             node.finish(complete=complete, deadline=deadline)
         if reporter:
             reporter.write_status_file()
+        # Launchers without a terminal pass on a SIGINT that all have got. Python gives it its default action while it
+        # ends, unless it is ignored: the process would be killed before the middleware has removed its shared memory.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if prefix and ends_at_once():
             leave_at_once(nodes, spinner, prefix)
         else:

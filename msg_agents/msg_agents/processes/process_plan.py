@@ -87,6 +87,7 @@ def plan_network(
     checkpoints: Path | None = None,  # directory of the states for a takeover; None: killed processes cannot resume
     *,
     use_sim_time: bool = False,
+    parameter_services: bool = False,
     storage: Storage = DEFAULT_STORAGE,
     share: Share | None = None,
     most: int = MOST_UNAIDED,
@@ -98,6 +99,8 @@ def plan_network(
     here = tuple(range(experiment.agents)) if share is None else share.agents
     count = count_processes(experiment, len(here), most=most)
     common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
+    if parameter_services:
+        common += ("--parameter-services",)
     timeout = discovery_timeout(experiment.agents, count) if share is None else share.discovery_timeout
     if timeout != DISCOVERY_TIMEOUT:
         common += ("--discovery-timeout", f"{timeout:g}")

@@ -9,6 +9,14 @@ from collections.abc import Callable
 from msg_analysis.model.arithmetic.step_clock import SECOND
 
 
+def parse_rate(word: object) -> float:
+    """A rate as users give it: a positive number, or "max" (inf); ValueError if it is neither."""
+    rate = math.inf if word == "max" else float(str(word))
+    if not rate > 0 or (isinstance(word, str) and math.isinf(rate) and word != "max"):
+        raise ValueError(word)
+    return rate
+
+
 class BagClock:
     """Time of a bag [ns], at ``rate`` seconds of the bag per second of wall time (inf: as fast as possible).
 

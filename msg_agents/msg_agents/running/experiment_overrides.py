@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
 from msg_analysis.model.experiment.yaml_document import read_yaml
 
 
-def load_with_overrides(path: Path, run: Mapping[str, Any]) -> ValidExperiment:
+def load_with_overrides(
+    path: Path, run: Mapping[str, Any], *, name: Callable[[str], str] = "--{}".format
+) -> ValidExperiment:
     """The experiment, checked once, after values of ``run`` were replaced; None replaces nothing.
 
-    ``processes`` may be a number as text.
+    ``processes`` may be a number as text. ``name``: how errors call the new value of a key.
     """
     changes = {key: value for key, value in run.items() if value is not None}
     if str(changes.get("processes", "")).isdigit():
@@ -25,7 +27,9 @@ def load_with_overrides(path: Path, run: Mapping[str, Any]) -> ValidExperiment:
     changed = document | {"run": section | changes}
     try:
         return ValidExperiment.parse(changed, source=str(path), directory=path.parent)
-    except InputError:
+    except InputError as error:
         ValidExperiment.parse(document, source=str(path), directory=path.parent)  # the fault may be the file's
-        given = ", ".join(f"--{key}" for key in changes)
+        problems = error.problems if isinstance(error, ExperimentError) else []
+        wrong = [key for key in changes if any(line.startswith(f"run.{key}:") for line in problems)]
+        given = ", ".join(name(key) for key in wrong or changes)
         return ValidExperiment.parse(changed, source=given, directory=path.parent)

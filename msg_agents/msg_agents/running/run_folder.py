@@ -65,10 +65,10 @@ def _clear_abandoned() -> None:
                 os.close(lock)
 
 
-def make_bag_directory(experiment: ValidExperiment, out: Path) -> Path:
+def make_bag_directory(experiment: ValidExperiment, out: Path, *, option: str = "--out: ") -> Path:
     """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name.
 
-    InputError: it cannot be made.
+    InputError: it cannot be made; ``option`` is how the user gave ``out``.
     """
     require_utf8(out)
     stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
@@ -83,4 +83,4 @@ def make_bag_directory(experiment: ValidExperiment, out: Path) -> Path:
                 candidate, number = out / f"{stem}_{number}", number + 1
     except OSError as error:
         place = "is a file" if out.is_file() else f"cannot be written ({error.strerror})"
-        raise InputError(f"--out: {out}: {place}: give a directory for the bags of runs") from error
+        raise InputError(f"{option}{out}: {place}: give a directory for the bags of runs") from error

@@ -1,9 +1,9 @@
-"""What launch files do, without ``launch``; and the launch files as far as they can be looked at without it."""
+"""What launch files do, without ``launch``. With it: tests/integration/test_launch.py."""
 
 from __future__ import annotations
 
-import ast
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,44 +11,13 @@ import pytest
 pytest.importorskip("rclpy")
 
 from msg_agents.processes.process_plan import plan_network
-from msg_agents.running.launch_support import (
-    NETWORK_ARGUMENTS,
-    REPLAY_ARGUMENTS,
-    LaunchedNetwork,
-    LaunchFailedError,
-    find_experiment,
-    replay_commands,
-)
+from msg_agents.running.launch_arguments import NETWORK_ARGUMENTS, REPLAY_ARGUMENTS
+from msg_agents.running.launch_support import ANALYSIS, LaunchedNetwork, LaunchedReplay
 from msg_agents.running.run_folder import PREFIX
-from msg_analysis.errors import InputError
 from msg_analysis.model.run.record import RunRecord
 
 BRINGUP = Path(__file__).parents[3] / "ros_ws/src/msg_agents_bringup"
-LAUNCH_FILES = sorted((BRINGUP / "launch").glob("*.launch.py"))
 DEFAULTS = {name: default for name, (default, _) in NETWORK_ARGUMENTS.items()}
-# What the launch files use of launch and launch_ros of Jazzy, with the arguments that these take by name.
-API = {
-    "ament_index_python.packages": {"get_package_share_directory": set()},
-    "launch": {"LaunchDescription": set()},
-    "launch.actions": {
-        "DeclareLaunchArgument": {"default_value", "description", "choices"},
-        "EmitEvent": {"event"},
-        "ExecuteProcess": {"cmd", "output", "additional_env"},
-        "LogInfo": {"msg"},
-        "OpaqueFunction": {"function", "args", "kwargs"},
-        "RegisterEventHandler": set(),
-    },
-    "launch.event_handlers": {"OnProcessExit": {"target_action", "on_exit"}, "OnShutdown": {"on_shutdown"}},
-    "launch.events": {"Shutdown": {"reason", "due_to_sigint"}},
-    "launch.substitutions": {"LaunchConfiguration": {"default"}},
-    "launch_ros.actions": {
-        "Node": {
-            *("package", "executable", "name", "namespace", "exec_name", "parameters", "remappings"),
-            *("ros_arguments", "arguments", "output", "additional_env"),
-        }
-    },
-    "launch_ros.substitutions": {"ExecutableInPackage": {"executable", "package"}},
-}
 
 
 def launched(out: Path, **changes: str) -> LaunchedNetwork:
@@ -70,7 +39,9 @@ def test_the_plan_is_that_of_the_runner(tmp_path: Path) -> None:
         record = RunRecord.from_json(run_file.read_text(), str(run_file))
         assert (record.experiment.run.seed, record.experiment.run.duration) == (5, 1.0)
         assert network.bag is not None
-        assert network.processes == plan_network(record.experiment, run_file, network.bag)
+        lifeline = ("--lifeline-lock", str(run_file.parent))
+        plans = plan_network(record.experiment, run_file, network.bag)
+        assert network.processes == [replace(plan, arguments=plan.arguments + lifeline) for plan in plans]
         assert [plan.name for plan in network.processes] == ["recorder", "agents_1_to_2", "agents_3_to_5", "switcher"]
         assert network.namespace == "/lab"
     finally:
@@ -78,14 +49,17 @@ def test_the_plan_is_that_of_the_runner(tmp_path: Path) -> None:
 
 
 def test_complete(tmp_path: Path) -> None:
-    """Only the last process to end completes the run; one that ended itself by an alarm has done its part."""
+    """The last process to end completes the run; one that ended itself by an alarm has done its part."""
     network = launched(tmp_path, processes="1")
     folder = workshops(network)
-    assert not network.ended("agents_1_to_5", 0)
-    assert not network.ended("switcher", -signal.SIGALRM)
-    assert network.ended("recorder", 0)
-    assert network.analysis == ["compare", str(network.bag), "--report", f"{network.bag}/report.html"]
-    network.analysed(0)
+    for name, code in (("agents_1_to_5", 0), ("switcher", -signal.SIGALRM)):
+        network.ended(name, code)
+        assert network.analysis() is None
+    network.ended("recorder", 0)
+    assert network.analysis() == ["compare", str(network.bag), "--report", f"{network.bag}/report.html"]
+    assert (network.over, network.analysis()) == (False, None)
+    network.ended(ANALYSIS, 0)
+    assert (network.over, network.reason, network.to_stop()) == (True, None, [])
     network.close()
     network.close()
     assert not folder.exists()
@@ -94,95 +68,88 @@ def test_complete(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("code", "words"), [(2, "exit code 2"), (-signal.SIGKILL, "killed by SIGKILL")])
 def test_failed(tmp_path: Path, code: int, words: str) -> None:
-    """Said once: the others end because of it."""
+    """Said once: the others end because of it, the recorder last. Until then they may read the run record."""
+    network = launched(tmp_path, processes="2")
+    assert network.to_stop() == []
+    network.ended("agents_1_to_2", code)
+    assert (network.to_stop(), network.to_stop()) == (["agents_3_to_5", "switcher"], [])
+    network.interrupted("stopped by Ctrl-C")
+    network.ended("switcher", 3)
+    network.ended("agents_3_to_5", -signal.SIGTERM)
+    assert network.to_stop() == ["recorder"]
+    assert (workshops(network) / "run.json").exists()
+    network.ended("recorder", 3)
+    assert (network.over, network.to_stop(), network.analysis()) == (True, [], None)
+    assert network.reason == f"agents_1_to_2: {words}: the run is not complete"
+    network.close()
+
+
+def test_a_recorder_that_failed(tmp_path: Path) -> None:
     network = launched(tmp_path, processes="1")
-    try:
-        with pytest.raises(LaunchFailedError, match=f"agents_1_to_5: {words}: the run is not complete"):
-            network.ended("agents_1_to_5", code)
-        assert not network.ended("switcher", 3)
-        assert not network.ended("recorder", 0)
-    finally:
+    network.ended("recorder", 2)
+    assert network.to_stop() == ["agents_1_to_5", "switcher"]
+    network.close()
+
+
+def test_interrupted(tmp_path: Path) -> None:
+    """What launch was told is the reason, not that its processes obeyed; data so far are kept with the run record."""
+    network = launched(tmp_path, processes="1")
+    assert network.bag is not None
+    (network.bag / f"{network.bag.name}_0.mcap").touch()
+    network.interrupted("stopped by Ctrl-C")
+    for name in ("agents_1_to_5", "switcher", "recorder"):
+        network.ended(name, 3)
+    assert network.reason == f"stopped by Ctrl-C: the run is not complete; its data so far are in {network.bag}"
+    network.close()
+    assert (network.bag / "log/run.json").exists()
+
+
+def test_interrupted_after_the_run(tmp_path: Path) -> None:
+    """Before the comparison, which launch does not start any more, or during it."""
+    for started in (False, True):
+        network = launched(tmp_path, processes="1")
+        for interrupted, name in ((False, "agents_1_to_5"), (not started, "switcher"), (False, "recorder")):
+            if interrupted:
+                network.interrupted("stopped by Ctrl-C")
+            network.ended(name, 0)
+        assert (network.analysis() is not None) == started
+        if started:
+            network.interrupted("stopped by Ctrl-C")
+            network.ended(ANALYSIS, 130)
+        when = "during" if started else "before"
+        assert network.reason == f"stopped by Ctrl-C {when} the comparison: no verdict of {network.bag}"
         network.close()
 
 
 @pytest.mark.parametrize(("code", "words"), [(1, "disagrees"), (3, "incomplete"), (2, "exit code 2")])
 def test_verdict(tmp_path: Path, code: int, words: str) -> None:
-    network = launched(tmp_path)
+    network = launched(tmp_path, processes="1")
+    for plan in network.processes:
+        network.ended(plan.name, 0)
+    assert network.analysis()
+    network.ended(ANALYSIS, code)
     network.close()
-    with pytest.raises(LaunchFailedError, match=words):
-        network.analysed(code)
+    assert network.reason is not None
+    assert words in network.reason
 
 
 def test_nothing_to_analyse(tmp_path: Path) -> None:
     for changes in ({"analyse": "false"}, {"record": "false"}):
         network = launched(tmp_path, **changes)
+        for plan in network.processes:
+            network.ended(plan.name, 0)
         network.close()
-        assert network.analysis is None
+        assert (network.over, network.analysis(), network.reason) == (True, None, None)
         assert ("recorder" in {plan.name for plan in network.processes}) == ("record" not in changes)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"experiment": "lin_ring"}, "experiment: lin_ring: expected a file, or one of discrete, .*line_ring"),
-        ({"experiment": "nowhere.yaml"}, "nowhere.yaml"),
-        ({"record": "perhaps"}, "record: perhaps: expected true or false"),
-        ({"seed": "1.5"}, "seed: 1.5: expected a whole number"),
-        ({"duration": "long"}, "duration: long: expected a number"),
-        ({"pace": "slow"}, 'run.pace: "slow"'),
-        ({"processes": "0"}, "run.processes"),
-        ({"pace": "realtime", "experiment": "nowhere.yaml"}, "nowhere"),
-    ],
-)
-def test_wrong_arguments(tmp_path: Path, changes: dict[str, str], words: str) -> None:
-    """Before anything is made."""
-    with pytest.raises((InputError, OSError), match=words):
-        launched(tmp_path / "runs", **changes)
-    assert not (tmp_path / "runs").exists()
-
-
-def test_examples_by_name() -> None:
-    assert find_experiment("line_ring", BRINGUP) == BRINGUP / "experiments/line_ring.yaml"
-    assert find_experiment(str(BRINGUP / "package.xml"), BRINGUP) == BRINGUP / "package.xml"
 
 
 def test_replay(tmp_path: Path) -> None:
     defaults = {name: default for name, (default, _) in REPLAY_ARGUMENTS.items()}
-    bag = str(tmp_path)
-    assert replay_commands(defaults | {"bag": bag, "rate": "max"}) == [
-        ("live", ["--reliable"]),
-        ("player", [bag, "--rate", "max", "--await", "live"]),
-    ]
-    alone = replay_commands(defaults | {"bag": bag, "live": "false", "loop": "true", "clock": "50"})
-    assert alone == [("player", [bag, "--rate", "1", "--loop", "--clock", "50"])]
-    for changes, words in (
-        ({}, "bag: not given"),
-        ({"bag": "/nowhere"}, "bag: /nowhere"),
-        ({"bag": bag, "loop": "yes"}, "loop: true"),
-    ):
-        with pytest.raises(InputError, match=words):
-            replay_commands(defaults | changes)
-
-
-def test_arguments_are_documented() -> None:
-    text = (BRINGUP.parents[2] / "docs/ros.md").read_text(encoding="utf-8")
-    assert [name for name in {**NETWORK_ARGUMENTS, **REPLAY_ARGUMENTS} if f"`{name}`" not in text] == []
-
-
-@pytest.mark.parametrize("file", LAUNCH_FILES, ids=lambda file: file.name)
-def test_launch_files_use_what_there_is(file: Path) -> None:
-    """Every name that they import from launch, and every argument that they give by name, is one that Jazzy has."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    names: dict[str, set[str]] = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module in API:
-            for alias in node.names:
-                names[alias.name] = API[node.module][alias.name]
-        elif isinstance(node, ast.ImportFrom):
-            assert node.module in {"pathlib", "msg_agents.running.launch_support"}
-    assert "Node" in names
-    for call in ast.walk(tree):
-        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in names:
-            assert {keyword.arg for keyword in call.keywords} <= names[call.func.id], ast.unparse(call)
-    functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
-    assert {"generate_launch_description", "start"} <= functions
+    replay = LaunchedReplay(defaults | {"bag": str(tmp_path), "rate": "max"})
+    words = [plan.arguments[: plan.arguments.index("--lifeline-lock")] for plan in replay.processes]
+    assert words == [("live", "--reliable"), ("player", str(tmp_path), "--rate", "max", "--await", "live")]
+    replay.ended("player", 2)
+    assert (replay.to_stop(), replay.reason) == (["live"], "player: exit code 2")
+    replay.close()
+    (player,) = LaunchedReplay(defaults | {"bag": str(tmp_path), "live": "false"}).processes
+    assert player.name == "player"

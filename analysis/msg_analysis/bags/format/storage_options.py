@@ -10,6 +10,7 @@ from msg_analysis.errors import InputError
 Compression = Literal["none", "zstd", "lz4"]
 COMPRESSIONS: tuple[Compression, ...] = ("none", "zstd", "lz4")
 MEGABYTE = 10**6
+SMALLEST_SPLIT = 0.1  # MB; about the size of a chunk
 
 
 @dataclass(frozen=True, slots=True)
