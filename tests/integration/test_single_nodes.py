@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +48,40 @@ def test_started_by_hand(network: Any, run_file: Path) -> None:
     trajectory = read_bag(bag)
     assert trajectory.completeness.complete
     assert check(trajectory).difference is None
+
+
+def test_interrupted_again_and_again(network: Any) -> None:
+    """Until the last moment of a process: it ends in order, and leaves no shared memory (``network`` looks)."""
+    prepare = network.start("prepare", network.file(run={"duration": 5000}))
+    run_file = network.directory / "run.json"
+    run_file.write_text(prepare.communicate(timeout=60)[0])
+    await_recorder = ("--await", "recorder")
+    older = set(Path("/dev/shm").glob("fastrtps*"))  # of killed processes of others
+    with free_domain() as domain:
+        nodes = [
+            # Executed, not forked: a process that ends has a Python of its own to take down.
+            subprocess.Popen(
+                [sys.executable, "-m", "msg_agents", *map(str, command)],
+                stderr=subprocess.PIPE,
+                text=True,
+                env=os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONSAFEPATH": "1"},
+            )
+            for command in (
+                ("switcher", run_file, *await_recorder),
+                ("agent", run_file, *(p for i in "12345" for p in ("--agent", i)), *await_recorder),
+                ("recorder", run_file, "--out", network.directory / "runs" / "mine"),
+            )
+        ]
+        network.wait_until_moving()
+        network.processes()
+        while running := [node for node in nodes if node.poll() is None]:
+            for node in running:
+                node.send_signal(signal.SIGINT)
+            time.sleep(0.002)
+    for node in nodes:
+        _, stderr = node.communicate()
+        assert (node.returncode, "Traceback" in stderr) == (3, False), stderr
+    network.traces.difference_update(older)
 
 
 @pytest.mark.parametrize(

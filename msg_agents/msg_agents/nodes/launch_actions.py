@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +19,7 @@ from launch.actions import (
 )
 from launch.event_handlers import OnProcessExit, OnShutdown
 from launch.events import Shutdown, matches_action
-from launch.events.process import ProcessExited, ShutdownProcess
+from launch.events.process import ProcessExited, ShutdownProcess, SignalProcess
 from launch.launch_context import LaunchContext
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
@@ -26,6 +27,8 @@ from launch_ros.substitutions import ExecutableInPackage
 
 from msg_agents.running.launch_arguments import check_names, flag
 from msg_agents.running.launch_support import ANALYSIS, LaunchedProcesses, LaunchFailedError, environment
+
+GRACE = 20.0  # s that a process has to end
 
 
 def describe(arguments: Mapping[str, tuple[str, str]], start: Any) -> LaunchDescription:
@@ -57,6 +60,7 @@ class _Group:
         self._launched = launched
         self._shutdown = shutdown
         self._nodes: dict[str, ExecuteProcess] = {}
+        self._timers: list[TimerAction] = []
 
     def actions(self) -> list[Action]:
         """What starts them, and follows their ends."""
@@ -84,13 +88,11 @@ class _Group:
     def _next(self, context: LaunchContext, *, failed: bool) -> list[Action]:
         """What follows the end of a process; ``failed``: it is the first one to fail."""
         launched = self._launched
-        stop: list[Action] = [
-            EmitEvent(event=ShutdownProcess(process_matcher=matches_action(self._nodes[name])))
-            for name in launched.to_stop()
-        ]
         if not launched.over:
-            told = failed and stop and not context.is_shutdown
-            return [LogInfo(msg=f"{launched.reason}: stopping the other processes"), *stop] if told else stop
+            if context.is_shutdown:  # launch stops them itself
+                return []
+            told = [LogInfo(msg=f"{launched.reason}: stopping the other processes")] if failed else []
+            return told + [action for name in launched.to_stop() for action in self._stop(self._nodes[name])]
         if (arguments := launched.analysis()) is not None:
             analysis = ExecuteProcess(
                 cmd=[ExecutableInPackage(executable="msg-analysis", package="msg_analysis"), *arguments],
@@ -102,9 +104,22 @@ class _Group:
                 analysis,
             ]
         launched.close()
+        for timer in self._timers:
+            timer.cancel()
         if launched.reason is not None and (self._shutdown or context.is_shutdown):
             return [self._failure()]
         return [EmitEvent(event=Shutdown(reason="all is done"))] if self._shutdown else []
+
+    def _stop(self, node: ExecuteProcess) -> list[Action]:
+        """SIGTERM, later SIGKILL. A Python that starts takes SIGINT, which launch would send, with a traceback."""
+        if "pid" not in node.process_details:  # launch sends what it has to when it is there
+            return [EmitEvent(event=ShutdownProcess(process_matcher=matches_action(node)))]
+        signals = [
+            EmitEvent(event=SignalProcess(signal_number=number, process_matcher=matches_action(node)))
+            for number in (signal.SIGTERM, signal.SIGKILL)
+        ]
+        self._timers.append(TimerAction(period=GRACE, actions=signals[1:], cancel_on_shutdown=False))
+        return [signals[0], self._timers[-1]]
 
     def _on_shutdown(self, event: Shutdown, _: LaunchContext) -> list[Action]:
         if not self._launched.over:

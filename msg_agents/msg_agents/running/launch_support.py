@@ -108,7 +108,7 @@ class LaunchedNetwork(LaunchedProcesses):
         storage = bag_storage(arguments)
         record = flag(arguments, "record")
         self._analyse = flag(arguments, "analyse") and record
-        options = {name: flag(arguments, name) for name in ("use_sim_time", "parameter_services")}
+        use_sim_time, services = flag(arguments, "use_sim_time"), flag(arguments, "parameter_services")
         self.bag: Path | None = None  # directory that the recorder makes
         super().__init__(arguments["namespace"])
         self._run_file = self._folder / "run.json"
@@ -119,7 +119,15 @@ class LaunchedNetwork(LaunchedProcesses):
                 out = Path(arguments["out"]).expanduser().absolute()
                 self.bag = make_bag_directory(experiment, out, option="out:=")
             # Of each, ``arguments[0]`` is the executable.
-            self._plan(plan_network(experiment, self._run_file, self.bag, storage=storage, **options))
+            plans = plan_network(
+                experiment,
+                self._run_file,
+                self.bag,
+                use_sim_time=use_sim_time,
+                parameter_services=services,
+                storage=storage,
+            )
+            self._plan(plans)
         except BaseException:
             self.close()
             raise
