@@ -19,7 +19,7 @@ from fuzz_documents import mutate_document, mutate_text
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from msg_analysis.bags import writer
+from msg_analysis.bags import written_file
 from msg_analysis.bags.format.mcap_file import MAGIC
 from msg_analysis.bags.format.storage_options import COMPRESSIONS, Storage
 from msg_analysis.bags.trajectory_writer import write_trajectory
@@ -39,7 +39,7 @@ Record = tuple[int, bytes]  # opcode, content
 
 def make_bags(directory: Path) -> list[Path]:
     """A bag of every kind that there is, each with several chunks."""
-    writer.CHUNK_SIZE = 3000
+    written_file.CHUNK_SIZE = 3000
     graphs = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
     plain = {"name": "fuzz", "graphs": graphs, "switching": {"generator": [[-1, 1], [1, -1]]}}
     run = {"dt": 0.05, "duration": 6.0, "replicas": 2, "start": "zero"}

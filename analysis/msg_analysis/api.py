@@ -276,7 +276,7 @@ def read_bag(path: str | Path) -> Run:
     Parameters
     ----------
     path
-        directory of a bag, or one of its .mcap files
+        directory of a bag, or one of its files (.mcap, .db3)
 
     Returns
     -------

@@ -3,11 +3,13 @@
 Within a topic that is the order of the file; a message logged earlier than its predecessor on the topic takes the time
 of that. Across topics it is the order of log times, then of the file. A bag is only nearly in that order, so messages
 are held until nothing earlier can follow: an outline of each file, taken first, bounds the times behind each point.
+Messages of latched topics that later files of a split bag repeat are left out.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import OrderedDict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,14 +17,17 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
+from msg_analysis.bags.format.files import bag_files, stored_file
 from msg_analysis.bags.format.inventory import offered_profiles
 from msg_analysis.bags.format.mcap_chunks import CHUNK_TIMES, INDEX_HEAD, RECORD, DamageError
 from msg_analysis.bags.format.mcap_file import MAGIC, McapFile
-from msg_analysis.bags.reader import bag_files
+from msg_analysis.bags.format.stored_file import StoredFile
 from msg_analysis.errors import BagError
 
 # Bytes of messages held to be put in order. A bag that needs more is played out of order rather than held in memory.
 MOST_HELD = 256 * 2**20
+# Messages of latched topics by which repetitions are recognised. What is repeated becomes one of the newest again.
+MOST_LATCHED = 2**16
 _LATCHED = ("transient_local", 1)  # as text, and as the number of older rosbag2
 
 
@@ -108,18 +113,23 @@ class Playback:
         newest: dict[str, int] = {}
         pending: list[tuple[int, int, str, bytes]] = []  # time, position in the bag, topic, data
         position = held = 0
-        for outline, later in zip(self._outlines, self._starts_after(), strict=True):
+        repeated = _Repetitions() if len(self._outlines) > 1 else None
+        for number_of_file, (outline, later) in enumerate(zip(self._outlines, self._starts_after(), strict=True)):
             lows = _Lows(outline.lows, later)
-            file = McapFile(outline.path)
+            file = stored_file(outline.path)
             names: dict[int, str | None] = {}
             for batch in file.batches():
                 for number, channel in file.channels.items():
                     if number not in names:
                         names[number] = channel.topic if channel.topic in topics else None
-                for number, _, time, _, start, size in batch.table.tolist():
+                for number, sequence, time, published, start, size in batch.table.tolist():
                     topic = names.get(number)
                     if topic is None:
                         continue
+                    if repeated is not None and self.topics[topic].latched:
+                        message = (topic, published, sequence, batch.data[start : start + size])
+                        if repeated.earlier(message, number_of_file):
+                            continue
                     newest[topic] = time = max(time, newest.get(topic, 0))
                     pending.append((time, position, topic, batch.data[start : start + size]))
                     position += 1
@@ -140,7 +150,7 @@ class Playback:
             if time <= until:
                 yield Message(time, topic, data)
 
-    def _note(self, outline: _Outline, file: McapFile) -> None:
+    def _note(self, outline: _Outline, file: StoredFile) -> None:
         if file.damaged_chunks and outline.damage is None:
             outline.damage = f"damaged chunks that are left out: {file.damaged_chunks}"
             self.damage.append(f"{outline.path}: {outline.damage}")
@@ -152,6 +162,23 @@ class Playback:
             starts.append(least)
             least = min(least, 2**63 if outline.start is None else outline.start)
         return starts[::-1]
+
+
+class _Repetitions:
+    """Which messages of latched topics an earlier file has, with the same time of publication, number and bytes."""
+
+    def __init__(self) -> None:
+        self._files: OrderedDict[int, int] = OrderedDict()  # hash: last file with it; the newest ones at the end
+
+    def earlier(self, message: tuple[str, int, int, bytes], file: int) -> bool:
+        """Whether an earlier file has a message, and this one, by number, has it for the first time."""
+        key = hash(message)
+        before = self._files.get(key, file)
+        self._files[key] = file
+        self._files.move_to_end(key)
+        if len(self._files) > MOST_LATCHED:
+            self._files.popitem(last=False)
+        return before < file
 
 
 class _Lows:
@@ -230,7 +257,7 @@ def _quick_outline(path: Path) -> _Outline | None:
 
 def _outline(path: Path) -> _Outline:
     """Outline by reading all of a file; BagError: not an MCAP file, empty, or one that cannot be read."""
-    outline, file = _Outline(path), McapFile(path)
+    outline, file = _Outline(path), stored_file(path)
     for batch in file.batches():
         if not len(batch.table):
             continue

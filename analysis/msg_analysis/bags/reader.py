@@ -8,17 +8,18 @@ from __future__ import annotations
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from msg_analysis.bags.format.files import bag_files, stored_file
 from msg_analysis.bags.format.inventory import Inventory
-from msg_analysis.bags.format.mcap_file import Batch, McapFile
-from msg_analysis.bags.format.metadata import METADATA_FILE, read_metadata
+from msg_analysis.bags.format.stored_file import Batch, StoredFile
 from msg_analysis.bags.trajectory_builder import Collector
-from msg_analysis.bags.writer import RECORD_NAME, recording_pid
+from msg_analysis.bags.writer import recording_pid
+from msg_analysis.bags.written_file import RECORD_NAME
 from msg_analysis.common.long_work import tell
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.model.run.record import RunRecord
@@ -38,15 +39,10 @@ _TOPICS = {
     STRING.full_name: re.compile(r"(?:^|/)(experiment)$"),
 }
 MOST_RECORDS = 100  # different run records that a bag may have: reading each takes milliseconds
-_ZSTD_FRAME = b"\x28\xb5\x2f\xfd"
-_EACH_COMPRESSED = (
-    "every message in it is compressed by itself, which cannot be read: convert it, or record with "
-    "`--storage-preset-profile zstd_fast`"
-)
 
 
 def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory:
-    """The run of a bag: of a directory or of one of its .mcap files; torn files are read up to the tear.
+    """The run of a bag: of a directory or of one of its files; torn files are read up to the tear.
 
     ``inventory`` is filled with what the files hold, even if no run can be made of it. BagError: no bag, no run record,
     or several runs; InputError: the run record is not valid.
@@ -57,7 +53,7 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
     files = bag_files(path)
     for number, file in enumerate(files):
         tell(f"reading {path.name}", number, len(files))
-        entry = (inventory or Inventory()).add(McapFile(file))
+        entry = (inventory or Inventory()).add(stored_file(file))
         try:
             contents.read(entry.file, entry.watch() if inventory else entry.file.batches())
         except BagError as error:  # the recorder died just after it made the file, or its start is damaged
@@ -69,42 +65,30 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
     return _trajectory(contents, _choose(contents))
 
 
-def bag_files(path: Path) -> list[Path]:
-    """The MCAP files of a bag in their order; BagError: there are none, one is missing, or another storage."""
-    if path.is_file():
-        return [path]
-    if not path.is_dir():
-        raise BagError(f"{path}: not found: expected the directory of a bag or an .mcap file")
-    information = read_metadata(path)
-    if information is None:
-        files = [file for suffix in ("mcap", "mcap.zstd") for file in path.glob(f"*.{suffix}")]
-        if not files:
-            if {entry.name for entry in path.iterdir()} <= {"log"}:  # a run makes its directory before anything else
-                raise BagError(f"{path}: empty: its run ended before anything was recorded: delete it")
-            raise BagError(f"{path}: not a bag: expected metadata.yaml or .mcap files in this directory")
-        return sorted(files, key=_file_number)
-    storage = information.get("storage_identifier")
-    if storage != "mcap":
-        raise BagError(
-            f"{path}: its storage is {storage}, expected mcap: record with `ros2 bag record -s mcap`, or convert it"
-        )
-    if str(information.get("compression_mode", "")).lower() == "message":
-        raise BagError(f"{path}: {_EACH_COMPRESSED}")
-    names = information.get("relative_file_paths")
-    files = [path / str(name) for name in names] if isinstance(names, list) else []
-    lost = [file.name for file in files if not file.is_file()]
-    if lost or not files:
-        raise BagError(
-            f"{path}: {', '.join(lost) or 'every file'} of its {METADATA_FILE} is missing: copy the whole bag, or move "
-            f"{METADATA_FILE} away to read the files that are there"
-        )
-    return files
+def read_record(path: str | Path) -> RunRecord:
+    """The run record of a bag, as ``read_bag`` finds it, without the states; at once where it comes first.
 
-
-def _file_number(file: Path) -> tuple[int, str]:
-    """Order of the files of a split bag, which rosbag2 numbers: name_0.mcap, name_1.mcap, ..., name_10.mcap."""
-    number = re.search(r"_(\d+)\.mcap", file.name)
-    return int(number[1]) if number else 0, file.name
+    BagError or InputError: no bag, or no valid run record.
+    """
+    path = Path(path)
+    contents = _Contents(path)
+    unreadable: list[BagError] = []
+    files = bag_files(path)
+    for name in files:
+        file = stored_file(name)
+        try:
+            for batch, kind in contents.network_topics(file, file.batches()):
+                contents.learn(batch, np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]))
+                contents.keep_metadata(file)
+                known = contents.first_record()
+                if known is not None:
+                    return known
+        except BagError as error:
+            unreadable.append(error)
+        contents.keep_metadata(file)
+    if len(unreadable) == len(files):
+        raise unreadable[0]
+    return _choose(contents)
 
 
 @dataclass(slots=True)
@@ -114,13 +98,23 @@ class _Contents:
     path: Path
     states: Collector = field(default_factory=Collector)
     truths: Collector = field(default_factory=Collector)
-    graphs: list[ActiveGraph] = field(default_factory=list)
+    # By their bytes: every file of a split bag may begin with those in force.
+    graphs: dict[bytes, ActiveGraph] = field(default_factory=dict)
     # Run records by text, in order, or why a text is not one: from the topic, and from the metadata of our files.
     experiments: dict[str, RunRecord | InputError] = field(default_factory=dict)
     metadata: dict[str, None] = field(default_factory=dict)
     refused: Counter[str] = field(default_factory=Counter)
 
-    def read(self, file: McapFile, batches: Iterable[Batch]) -> None:
+    def read(self, file: StoredFile, batches: Iterable[Batch]) -> None:
+        """Take all of a file."""
+        for batch, kind in self.network_topics(file, batches):
+            self._add(batch, kind)
+        self.keep_metadata(file)
+        self.refused[Refusal.TORN_FILE] += file.torn is not None
+        self.refused[Refusal.DAMAGED_CHUNK] += file.damaged_chunks
+
+    def network_topics(self, file: StoredFile, batches: Iterable[Batch]) -> Iterator[tuple[Batch, AnyArray]]:
+        """Each batch with the kinds of its messages, (messages,): one of ``_NUMBERS``."""
         kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: not a topic of the network
         known = 0
         size = file.path.stat().st_size
@@ -132,28 +126,42 @@ class _Contents:
                 found = pattern.search(channel.topic) if pattern else None
                 kind_of[number] = _NUMBERS[found[1] if found else None]
             known = len(file.channels)
-            self._add(batch, kind_of[batch.channel])
+            yield batch, kind_of[batch.channel]
+
+    def keep_metadata(self, file: StoredFile) -> None:
+        """Keep the run records in the metadata of a file."""
         for record in file.metadata:
             if record.name == RECORD_NAME and "record" in record.metadata and len(self.metadata) < MOST_RECORDS:
                 self.metadata[record.metadata["record"]] = None
-        self.refused[Refusal.TORN_FILE] += file.torn is not None
-        self.refused[Refusal.DAMAGED_CHUNK] += file.damaged_chunks
 
     def _add(self, batch: Batch, kind: AnyArray) -> None:
         # Records first: states of a known run are put in their places at once.
-        for index in np.flatnonzero(kind >= _NUMBERS[_GRAPH]).tolist():
+        self.learn(batch, np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]))
+        for index in np.flatnonzero(kind == _NUMBERS[_GRAPH]).tolist():
             data = batch.message(index)
+            if data in self.graphs:
+                continue
             try:
-                if kind[index] == _NUMBERS[_GRAPH]:
-                    self.graphs.append(ActiveGraph.decode(data))
-                else:
-                    self._learn(decode_string(data))
+                self.graphs[data] = ActiveGraph.decode(data)
             except CdrError:
-                self.refused[Refusal.COMPRESSED if data.startswith(_ZSTD_FRAME) else Refusal.UNDECODABLE] += 1
+                self.refused[Refusal.UNDECODABLE] += 1
         for name, collector in ((_STATE, self.states), (_TRUTH, self.truths)):
             chosen = np.flatnonzero(kind == _NUMBERS[name])
             if len(chosen):
                 collector.add(batch, chosen)
+
+    def learn(self, batch: Batch, chosen: IntArray) -> None:
+        """Take the run records in a batch: the messages with the indices ``chosen``, (k,)."""
+        for index in chosen.tolist():
+            try:
+                self._learn(decode_string(batch.message(index)))
+            except CdrError:
+                self.refused[Refusal.UNDECODABLE] += 1
+
+    def first_record(self) -> RunRecord | None:
+        """The first valid run record so far."""
+        found = (*self.experiments.values(), *map(self.parsed, self.metadata))
+        return next((record for record in found if isinstance(record, RunRecord)), None)
 
     def _learn(self, text: str) -> None:
         if text in self.experiments:
@@ -187,8 +195,6 @@ def _choose(contents: _Contents) -> RunRecord:
     path = contents.path
     later = (text for text in contents.metadata if text not in contents.experiments)
     found = [*contents.experiments.values(), *map(contents.parsed, later)]
-    if not found and contents.refused[Refusal.COMPRESSED]:
-        raise BagError(f"{path}: {_EACH_COMPRESSED}")
     if not found and contents.refused[Refusal.DAMAGED_CHUNK]:
         raise BagError(
             f"{path}: {contents.refused[Refusal.DAMAGED_CHUNK]} chunks are damaged (wrong checksums, or times that no "
@@ -267,7 +273,7 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
 def _modes(contents: _Contents, run: bytes, steps: int, graphs: int) -> IntArray:
     """(N,) graph of every step from the sojourns, from 0; -1 where none or more than one covers it."""
     sojourns: set[tuple[int, int, int, int]] = set()
-    for graph in contents.graphs:
+    for graph in contents.graphs.values():
         if graph.run != run:
             contents.refused[Refusal.OTHER_RUN] += 1
         elif not (1 <= graph.mode <= graphs and graph.first_step <= graph.last_step < steps):

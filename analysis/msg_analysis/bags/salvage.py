@@ -1,6 +1,6 @@
 """Makes a bag out of what a killed recorder, a full disk or a power cut left behind.
 
-Whole files are kept byte for byte; the others are rewritten from their whole records.
+Whole MCAP files are kept byte for byte; the others are rewritten from their whole records, as MCAP.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from msg_analysis.bags.format.files import bag_files, stored_file
 from msg_analysis.bags.format.inventory import FileInventory, channel_count
-from msg_analysis.bags.format.mcap_file import Batch, McapFile
 from msg_analysis.bags.format.mcap_writer import McapWriter
 from msg_analysis.bags.format.metadata import (
     METADATA_FILE,
@@ -27,15 +27,10 @@ from msg_analysis.bags.format.metadata import (
     dump,
     write_metadata,
 )
-from msg_analysis.bags.reader import bag_files
-from msg_analysis.bags.writer import (
-    CHUNK_SIZE,
-    RECORD_NAME,
-    RECORDING_MARKER,
-    ROSBAG2_RECORD,
-    exists_already,
-    recording_pid,
-)
+from msg_analysis.bags.format.storage_options import SQLITE_SUFFIX, ZSTD_SUFFIX
+from msg_analysis.bags.format.stored_file import Batch, StoredFile
+from msg_analysis.bags.writer import RECORDING_MARKER, exists_already, recording_pid
+from msg_analysis.bags.written_file import CHUNK_SIZE, RECORD_NAME, ROSBAG2_RECORD
 from msg_analysis.errors import BagError
 
 LONGEST_LIST = 500  # characters of what is said of torn files
@@ -168,7 +163,9 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
         for file, copy, count in saved:
             count.name = file.name
             if copy is not None:
-                count.name = file.name.removesuffix(".zstd")  # the copy is compressed by chunks
+                # The copy is MCAP, compressed by chunks.
+                count.name = file.name.removesuffix(ZSTD_SUFFIX).removesuffix(SQLITE_SUFFIX).removesuffix(".mcap")
+                count.name += ".mcap"
                 copy.replace(file.with_name(count.name))
                 if count.name != file.name:
                     file.unlink()
@@ -197,7 +194,7 @@ def _look(files: Sequence[Path], *, parts: bool) -> tuple[list[FileInventory], S
     """
     entries, total = [], SalvageReport(0, 0, 0)
     for file in files:
-        entry = FileInventory(McapFile(file), FileCount(file.name))
+        entry = FileInventory(stored_file(file), FileCount(file.name))
         entries.append(entry)
         try:
             for _ in entry.watch():
@@ -233,7 +230,7 @@ def _custom(entries: Sequence[FileInventory]) -> dict[str, str]:
     return custom
 
 
-def _readable(file: McapFile) -> Iterator[Batch]:
+def _readable(file: StoredFile) -> Iterator[Batch]:
     """Its messages up to where it cannot be read any further; some are known to be there."""
     with contextlib.suppress(BagError):
         yield from file.batches()
@@ -241,7 +238,7 @@ def _readable(file: McapFile) -> Iterator[Batch]:
 
 def _copy(file: Path, copy: Path) -> FileCount:
     """Write what is whole in one file to a new one."""
-    source = McapFile(file)
+    source = stored_file(file)
     count = FileCount(copy.name)
     with copy.open("wb") as stream:
         batches = _readable(source)
@@ -274,7 +271,7 @@ def _copy(file: Path, copy: Path) -> FileCount:
 class _Channels:
     """Copies messages; registers their channels and schemas in the new file when they first appear."""
 
-    def __init__(self, writer: McapWriter, source: McapFile, count: FileCount) -> None:
+    def __init__(self, writer: McapWriter, source: StoredFile, count: FileCount) -> None:
         self._writer, self._source, self._count = writer, source, count
         self._schemas: dict[int, int] = {0: 0}  # number in the source: number in the copy; 0 means none
         # Number in the copy, and the count, of every number in the source; a topic that takes an old number later

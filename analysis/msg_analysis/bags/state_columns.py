@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from msg_analysis.bags.format.mcap_chunks import gather
-from msg_analysis.bags.format.mcap_file import Batch
+from msg_analysis.bags.format.stored_file import Batch
 from msg_analysis.model.arithmetic.step_clock import SECOND
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.wire.cdr_fields import LITTLE_ENDIAN, CdrError

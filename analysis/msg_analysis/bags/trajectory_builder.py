@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from msg_analysis.bags.format.mcap_file import Batch
+from msg_analysis.bags.format.stored_file import Batch
 from msg_analysis.bags.state_columns import States, decode_states, run_number
 from msg_analysis.common.large_arrays import large_zeros, release
 from msg_analysis.errors import BagError

@@ -1,52 +1,42 @@
 """Writes a bag that rosbag2, rosbags, Foxglove and PlotJuggler open: a directory with MCAP files.
 
-While it is written, the directory has a locked marker instead of metadata.yaml.
+While it is written, the directory has a locked marker instead of metadata.yaml. The files of a split bag follow each
+other in time, and each begins with what is in force of the latched topics.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import heapq
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Self
 
 import numpy as np
 
-from msg_analysis.bags.format.mcap_chunks import MESSAGE_HEAD
-from msg_analysis.bags.format.mcap_writer import McapWriter
-from msg_analysis.bags.format.metadata import ChannelCount, FileCount, bag_information, dump, write_metadata
+from msg_analysis.bags.format.metadata import FileCount, bag_information, write_metadata
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
+from msg_analysis.bags.written_file import LatchedMessage, WrittenFile
 from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import BagError
 from msg_analysis.types import IntArray
 from msg_analysis.wire.topics import Topic
 
-# As in rosbag2: small enough that a killed recorder loses little, large enough that the readers' work per chunk does
-# not matter. With a third of it, reading takes a fifth longer.
-CHUNK_SIZE = 768 * 1024
 RECORDING_MARKER = ".recording"
-RECORD_NAME = "msg_agents"  # of the MCAP metadata record with the run record
-ROSBAG2_RECORD = "rosbag2"
-
-
-class _Channel:
-    """Number of a topic in the current file, its count there, and its number of messages in the files before."""
-
-    __slots__ = ("before", "count", "id")
-
-    def __init__(self, number: int, count: ChannelCount, before: int) -> None:
-        self.id, self.count, self.before = number, count, before
+# Files that wait for late messages. An agent so far behind that this is not enough is dead, and its messages, if it
+# comes back, are in a later file.
+MOST_OPEN = 3
 
 
 class BagWriter:
     """A bag being written: its directory, new or empty, has ``.recording`` (locked) and no metadata.yaml.
 
-    The run record (JSON) is kept in every file. A file is closed and on the disk before the next begins. BagError, here
-    and in the methods: cannot be written; what was written before stays readable.
+    The run record (JSON) is kept in every file. A full file is closed, and on the disk, when all topics have passed its
+    end. BagError, here and in the methods: cannot be written; what was written before stays readable.
     """
 
     def __init__(
@@ -54,11 +44,14 @@ class BagWriter:
     ) -> None:
         self.directory = Path(directory).absolute()
         require_utf8(self.directory)
-        self._topics, self._record = tuple(topics), record
-        self._compression, self._split_size = storage.compression, storage.split_size
-        self._chunk_size = min(CHUNK_SIZE, self._split_size or CHUNK_SIZE)
-        self._files: list[FileCount] = []
-        self._channels: dict[str, _Channel] = {}
+        self._topics, self._record, self._storage = tuple(topics), record, storage
+        self._latched = {topic.name for topic in topics if topic.qos.latched}
+        self._streams = {topic.name for topic in topics} - self._latched
+        self._sequences = dict.fromkeys((topic.name for topic in topics), 0)  # messages of each topic so far
+        self._counts: list[FileCount] = []  # of all files
+        self._now = 0  # latest time [ns] of what is in the files
+        self._held: list[LatchedMessage] = []  # a heap; what is ahead of that, of a split bag
+        self._in_force: list[LatchedMessage] = []  # what the next file begins with
         self._custom: dict[str, str] = {}
         if record is not None:
             self._custom["run"] = str(json.loads(record).get("run", ""))
@@ -68,7 +61,7 @@ class BagWriter:
             self.directory.mkdir(parents=True, exist_ok=True)
             if any(self.directory.iterdir()):
                 raise FileExistsError
-            self._stream: BinaryIO = self._next_stream()
+            self._open = [self._new_file()]  # those that are not finished, in their order
             self._marker = (self.directory / RECORDING_MARKER).open("w", encoding="utf-8")
         except FileExistsError as error:
             raise exists_already(directory) from error
@@ -78,121 +71,143 @@ class BagWriter:
             fcntl.flock(self._marker, fcntl.LOCK_EX)  # the system releases it when this process ends
             json.dump({"pid": os.getpid()}, self._marker)
             self._marker.flush()
-            self._begin_file()
+            self._open[0].write_head(self._topics, record, self._custom)
         except OSError as error:
             raise self._failed(error) from error
 
-    def _next_stream(self) -> BinaryIO:
-        self._file = FileCount(f"{self.directory.name}_{len(self._files)}.mcap")
-        self._files.append(self._file)
-        return (self.directory / self._file.name).open("xb")
+    def _new_file(self, begin: int = 0) -> WrittenFile:
+        path = self.directory / f"{self.directory.name}_{len(self._counts)}.mcap"
+        file = WrittenFile(path, self._counts, self._storage, begin=begin)
+        self._counts.append(file.count)
+        return file
 
-    def _begin_file(self) -> None:
-        """Write all that is needed to read this file without the others."""
-        self._mcap = McapWriter(
-            self._stream, chunk_size=self._chunk_size, compression=self._compression, directory=str(self.directory)
-        )
-        self._add_information()
-        if self._record is not None:
-            self._mcap.add_metadata(RECORD_NAME, {"record": self._record})
-        schemas: dict[str, int] = {}
-        for topic in self._topics:
-            kind = topic.type.full_name
-            if kind not in schemas:
-                schemas[kind] = self._mcap.register_schema(kind, "ros2msg", topic.type.schema.encode())
-            self._add_channel(topic, schemas[kind])
-        self._mcap.flush()
-        # The head is not counted: it may be larger than the limit, and every file has it.
-        self._full = None if self._split_size is None else self._stream.tell() + self._split_size
+    def write(self, topic: str, data: bytes, time_ns: int, until: int | None = None) -> None:
+        """Append a message (CDR with encapsulation header) to a topic, by absolute name, at a simulated time [ns].
 
-    def _add_channel(self, topic: Topic, schema: int) -> None:
-        offered = topic.qos.offered()
-        count = ChannelCount(topic.name, topic.type.full_name, topic.type.type_hash, offered)
-        metadata = {"offered_qos_profiles": dump(offered), "topic_type_hash": topic.type.type_hash}
-        number = self._mcap.register_channel(topic.name, "cdr", schema, metadata)
-        last = self._channels.get(topic.name)
-        self._channels[topic.name] = _Channel(number, count, last.before + last.count.messages if last else 0)
-        self._file.channels[topic.name] = count
-
-    def _finish_file(self) -> None:
-        self._add_information()
-        self._mcap.finish()
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
-        self._stream.close()
-
-    def _split(self) -> None:
-        self._finish_file()
-        self._stream = self._next_stream()
-        self._begin_file()
-
-    def write(self, topic: str, data: bytes, time_ns: int) -> None:
-        """Append a message (CDR with encapsulation header) to a topic, by absolute name, at a simulated time [ns]."""
-        channel = self._channels.get(topic)
-        if channel is None or self._closed:
+        Files that begin later repeat it if the topic is latched, up to the time ``until`` [ns] (None: always). A split
+        bag keeps a latched message that is ahead of its time until then.
+        """
+        if topic not in self._sequences or self._closed:
             raise self._refused("is closed" if self._closed else f"has no topic {topic}")
         try:
-            if self._full is not None and self._stream.tell() >= self._full:
-                self._split()
-                channel = self._channels[topic]
-            count = channel.count
-            self._mcap.add_message(channel.id, time_ns, data, channel.before + count.messages)
+            if topic in self._latched:
+                message = LatchedMessage(time_ns, self._sequences[topic], topic, data, until)
+                self._sequences[topic] += 1
+                if self._storage.split_size is not None and time_ns > self._now:
+                    heapq.heappush(self._held, message)
+                else:
+                    self._place(message)
+                return
+            self._release(time_ns)
+            file = self._file_of(time_ns)
+            file.add(topic, data, time_ns, self._sequences[topic])
+            self._sequences[topic] += 1
+            self._passed(file, (topic,))
         except OSError as error:
             raise self._failed(error) from error
-        count.messages += 1
-        file = self._file
-        if time_ns > file.end:
-            file.end = time_ns
-        if time_ns < file.start:
-            file.start = time_ns
 
     def write_many(
         self, topics: Sequence[str], of: IntArray, time_ns: IntArray, data: bytes, start: IntArray, size: IntArray
     ) -> None:
-        """Append messages; of each, (messages,): index of its topic, time [ns], place and size of its bytes.
+        """Append messages of topics that are not latched.
 
-        The same as ``write`` for each, in a fraction of the time.
+        Of each, (messages,): index of its topic, time [ns], place and size of its bytes. The same as ``write`` for
+        each, in a fraction of the time.
         """
         if self._closed:
             raise self._refused("is closed")
         done = 0
         try:
-            while done < len(size):
-                if self._full is not None and self._stream.tell() >= self._full:
-                    self._split()
-                piece = slice(done, done + self._mcap.fitting(size[done:]))
-                self._write_piece(topics, of[piece], time_ns[piece], data, start[piece], size[piece])
-                done = piece.stop
+            while done < len(of):
+                file = self._file_of(int(time_ns[done]))
+                end = done + file.mcap.fitting(size[done : done + self._together(file, time_ns[done:])])
+                piece = slice(done, end)
+                if self._release(int(time_ns[piece].max())):
+                    continue  # perhaps into a new file
+                present = file.add_many(
+                    topics, of[piece], time_ns[piece], data, start[piece], size[piece], self._sequences
+                )
+                self._passed(file, present)
+                done = end
         except OSError as error:
             raise self._failed(error) from error
 
-    def _write_piece(
-        self, topics: Sequence[str], of: IntArray, time_ns: IntArray, data: bytes, start: IntArray, size: IntArray
-    ) -> None:
-        head = np.zeros(len(of), MESSAGE_HEAD)
-        head["log_time"] = head["publish_time"] = time_ns
-        order = np.argsort(of, kind="stable")
-        present, first, counts = np.unique(of[order], return_index=True, return_counts=True)
-        channels = [self._channels[topics[topic]] for topic in present.tolist()]
-        number = [channel.id for channel in channels]
-        earlier = [channel.before + channel.count.messages for channel in channels]
-        head["channel"][order] = np.repeat(number, counts)
-        head["sequence"][order] = np.arange(len(of)) + np.repeat(np.array(earlier) - first, counts)
-        for channel, count in zip(channels, counts.tolist(), strict=True):
-            channel.count.messages += count
-        self._mcap.add_messages(head, data, start, size)
-        self._file.end = max(self._file.end, int(time_ns.max()))
-        self._file.start = min(self._file.start, int(time_ns.min()))
+    def _together(self, file: WrittenFile, time_ns: IntArray) -> int:
+        """How many of the messages with these times belong into the same file as the first."""
+        before = self._open.index(file)
+        if not before and file.bound is None:
+            return len(time_ns)
+        others = np.zeros(len(time_ns), dtype=np.bool_)
+        if file.bound is not None:
+            others |= time_ns > file.bound
+        if before:
+            bound = self._open[before - 1].bound
+            assert bound is not None  # only the last file has none
+            others |= time_ns <= bound
+        return int(np.argmax(others)) if others.any() else len(others)
+
+    def _file_of(self, time_ns: int) -> WrittenFile:
+        """The file of a message with this time; a new one if the last one is full."""
+        last = self._open[-1]
+        if last.bound is None:
+            if not last.full:
+                return last if len(self._open) == 1 else self._first_with(time_ns) or last
+            last.bound, last.behind = last.count.end, set(self._streams)
+        return self._first_with(time_ns) or self._begin_file(last.bound + 1)
+
+    def _first_with(self, time_ns: int) -> WrittenFile | None:
+        return next((file for file in self._open if file.bound is not None and time_ns <= file.bound), None)
+
+    def _begin_file(self, begin: int) -> WrittenFile:
+        if len(self._open) == MOST_OPEN:
+            self._finish_first()
+        self._open.append(self._new_file(begin))
+        self._in_force = [each for each in self._in_force if each.until is None or each.until >= begin]
+        self._open[-1].write_head(self._topics, self._record, self._custom, self._in_force)
+        return self._open[-1]
+
+    def _finish_first(self) -> None:
+        self._open[0].finish()
+        del self._open[0]
+
+    def _passed(self, file: WrittenFile, topics: Iterable[str]) -> None:
+        """Finish the files before this one that no topic has messages for any more, now that these are here."""
+        if file is self._open[0]:
+            return
+        for earlier in self._open[: self._open.index(file)]:
+            earlier.behind.difference_update(topics)
+        while self._open[0].bound is not None and not self._open[0].behind:
+            self._finish_first()
+
+    def _release(self, now: int) -> bool:
+        """Write what was held for this time [ns]; whether there was something."""
+        self._now = max(self._now, now)
+        some = False
+        while self._held and self._held[0].time <= now:
+            self._place(heapq.heappop(self._held))
+            some = True
+        return some
+
+    def _place(self, message: LatchedMessage) -> None:
+        file = self._file_of(message.time)
+        file.add(message.topic, message.data, message.time, message.sequence)
+        if self._storage.split_size is None:
+            return
+        self._in_force.append(message)
+        for later in self._open[self._open.index(file) + 1 :]:  # it is late: their heads are written
+            if message.until is None or message.until >= later.begin:
+                later.repeat(message)
 
     @property
     def messages(self) -> int:
-        """Written so far."""
-        return sum(file.messages for file in self._files)
+        """Written so far, without repetitions."""
+        return sum(self._sequences.values())
 
     def flush(self) -> None:
         """Hand everything so far to the operating system, so that it survives the end of this process."""
         try:
-            self._mcap.flush()
+            for file in self._open:
+                file.mcap.flush()
         except OSError as error:
             raise self._failed(error) from error
 
@@ -205,26 +220,25 @@ class BagWriter:
             return
         self._custom["complete"] = "true" if complete else "false"
         try:
-            self._finish_file()
-            write_metadata(self.directory, bag_information(self._files, self._custom))
+            self._release(2**63)
+            while self._open:
+                self._finish_first()
+            write_metadata(self.directory, bag_information(self._counts, self._custom))
             (self.directory / RECORDING_MARKER).unlink()
             self._marker.close()
         except OSError as error:
             raise self._failed(error) from error
         self._closed = True
 
-    def _add_information(self) -> None:
-        information = bag_information(self._files, self._custom)
-        self._mcap.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(information)})
-
     def _refused(self, reason: str) -> BagError:
         return BagError(f"{self.directory}: {reason}: nothing more can be written to it")
 
     def _failed(self, error: OSError) -> BagError:
         self._closed = True
-        for stream in (self._stream, self._marker):
-            with contextlib.suppress(OSError):  # closing tries again to write what is left
-                stream.close()
+        for file in self._open:
+            file.abandon()
+        with contextlib.suppress(OSError):
+            self._marker.close()
         return BagError(
             f"{self.directory}: cannot be written ({error.strerror or error}): free some space or choose "
             "another place; what was written before can still be read"

@@ -228,7 +228,7 @@ def info(source: Path, as_json: bool) -> None:
     from msg_analysis.report.documents.info import describe_bag, describe_experiment
     from msg_analysis.report.terminal import bag_text, experiment_text
 
-    if source.is_dir() or ".mcap" in source.suffixes:
+    if source.is_dir() or {".mcap", ".db3"} & set(source.suffixes):
         document, show = describe_bag(source), bag_text.print_bag
     else:
         document, show = describe_experiment(ValidExperiment.load(source)), experiment_text.print_experiment

@@ -11,6 +11,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from msg_analysis.bags.format.storage_options import BAG_SUFFIXES
 from msg_analysis.common.files import RESULT_FILE
 
 _PLAIN = re.compile(r"[\w./~+,:@%=-]*")  # characters that a shell needs no quotes for
@@ -60,8 +61,8 @@ def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:
 
 
 YAML = InputPath(".yaml", ".yml", ".json")  # experiments, sweeps, hosts
-BAG = InputPath(".mcap", ".mcap.zstd", holds=("metadata.yaml", "*.mcap"))
-SOURCE = InputPath(".yaml", ".yml", ".json", ".mcap", ".mcap.zstd", holds=("metadata.yaml", "*.mcap"))
+BAG = InputPath(*BAG_SUFFIXES, holds=("metadata.yaml", "*.mcap", "*.db3"))
+SOURCE = InputPath(".yaml", ".yml", ".json", *BAG_SUFFIXES, holds=("metadata.yaml", "*.mcap", "*.db3"))
 RESULT = InputPath(".json", holds=(RESULT_FILE,))
 RUN_RECORD = InputPath(".json")
 PATH = click.Path(path_type=Path)

@@ -128,7 +128,8 @@ class Recorder(NetworkNode):
         while self._next_sojourn in self._sojourns:
             self.rules.forget(self._sojourns.pop(self._next_sojourn) + 1)
             self._next_sojourn += 1
-        self._write(topics.GRAPH, data, graph.stamp, last=graph.last_step == self._last - 1)
+        until = self._step_clock.nanoseconds(graph.last_step + 1)
+        self._write(topics.GRAPH, data, graph.stamp, until, last=graph.last_step == self._last - 1)
 
     def _record_experiment(self, data: bytes) -> None:
         known = self._root + topics.EXPERIMENT.name not in self._awaiting
@@ -136,11 +137,11 @@ class Recorder(NetworkNode):
         if reason:
             self.refuse(reason, topics.EXPERIMENT.name)
         else:
-            self._write(topics.EXPERIMENT, data, 0, last=True)
+            self._write(topics.EXPERIMENT, data, 0, None, last=True)
 
-    def _write(self, topic: Topic, data: bytes, time: int, *, last: bool) -> None:
+    def _write(self, topic: Topic, data: bytes, time: int, until: int | None, *, last: bool) -> None:
         name = self._root + topic.name
-        self._guarded(lambda: self.bag.write(name, data, time))()
+        self._guarded(lambda: self.bag.write(name, data, time, until))()
         if last:
             self._received_last(name)
 

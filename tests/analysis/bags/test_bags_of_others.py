@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 import zstandard
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
 from msg_analysis.bags.format.storage_options import Storage
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reader import read_bag, read_record
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.errors import BagError
@@ -168,22 +169,64 @@ def test_without_the_graph(record: Record) -> None:
     assert compare(found).verdict == "incomplete"
 
 
-def test_compressed_message_by_message(record: Record) -> None:
-    """With metadata.yaml and without: the same reason."""
-    bag = record(compression=CompressionMode.MESSAGE)
-    for path in (bag, *bag.glob("*.mcap")):
-        with pytest.raises(BagError, match="every message in it is compressed by itself"):
-            read_bag(path)
+STORAGES = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
 
 
-def test_sqlite(record: Record) -> None:
-    bag = record(storage=StoragePlugin.SQLITE3)
-    for function in (read_bag, describe_bag):
-        with pytest.raises(BagError, match="storage is sqlite3, expected mcap: record with `ros2 bag record -s mcap`"):
-            function(bag)
-    (file,) = bag.glob("*.db3")
-    with pytest.raises(BagError, match="not an MCAP file"):
-        read_bag(file)
+@pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE])
+@pytest.mark.parametrize("storage", STORAGES)
+def test_every_storage_and_compression(
+    run: Trajectory, record: Record, compression: CompressionMode, storage: StoragePlugin
+) -> None:
+    """With metadata.yaml and without, from the directory and from the file; compared as ours is."""
+    bag = record(_shuffled, compression=compression, storage=storage)
+    _same(read_bag(bag), run)
+    theirs, ours = compare(read_bag(bag)).to_json(), compare(run).to_json()
+    for document in (theirs, ours):
+        del document["completeness"]
+    assert theirs == ours
+    (file,) = (file for file in bag.iterdir() if file.name != "metadata.yaml")
+    _same(read_bag(file), run)
+    (bag / "metadata.yaml").unlink()
+    _same(read_bag(bag), run)
+    assert read_record(bag).to_json() == run.record.to_json()
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_message_that_cannot_be_unpacked(
+    run: Trajectory, record: Record, storage: StoragePlugin, typestore: Any, tmp_path: Path
+) -> None:
+    """It is refused, and all others are read."""
+
+    def damaged(messages: list[Message]) -> list[Message]:
+        packed = [(topic, kind, zstandard.compress(data)) for topic, kind, data in messages]
+        topic, kind, data = packed[-1]
+        return [*packed[:-1], (topic, kind, data[:-5]), (topic, kind, b"\x28\xb5\x2f\xfd")]
+
+    found = read_bag(record(damaged, storage=storage))
+    assert (found.completeness.missing, found.completeness.refused) == (1, {"undecodable": 2})
+    assert np.isnan(found.states).sum() + np.isnan(found.published).sum() == 2
+
+
+def test_messages_made_to_fill_the_memory(record: Record) -> None:
+    """A megabyte of messages that unpack to a gigabyte: one error, before that is unpacked."""
+    bomb = zstandard.compress(bytes(2**27))
+
+    def bombs(messages: list[Message]) -> list[Message]:
+        return [*messages[:100], *[("/agent_1/state", messages[5][1], bomb)] * 80]
+
+    for storage in STORAGES:
+        with pytest.raises(BagError, match="made to fill the memory"):
+            read_bag(record(bombs, name=storage.name, storage=storage))
+
+
+def test_another_compression_or_storage(record: Record) -> None:
+    for name, key, value in (("a", "compression_format", "lz4"), ("b", "storage_identifier", "tape")):
+        bag = record(name=name, compression=CompressionMode.FILE)
+        information = yaml.safe_load((bag / "metadata.yaml").read_text())
+        information["rosbag2_bagfile_information"][key] = value
+        (bag / "metadata.yaml").write_text(yaml.safe_dump(information))
+        with pytest.raises(BagError, match=rf"{value}, expected .*convert"):
+            read_bag(bag)
 
 
 def test_split_without_metadata_and_with_a_lost_file(run: Trajectory, record: Record, tmp_path: Path) -> None:
@@ -213,7 +256,7 @@ def test_torn_file_that_is_compressed_as_a_whole(
     run: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Cut or flipped: what could be unpacked up to there counts."""
-    monkeypatch.setattr("msg_analysis.bags.writer.CHUNK_SIZE", 3000)
+    monkeypatch.setattr("msg_analysis.bags.written_file.CHUNK_SIZE", 3000)
     write_trajectory(run, tmp_path / "bag", Storage("none"))
     whole = (tmp_path / "bag" / "bag_0.mcap").read_bytes()
     frames = [whole[start : start + 10_000] for start in range(0, len(whole), 10_000)]

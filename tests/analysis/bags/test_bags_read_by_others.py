@@ -50,7 +50,7 @@ def test_every_peer_reads_every_bag(
     run: Trajectory, compression: Compression, split: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every message, in the order of time, with the right counts and values, in one file or in several."""
-    monkeypatch.setattr("msg_analysis.bags.writer.CHUNK_SIZE", 3000)
+    monkeypatch.setattr("msg_analysis.bags.written_file.CHUNK_SIZE", 3000)
     bag = tmp_path / "bag"
     if split is not None:  # so many files
         write_trajectory(run, tmp_path / "one", Storage(compression))
@@ -104,7 +104,9 @@ def _values(run: Trajectory, bag: Path) -> Counter[str]:
     assert np.array_equal(found["truth"], run.states) if noisy else np.isnan(found["truth"]).all()
     kinds = ("state", "truth") if noisy else ("state",)
     states = {f"/agent_{i + 1}/{kind}": STEPS + 1 for i in range(AGENTS) for kind in kinds}
-    assert count == states | {"/experiment": 1, "/graph": count["/graph"]}
+    files = len(list(bag.glob("*.mcap")))  # each begins with what is in force
+    assert count == states | {"/experiment": files, "/graph": count["/graph"]}
+    assert count["/graph"] - int(np.count_nonzero(np.diff(run.modes))) - 1 in range(2 * files - 1)
     return count
 
 
@@ -115,6 +117,7 @@ def _files(bag: Path, files: list[Path], compression: Compression, topics: Count
     assert information["relative_file_paths"] == [file.name for file in files]
     counted: Counter[str] = Counter()
     sequences: dict[str, list[int]] = {}
+    before = -1
     for file, entry in zip(files, information["files"], strict=True):
         with file.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
@@ -124,16 +127,22 @@ def _files(bag: Path, files: list[Path], compression: Compression, topics: Count
             kinds = {index.compression for index in summary.chunk_indexes}
             assert kinds == {"" if compression == "none" else compression}
             sizes = [index.chunk_length + index.message_index_length for index in summary.chunk_indexes]
-            assert sum(sizes[:-1]) < (split or 10**9)  # the last one made it too large
+            # Without the head of a later file, the one that made it too large, and those that were late.
+            assert sum(sizes[file is not files[0] : -2]) < (split or 10**9)
             messages = [(channel.topic, message) for _, channel, message in reader.iter_messages()]
             for topic, message in messages:
-                sequences.setdefault(topic, []).append(message.sequence)
+                if message.publish_time == message.log_time:
+                    sequences.setdefault(topic, []).append(message.sequence)
+                else:
+                    assert message.sequence in sequences[topic]  # repeated
             times = [message.log_time for _, message in messages]
             metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         assert summary.statistics.message_count == len(messages) == entry["message_count"]
         assert summary.statistics.chunk_count == len(summary.chunk_indexes)
         assert {channel.topic for channel in summary.channels.values()} == set(topics)
         assert entry["path"] == file.name
+        assert min(times) > before
+        before = max(times)
         assert entry["starting_time"]["nanoseconds_since_epoch"] == min(times)
         assert entry["duration"]["nanoseconds"] == max(times) - min(times)
         counted.update(topic for topic, _ in messages)

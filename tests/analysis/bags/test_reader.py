@@ -324,8 +324,8 @@ def test_no_bag(tmp_path: Path, make_run: MakeRun) -> None:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"storage_identifier": "sqlite3"}, "expected mcap"),
-        ({"compression_mode": "MESSAGE"}, "compressed by itself"),
+        ({"storage_identifier": "tape"}, "expected mcap or sqlite3"),
+        ({"compression_mode": "MESSAGE", "compression_format": "lz4"}, "expected zstd"),
         ({"relative_file_paths": ["gone_0.mcap"]}, "gone_0.mcap"),
         ({"relative_file_paths": []}, "missing"),
     ],

@@ -119,7 +119,7 @@ def _boundaries(file: Path) -> list[int]:
 @pytest.fixture
 def recorded(tmp_path: Path, make_run: MakeRun, monkeypatch: pytest.MonkeyPatch) -> tuple[Trajectory, Path]:
     """A run and its bag of many small chunks."""
-    monkeypatch.setattr("msg_analysis.bags.writer.CHUNK_SIZE", 2000)
+    monkeypatch.setattr("msg_analysis.bags.written_file.CHUNK_SIZE", 2000)
     run = make_run()
     write_trajectory(run, tmp_path / "whole")
     return run, tmp_path / "whole" / "whole_0.mcap"

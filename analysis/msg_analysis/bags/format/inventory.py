@@ -20,8 +20,9 @@ from mcap.records import Channel, ChunkIndex
 from mcap.summary import Summary
 
 from msg_analysis.bags.format.mcap_chunks import CHUNK_CRC, RECORD_LIMIT, chunk_head
-from msg_analysis.bags.format.mcap_file import Batch, McapFile
+from msg_analysis.bags.format.mcap_file import McapFile
 from msg_analysis.bags.format.metadata import ChannelCount, FileCount
+from msg_analysis.bags.format.stored_file import Batch, StoredFile
 from msg_analysis.common.bounded_input import load_yaml
 
 _FOOTER = struct.Struct("<9xQQI8x")  # starts of summary and summary offsets; CRC of all from the summary up to itself
@@ -32,7 +33,7 @@ _BEHIND_CRC = 12  # bytes of the CRC and the closing magic
 class FileInventory:
     """One file: what it holds and what is wrong with it, complete once ``watch`` has run to its end."""
 
-    file: McapFile
+    file: StoredFile
     count: FileCount
     summary: Summary | None = None  # None where the file has none that is correct
     problem: str | None = None  # why nothing of the file can be read
@@ -51,7 +52,7 @@ class FileInventory:
             yield batch
         for number in self.file.channels:
             self._channel(number)
-        if self.file.torn is None:
+        if self.file.torn is None and isinstance(self.file, McapFile):
             self.summary = summary_of(self.file.path)
 
     def _channel(self, number: int) -> ChannelCount:
@@ -63,8 +64,11 @@ class FileInventory:
 
     @property
     def whole(self) -> bool:
-        """Whether other programs can read it as it is: not torn, not damaged, with a correct summary."""
-        return self.lost_messages == 0 and not self.file.damaged_chunks and not self.file.false_indexes
+        """Whether other programs can read it as it is: MCAP, not torn, not damaged, with a correct summary."""
+        file = self.file
+        if not isinstance(file, McapFile) or file.unpacked_messages:
+            return False
+        return self.lost_messages == 0 and not file.damaged_chunks and not file.false_indexes
 
     @property
     def lost_messages(self) -> int | None:
@@ -88,7 +92,7 @@ class Inventory:
 
     files: list[FileInventory] = field(default_factory=list)
 
-    def add(self, file: McapFile) -> FileInventory:
+    def add(self, file: StoredFile) -> FileInventory:
         """Add a file that has not been read yet."""
         self.files.append(FileInventory(file, FileCount(file.path.name)))
         return self.files[-1]

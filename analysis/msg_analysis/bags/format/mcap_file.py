@@ -9,7 +9,6 @@ import contextlib
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import zstandard
@@ -28,59 +27,15 @@ from msg_analysis.bags.format.mcap_chunks import (
     run_of_messages,
     unpack,
 )
+from msg_analysis.bags.format.storage_options import ZSTD_SUFFIX
+from msg_analysis.bags.format.stored_file import Batch, StoredFile, no_time
 from msg_analysis.errors import BagError
-from msg_analysis.types import AnyArray, BoolArray, IntArray
+from msg_analysis.types import IntArray
 
 MAGIC = b"\x89MCAP0\r\n"
-# Bytes of chunks for every byte of their file, at most, and those that any file may have. States shrink to two thirds,
-# those of a run without noise to a two hundredth.
-MOST_EXPANSION = 1000
-FREE_EXPANSION = 2**26
 MOST_OTHERS = 2**18  # records of a chunk that are no messages: two for every number of a channel
-MOST_CHANNELS = 2**13  # of a file: writing the metadata of each topic takes a tenth of a millisecond
 MOST_DESCRIBED = 2**26  # bytes of the schemas and channels in the chunks of a file: what they describe is kept
 _LOOSE = 2**18  # bytes of a batch of messages that are not in chunks
-_ZSTD = ".zstd"  # suffix of rosbag2's compression mode `file`
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Batch:
-    """Messages in the order of the file; the CDR bytes of each lie behind the rest of its record in ``data``."""
-
-    data: bytes
-    start: IntArray  # (messages,) offset of the CDR bytes in ``data``
-    size: IntArray  # (messages,) number of CDR bytes
-    head: AnyArray  # (messages,) of type ``MESSAGE_HEAD``
-    end: int  # bytes of the file up to the end of the chunk, or of the last record, of these messages
-
-    @classmethod
-    def of_contents(cls, data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
-        """A batch from the offsets and sizes, (messages,), of the contents of its message records in ``data``.
-
-        DamageError: a record too short for a message, or a time of 2^63 ns or more.
-        """
-        if (size < MESSAGE_HEAD.itemsize).any():
-            raise DamageError
-        head = gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
-        if _no_time(head).any():
-            raise DamageError
-        return cls(data, start + MESSAGE_HEAD.itemsize, size - MESSAGE_HEAD.itemsize, head, end)
-
-    @property
-    def channel(self) -> AnyArray:
-        """(messages,) channel number."""
-        return np.asarray(self.head["channel"])
-
-    @property
-    def table(self) -> IntArray:
-        """(messages, 6) int64: channel number, sequence, log time [ns], publish time [ns], start, size."""
-        columns = [self.head[name].astype(np.int64) for name in MESSAGE_HEAD.names or ()]
-        return np.column_stack((*columns, self.start, self.size))
-
-    def message(self, index: int) -> bytes:
-        """CDR bytes of the message at an index of the batch."""
-        start = int(self.start[index])
-        return self.data[start : start + int(self.size[index])]
 
 
 @dataclass(slots=True)
@@ -137,31 +92,19 @@ class _Source:
 
 
 @dataclass(slots=True)
-class McapFile:
+class McapFile(StoredFile):
     """An MCAP file to be read once, by iterating over ``batches()``; compressed as a whole if named *.zstd."""
 
-    path: Path
-    channels: dict[int, Channel] = field(default_factory=dict)  # by number; these and the following: seen so far
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    metadata: list[Metadata] = field(default_factory=list)
-    attachments: list[Attachment] = field(default_factory=list)
     statistics: Statistics | None = None
-    profile: str = ""
-    library: str = ""
-    whole_bytes: int = 0  # length of the whole records so far, with the magic bytes; of a .zstd file, unpacked
-    torn: str | None = None  # what is there instead of the end of the file, known when all is read
-    damaged_chunks: int = 0  # chunks that are left out
     false_indexes: int = 0  # chunks whose index is wrong: here the records decide, other programs use the index
-    _expanded: int = 0  # bytes of all chunks so far
-    _described: int = 0  # bytes of the schemas and channels in them
+    _described: int = 0  # bytes of the schemas and channels in the chunks
 
-    def batches(self) -> Iterator[Batch]:
-        """The messages of all whole records; BagError: not an MCAP file, empty, or one that cannot be read."""
+    def _stored(self) -> Iterator[Batch]:
         try:
             size = self.path.stat().st_size
             with contextlib.ExitStack() as stack:
                 stream = stack.enter_context(self.path.open("rb"))
-                if self.path.suffix == _ZSTD:
+                if self.path.suffix == ZSTD_SUFFIX:
                     size = 2**62  # not known before all is unpacked
                     unpacked = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
                     stream = stack.enter_context(io.BufferedReader(unpacked))
@@ -244,9 +187,7 @@ class McapFile:
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
                 channel = Channel.read(stream)
-                self.channels[channel.id] = channel
-                if len(self.channels) > MOST_CHANNELS:
-                    raise BagError(f"{self.path}: more than {MOST_CHANNELS} topics: record the topics of the run alone")
+                self.add_channel(channel)
             elif opcode == Opcode.METADATA:
                 self.metadata.append(Metadata.read(stream))
             elif opcode == Opcode.STATISTICS:
@@ -264,12 +205,7 @@ class McapFile:
         except Exception:  # decompressors raise many kinds of errors on damage
             self.damaged_chunks += 1
             return
-        self._expanded += len(data)
-        if self._expanded > MOST_EXPANSION * chunk.end + FREE_EXPANSION:
-            raise BagError(
-                f"{self.path}: {self._expanded >> 20} MB in chunks of {chunk.end >> 10} kB: expected at most "
-                f"{MOST_EXPANSION} times as much: the file is damaged, or made to fill the memory"
-            )
+        self.count_expanded(len(data), chunk.end)
         try:
             places = locate(data, chunk.index)
             if places is None:
@@ -319,11 +255,5 @@ def _keep_memory() -> None:
 def _loose_batch(data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
     """Messages that are not in a chunk; damaged ones are left out one by one."""
     start, size = start[size >= MESSAGE_HEAD.itemsize], size[size >= MESSAGE_HEAD.itemsize]
-    timed = ~_no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
+    timed = ~no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
     return Batch.of_contents(data, start[timed], size[timed], end)
-
-
-def _no_time(head: AnyArray) -> BoolArray:
-    """(messages,) whether the log or publish time is 2^63 ns or more, which no clock shows."""
-    octets = head.view(np.uint8).reshape(len(head), MESSAGE_HEAD.itemsize)
-    return np.asarray((octets[:, 13] | octets[:, 21]) >= 128)  # the highest byte of either

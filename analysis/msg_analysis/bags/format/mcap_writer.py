@@ -118,10 +118,13 @@ class McapWriter:
             self._finish_chunk()
         return len(records)
 
-    def add_message(self, channel: int, time_ns: int, data: bytes, sequence: int) -> None:
-        """Append a message, logged and published at that time."""
+    def add_message(
+        self, channel: int, time_ns: int, data: bytes, sequence: int, published_ns: int | None = None
+    ) -> None:
+        """Append a message, logged at that time, and published then if no other time is given."""
         length = len(data)
-        self._chunk += (MESSAGE.pack(Opcode.MESSAGE, length + 22, channel, sequence, time_ns, time_ns), data)
+        published = time_ns if published_ns is None else published_ns
+        self._chunk += (MESSAGE.pack(Opcode.MESSAGE, length + 22, channel, sequence, time_ns, published), data)
         self._index[channel] += (time_ns, self._size)
         self._size += length + MESSAGE.size
         if self._size > self._chunk_size:

@@ -11,6 +11,8 @@ Compression = Literal["none", "zstd", "lz4"]
 COMPRESSIONS: tuple[Compression, ...] = ("none", "zstd", "lz4")
 MEGABYTE = 10**6
 SMALLEST_SPLIT = 0.1  # MB; about the size of a chunk
+SQLITE_SUFFIX, ZSTD_SUFFIX = ".db3", ".zstd"  # the latter of rosbag2's compression mode `file`
+BAG_SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".db3.zstd")  # of the files that can be read
 
 
 @dataclass(frozen=True, slots=True)

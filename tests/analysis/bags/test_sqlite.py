@@ -1,0 +1,263 @@
+"""Bags in sqlite3, made by hand in the schemas of rosbag2's versions, and by rosbags: read, played, salvaged."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+import zstandard
+from click.testing import CliRunner
+from rosbags.highlevel import AnyReader
+
+from msg_analysis.bags.playback import Playback
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.salvage import salvage
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.cli.main import main
+from msg_analysis.errors import BagError
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.report.documents.info import describe_bag
+
+MakeRun = Callable[..., Trajectory]
+Message = tuple[str, str, int, bytes]  # topic, type, time, data
+TOPICS = {  # columns by version: of Foxy (1), Galactic and Humble (2, 3), Iron, Jazzy and later (4)
+    1: "id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL",
+    3: "id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL, "
+    "offered_qos_profiles TEXT NOT NULL",
+    4: "id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL, "
+    "offered_qos_profiles TEXT NOT NULL, type_description_hash TEXT NOT NULL",
+}
+MESSAGES = "id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL, timestamp INTEGER NOT NULL, data BLOB NOT NULL"
+# As rosbag2 writes it: in numbers until version 8 of its metadata, then in words.
+QOS = """- history: {0[0]}
+  depth: 0
+  reliability: {0[1]}
+  durability: {0[2]}
+  deadline: {{sec: 9223372036, nsec: 854775807}}
+  lifespan: {{sec: 9223372036, nsec: 854775807}}
+  liveliness: {0[3]}
+  liveliness_lease_duration: {{sec: 9223372036, nsec: 854775807}}
+  avoid_ros_namespace_conventions: false
+"""
+WORDS = {
+    3: ((2, 1, 1, 1), (2, 1, 2, 1)),
+    4: [("keep_all", "reliable", w, "automatic") for w in ("transient_local", "volatile")],
+}
+
+
+@pytest.fixture
+def run(make_run: MakeRun) -> Trajectory:
+    return make_run(3, 200, 2)
+
+
+@pytest.fixture
+def messages(run: Trajectory, tmp_path: Path) -> list[Message]:
+    write_trajectory(run, tmp_path / "ours")
+    with AnyReader([tmp_path / "ours"]) as reader:
+        return [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
+
+
+def database(file: Path, messages: list[Message], version: int = 4, mode: str = "MEMORY") -> Path:
+    connection = sqlite3.connect(file)
+    connection.execute(f"PRAGMA journal_mode={mode}")
+    connection.execute(f"CREATE TABLE topics({TOPICS[version]})")
+    connection.execute(f"CREATE TABLE messages({MESSAGES})")
+    connection.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
+    numbers: dict[str, int] = {}
+    for topic, kind, time, data in messages:
+        if topic not in numbers:
+            numbers[topic] = 10 * len(numbers) + 3
+            row: list[Any] = [numbers[topic], topic, kind, "cdr"]
+            if version > 1:
+                latched = topic in ("/experiment", "/graph")
+                row.append(QOS.format(WORDS[version][0 if latched else 1]))
+            if version > 3:
+                row.append("")
+            connection.execute(f"INSERT INTO topics VALUES ({', '.join('?' * len(row))})", row)
+        connection.execute("INSERT INTO messages VALUES (NULL, ?, ?, ?)", (numbers[topic], time, data))
+    connection.commit()
+    connection.close()
+    return file
+
+
+@pytest.mark.parametrize("version", TOPICS)
+def test_every_version_is_read_and_played(
+    version: int, run: Trajectory, messages: list[Message], tmp_path: Path
+) -> None:
+    file = database(tmp_path / "theirs_0.db3", messages, version)
+    found = read_bag(file)
+    assert found.completeness.complete
+    assert np.array_equal(found.states, run.states)
+    assert np.array_equal(found.modes, run.modes)
+    playback = Playback(file)
+    played = [(message.topic, message.time, message.data) for message in playback.messages(list(playback.topics))]
+    assert sorted(played) == sorted((topic, time, data) for topic, _, time, data in messages)
+    assert [time for _, time, _ in played] == sorted(time for _, time, _ in played)
+    latched = {name for name, topic in playback.topics.items() if topic.latched}
+    assert latched == (set() if version == 1 else {"/experiment", "/graph"})
+    assert playback.topics["/graph"].type_name == "msg_agents_interfaces/msg/ActiveGraph"
+
+
+def test_several_files_with_the_names_of_old_versions(run: Trajectory, messages: list[Message], tmp_path: Path) -> None:
+    """Until version 3 of metadata.yaml, names of files begin with that of the bag. Without it, they go by number."""
+    bag = tmp_path / "theirs"
+    bag.mkdir()
+    for number in range(12):
+        database(bag / f"theirs_{number}.db3", messages[number::12], 1)
+    information = {"version": 3, "storage_identifier": "sqlite3", "compression_format": "", "compression_mode": ""}
+    names = [f"theirs/theirs_{number}.db3" for number in range(12)]
+    (bag / "metadata.yaml").write_text(
+        yaml.safe_dump({"rosbag2_bagfile_information": information | {"relative_file_paths": names}})
+    )
+    for _ in range(2):
+        assert np.array_equal(read_bag(bag).states, run.states)
+        document = describe_bag(bag)
+        files = [file["name"] for file in document["files"] if file["name"].endswith(".db3")]
+        assert files == [f"theirs_{number}.db3" for number in range(12)]
+        assert sum(topic["messages"] for topic in document["topics"]) == len(messages)
+        (bag / "metadata.yaml").unlink(missing_ok=True)
+    shutil.copy(bag / "theirs_3.db3", tmp_path / "x")
+    (bag / "theirs_3.db3").write_bytes((tmp_path / "x").read_bytes()[:5000])
+    found = read_bag(bag)
+    assert found.completeness.missing > 0
+    assert {"torn file", "unreadable file"} & found.completeness.refused.keys()
+
+
+WRITER = """
+import os, signal, sqlite3, sys
+connection = sqlite3.connect(sys.argv[1])
+connection.execute("PRAGMA journal_mode=WAL")
+connection.execute("PRAGMA wal_autocheckpoint=0")
+connection.execute("DELETE FROM messages WHERE id % 2 = 0")
+connection.commit()
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_the_log_of_a_killed_recorder_counts(messages: list[Message], tmp_path: Path) -> None:
+    """`--storage-preset-profile resilient`: what was committed is in a log beside the file."""
+    file = database(tmp_path / "theirs_0.db3", messages)
+    killed = subprocess.run([sys.executable, "-c", WRITER, file], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert (tmp_path / "theirs_0.db3-wal").stat().st_size > 0
+    before = file.read_bytes()
+    found = read_bag(file)
+    assert found.completeness.received == sum(1 for topic, *_ in messages[::2] if topic.endswith("state"))
+    assert file.read_bytes() == before
+
+
+def test_nothing_is_left_beside_a_file_in_wal_mode(run: Trajectory, messages: list[Message], tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    file = database(tmp_path / "bag/theirs_0.db3", messages, mode="WAL")
+    assert np.array_equal(read_bag(file).states, run.states)
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+
+
+def test_salvage_makes_mcap_of_it(run: Trajectory, messages: list[Message], tmp_path: Path) -> None:
+    """Also of a file that is cut off, as far as SQLite can read it; others read the new bag."""
+    file = database(tmp_path / "theirs_0.db3", messages)
+    report = salvage(file, tmp_path / "whole")
+    assert (report.kept_messages, report.dropped_bytes, report.torn) == (len(messages), 0, None)
+    assert [path.name for path in sorted((tmp_path / "whole").iterdir())] == ["metadata.yaml", "whole_0.mcap"]
+    with AnyReader([tmp_path / "whole"]) as reader:
+        found = [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
+    assert sorted(found) == sorted(messages)
+    assert np.array_equal(read_bag(tmp_path / "whole").states, run.states)
+    content = file.read_bytes()
+    file.write_bytes(content[: len(content) // 2] + bytes(4096))
+    report = salvage(file, tmp_path / "half")
+    assert 0 < report.kept_messages < len(messages)
+    assert report.torn is not None
+    assert 0 < read_bag(tmp_path / "half").completeness.received < 603
+
+
+def test_messages_compressed_one_by_one_are_salvaged_unpacked(
+    run: Trajectory, messages: list[Message], tmp_path: Path
+) -> None:
+    packed = [(topic, kind, time, zstandard.compress(data)) for topic, kind, time, data in messages]
+    file = database(tmp_path / "theirs_0.db3", packed)
+    salvage(file, tmp_path / "whole")
+    with AnyReader([tmp_path / "whole"]) as reader:
+        assert sorted(bytes(data) for _, _, data in reader.messages()) == sorted(data for *_, data in messages)
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda file: file.touch(), "empty: nothing was recorded"),
+        (lambda file: file.write_bytes(b"SQLite format 3\x00" + bytes(4000)), "cannot be read"),
+        (lambda file: file.write_text("name: line_ring\n" * 300), "cannot be read"),
+        (lambda file: _made(file, "CREATE TABLE topics(id)"), "not a bag: expected the tables"),
+        (
+            lambda file: _made(
+                file,
+                f"CREATE TABLE topics({TOPICS[1]})",
+                "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) "
+                "SELECT i AS rowid, i AS topic_id, i AS timestamp, x'00' AS data FROM n",
+            ),
+            "not a bag: expected the tables",
+        ),
+        (
+            lambda file: _made(
+                file,
+                f"CREATE TABLE topics({TOPICS[1]})",
+                f"CREATE TABLE messages({MESSAGES})",
+                "INSERT INTO topics WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 9000) "
+                "SELECT i, 'a', 'b', 'cdr' FROM n",
+            ),
+            "more than 8192 topics",
+        ),
+        (
+            lambda file: _made(
+                file,
+                f"CREATE TABLE topics({TOPICS[1]})",
+                "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
+                "data GENERATED ALWAYS AS (zeroblob(200000000)) VIRTUAL)",
+                "INSERT INTO messages VALUES (1, 1, 1), (2, 1, 1), (3, 1, 1), (4, 1, 1)",
+            ),
+            "made to fill the memory",
+        ),
+    ],
+)
+def test_files_that_are_no_bags(make: Callable[[Path], Any], expected: str, tmp_path: Path) -> None:
+    """One error each; as a bag of a command, with exit code 2 and without a traceback."""
+    file = tmp_path / "x.db3"
+    make(file)
+    for function in (read_bag, Playback):
+        with pytest.raises(BagError, match=expected):
+            function(file)
+    result = CliRunner().invoke(main, ["info", str(file)])
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
+
+
+def _made(file: Path, *statements: str) -> None:
+    connection = sqlite3.connect(file)
+    for statement in statements:
+        connection.execute(statement)
+    connection.commit()
+    connection.close()
+
+
+def test_rows_that_are_no_messages(run: Trajectory, messages: list[Message], tmp_path: Path) -> None:
+    """They are left out and counted, like a message of a topic that is not there; also the last one."""
+    file = database(tmp_path / "theirs_0.db3", messages)
+    _made(
+        file,
+        *(
+            f"INSERT INTO messages VALUES (NULL, {row})"
+            for row in ("3, -1, x'00'", "3, 'noon', x'00'", "3, 1, 'text'", "77, 1, x'00'", "'x', 1.5, 2")
+        ),
+    )
+    found = read_bag(file)
+    assert np.array_equal(found.states, run.states)
+    assert found.completeness.refused == {"damaged chunk": 4}
