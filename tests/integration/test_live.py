@@ -73,6 +73,37 @@ def test_a_replay_gives_the_numbers_of_the_comparison(network: Any, domain: int)
     assert heard[7:] == [14, 950_000_000]
 
 
+@pytest.mark.parametrize("option", ["--bag", "--experiment"])
+def test_a_replay_without_its_start_is_known_from_a_file(network: Any, domain: int, option: str) -> None:
+    """As with `ros2 bag play --start-offset`: no latched topic is played, and it is there before there is a player."""
+    trajectory = simulate(network.experiment())
+    bag, record = network.directory / "bag", network.directory / "run.json"
+    write_trajectory(trajectory, bag)
+    record.write_text(trajectory.record.to_json())
+    source = bag if option == "--bag" else record
+    live = network.start("live", "--reliable", "--json", "--timeout", "60", option, source)
+    without = ("--exclude", "/experiment", "--exclude", "/graph")
+    ended(network.start("play", bag, *without, "--start-offset", "5", "--rate", "max", "--await", "live"))
+    found = json.loads(ended(live)[0])
+    assert (found["run"], found["refused"]) == (str(trajectory.record.run), {})
+    assert (found["first_step"], found["last_step"], found["steps"], found["missing"]) == (100, 299, 200, 0)
+    states = trajectory.states[100:300]  # (steps, agents, replicas)
+    error = ((states - states.mean(axis=1, keepdims=True)) ** 2).sum(axis=1).mean()
+    assert found["system_error"]["measured"] == pytest.approx(error, rel=1e-9)
+
+
+def test_files_of_which_no_run_is_known(network: Any) -> None:
+    file = network.file()
+    for words, message in (
+        (["--bag", network.directory], "not a bag: expected metadata.yaml, .mcap or .db3 files"),
+        (["--experiment", file], "not a run record (JSONDecodeError"),
+        (["--experiment", network.directory / "none.json"], "cannot be read"),
+        (["--experiment", file, "--bag", network.directory], "--bag and --experiment: expected at most one of them"),
+    ):
+        _, stderr = ended(network.start("live", *words), code=2)
+        assert message in stderr
+
+
 def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> None:
     """From the first step that it gets whole, it misses none: its number is that of the bag, to every printed digit.
 

@@ -17,7 +17,7 @@ from msg_agents.cli.web_options import WebRosCommand, announce, page, web_option
 from msg_agents.processes.environment import LAST_DOMAIN
 from msg_agents.terminal.interruption import exit_on_signals
 from msg_analysis.cli.console import examples, print_json, print_text, result_console
-from msg_analysis.cli.options import BAG, PositiveFloat, json_option
+from msg_analysis.cli.options import BAG, RUN_RECORD, PositiveFloat, json_option
 from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.text.notes import print_note
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from msg_agents.nodes.watching.live import Watched
     from msg_agents.watching.display import Display
     from msg_agents.watching.snapshot import SnapshotSource
+    from msg_analysis.model.run.record import RunRecord
 
 _domain = click.option(
     "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Overrides ROS_DOMAIN_ID of the environment."
@@ -151,7 +152,7 @@ def play(
     domain: int | None,
     as_json: bool,
 ) -> None:
-    """Play BAG, a bag of ROS 2 with MCAP storage: publish its messages in the recorded order.
+    """Play BAG, a bag of ROS 2: publish its messages in the recorded order.
 
     No message is lost: the player waits for slow readers.
 
@@ -257,7 +258,22 @@ def _enter(domain: int | None) -> None:
         "msg-agents live --domain 42 --web",
         "msg-agents live --reliable --json    # misses nothing of:",
         "msg-agents play BAG --await live",
+        "msg-agents live --bag BAG            # also of a replay without its start:",
+        "ros2 bag play BAG --start-offset 50",
     ),
+)
+@click.option(
+    "--bag",
+    type=BAG,
+    metavar="BAG",
+    help="Take the experiment from this bag instead of the topic: for a replay that does not publish it.",
+)
+@click.option(
+    "--experiment",
+    "run_record",
+    type=RUN_RECORD,
+    metavar="FILE",
+    help="The same from a run record, such as BAG/log/run.json.",
 )
 @click.option(
     "--reliable",
@@ -269,7 +285,15 @@ def _enter(domain: int | None) -> None:
 @web_options
 @_domain
 def live(
-    *, reliable: bool, timeout: float | None, as_json: bool, web: int | None, web_host: str, domain: int | None
+    *,
+    bag: Path | None,
+    run_record: Path | None,
+    reliable: bool,
+    timeout: float | None,
+    as_json: bool,
+    web: int | None,
+    web_host: str,
+    domain: int | None,
 ) -> None:
     """Watch a network, running or played: its errors so far next to their prediction.
 
@@ -281,6 +305,7 @@ def live(
     from msg_analysis.report.terminal.live_text import live_document
 
     _enter(domain)
+    record = _record_of(bag, run_record)
     console = result_console()
     panel = console.is_terminal and not as_json
     with page(web, web_host) as served:
@@ -289,7 +314,12 @@ def live(
         with Display(console, served, panel=panel, transient=False) as display:
             view = LiveView(display, None if as_json or panel else print_text)
             found = watch(
-                reliable=reliable, timeout=timeout, on_report=view.show, on_note=print_note, on_look=display.check
+                reliable=reliable,
+                record=record,
+                timeout=timeout,
+                on_report=view.show,
+                on_note=print_note,
+                on_look=display.check,
             )
         if found is not None:
             words = "The run has ended." if found.finished else "This page is no longer updated."
@@ -305,6 +335,25 @@ def live(
     sys.stderr.flush()
     # All is done, and leaving the middleware may hang.
     os._exit(ExitCode.FINE if found.finished else ExitCode.INCOMPLETE)
+
+
+def _record_of(bag: Path | None, run_record: Path | None) -> RunRecord | None:
+    """The run record of a bag or a file; None without either."""
+    if bag is not None and run_record is not None:
+        raise click.UsageError("--bag and --experiment: expected at most one of them")
+    if run_record is not None:
+        from msg_agents.cli.nodes import load_record
+        from msg_analysis.errors import InputError
+
+        try:
+            return load_record(run_record)
+        except InputError as error:
+            raise InputError(f"--experiment: {error}: expected a run record, such as log/run.json of a run") from error
+    if bag is not None:
+        from msg_analysis.bags.reader import read_record
+
+        return read_record(bag)
+    return None
 
 
 class LiveView:

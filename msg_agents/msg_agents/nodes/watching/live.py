@@ -33,7 +33,7 @@ class Watched:
 
 
 class Live(Watcher):
-    """Reads the states of the first network that it discovers, and publishes its running estimates.
+    """Reads the states of the run whose record is given, or of the first network, and publishes its running estimates.
 
     With ``reliable`` it misses no state, and the network waits for this node where it is too slow.
     """
@@ -42,10 +42,11 @@ class Live(Watcher):
         self,
         *,
         reliable: bool,
+        record: RunRecord | None = None,
         on_report: Callable[[Watched, float], None],  # the float: steps per second
         on_note: Callable[[str], None],
     ) -> None:
-        super().__init__("live", topics.ESTIMATE, on_note=on_note)
+        super().__init__("live", topics.ESTIMATE, on_note=on_note, record=record)
         self.outcome: Watched | None = None  # set at the end
         self._qos = topics.STREAM if reliable else topics.PASSIVE
         self._on_report = on_report
@@ -65,7 +66,7 @@ class Live(Watcher):
 
     def watched(self) -> Watched | None:
         """What has been seen up to now; None: no network."""
-        if self.record is None or self._estimate is None:
+        if self.record is None or self._estimate is None or not self.known.done():
             return None
         report = self._estimate.report()
         for reason, count in self._refused.items():
@@ -78,6 +79,11 @@ class Live(Watcher):
             self._estimate.add(agent, step, mode, state)
 
     def _report(self) -> None:
+        assert self._estimate is not None
+        if not self.known.done():
+            if self._estimate.steps.newest < 0:
+                return
+            self.known.set_result(None)
         watched = self.watched()
         assert watched is not None
         newest, now = watched.report.newest, time.monotonic()
@@ -87,7 +93,6 @@ class Live(Watcher):
             self._writer.publish(self._message(watched))
         self._on_report(watched, (newest - before) / max(now - then, 1e-9) if before >= 0 else 0.0)
         last = watched.record.experiment.steps
-        assert self._estimate is not None
         self._silent = self._silent + 1 if newest == before else 0
         # All states have arrived, or no more will, because the run has ended or its publishers have gone.
         quiet = self._silent >= (1 if newest >= 0 else MOST_SILENT)
@@ -125,6 +130,7 @@ def _number(value: float | None) -> float:
 def watch(
     *,
     reliable: bool = False,
+    record: RunRecord | None = None,  # None: of the topic ``experiment``
     timeout: float | None = None,  # s to wait for a network; None: no limit
     on_report: Callable[[Watched, float], None] = lambda *_: None,
     on_note: Callable[[str], None] = lambda _: None,
@@ -136,7 +142,7 @@ def watch(
     prediction fails.
     """
     node = run_watcher(
-        lambda: Live(reliable=reliable, on_report=on_report, on_note=on_note),
+        lambda: Live(reliable=reliable, record=record, on_report=on_report, on_note=on_note),
         timeout=timeout,
         on_note=on_note,
         on_look=on_look,

@@ -34,15 +34,20 @@ NOTE_DELAY = 1.0  # s after which a note says that there is no network
 
 
 class Watcher(LeanNode):
-    """Follows the first run that it discovers; ``known`` is set then, and ``done`` (by subclasses) at its end."""
+    """Follows the run whose record is given, or the first one that it discovers.
+
+    ``known`` is set when the run is there, and ``done`` (by subclasses) at its end.
+    """
 
     ack_timeout = 5.0  # s for readers to acknowledge the last message of this node
 
-    def __init__(self, name: str, output: Topic, *, on_note: Callable[[str], None]) -> None:
+    def __init__(
+        self, name: str, output: Topic, *, on_note: Callable[[str], None], record: RunRecord | None = None
+    ) -> None:
         super().__init__(name)
         self._on_note = on_note
         self._writer: Publisher = self.publisher_of(output)
-        self.record: RunRecord | None = None
+        self.record = record
         self.known, self.done = Future(), Future()
         self._refused: Counter[str] = Counter()
         self._others: set[str] = set()
@@ -103,6 +108,11 @@ class Watcher(LeanNode):
         if self.record is not None and isinstance(decode_of_run(Progress, data, self.record.run.bytes), Progress):
             self._ended = True
 
+    def look(self) -> None:
+        """Look whether the run whose record was given is there."""
+        if self._topics and not self.known.done() and self._has_publishers():
+            self.known.set_result(None)
+
     def _has_publishers(self) -> bool:
         return any(self.count_publishers(topic) for topic in self._topics)
 
@@ -132,9 +142,13 @@ def run_watcher(
         nodes = [node := make_node()]
         executor = make_executor()
         executor.add_node(node)
+        followed = node.record is not None
+        if followed:  # at once: a player may wait for nobody
+            node.follow()
         began, noted = time.monotonic(), False
         while not node.known.done():
             on_look()
+            node.look()
             executor.spin_until_future_complete(node.known, timeout_sec=SPIN_SLICE)
             waited = time.monotonic() - began
             if timeout is not None and waited > timeout and not node.known.done():
@@ -142,7 +156,8 @@ def run_watcher(
             if waited > NOTE_DELAY and not noted and not node.known.done():
                 noted = True
                 on_note(f"{no_network} yet: waiting for one")
-        node.follow()
+        if not followed:
+            node.follow()
         _spin(executor, node.done, on_look)
         node.wait_for_readers()
     except (KeyboardInterrupt, SystemExit):
