@@ -22,7 +22,7 @@ from msg_analysis.types import AnyArray, BoolArray, IntArray
 MOST_EXPANSION = 1000
 FREE_EXPANSION = 2**26
 MOST_CHANNELS = 2**13  # of a file: writing the metadata of each topic takes a tenth of a millisecond
-_ZSTD_FRAME = int.from_bytes(b"\x28\xb5\x2f\xfd", "little")  # first bytes; no CDR message begins like that
+_ZSTD_FRAME = b"\x28\xb5\x2f\xfd"  # first bytes; no CDR message begins like that
 _UNPACKED = 2**22  # bytes of a batch of messages that were unpacked one by one
 
 
@@ -149,12 +149,14 @@ def batch_of(pieces: list[bytes], head: AnyArray, end: int) -> Batch:
 
 def _packed(batch: Batch) -> BoolArray:
     """(messages,) whether they are compressed one by one."""
-    long = batch.size >= 4
-    if not long.any():
-        return np.zeros(len(long), dtype=np.bool_)
-    start = batch.start if long.all() else np.where(long, batch.start, batch.start[long][0])
-    begins: AnyArray = gather(batch.data, start, 4).view("<u4")
-    return np.asarray((begins == _ZSTD_FRAME) & long)
+    octets = np.frombuffer(batch.data, np.uint8)
+    if not len(octets):
+        return np.zeros(len(batch.size), dtype=np.bool_)
+    # One byte first, which is enough in nearly all files and takes a fraction of the time of four.
+    packed = octets.take(batch.start, mode="clip") == _ZSTD_FRAME[0]
+    for index in np.flatnonzero(packed).tolist():
+        packed[index] = batch.message(index).startswith(_ZSTD_FRAME)
+    return np.asarray(packed)
 
 
 def no_time(head: AnyArray) -> BoolArray:
