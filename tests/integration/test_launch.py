@@ -177,7 +177,9 @@ def test_others_of_the_launch(network: Any, launch: Launch, shutdown: str) -> No
     )
     process = launch(file)
     if shutdown == "false":
-        network.wait_for(lambda: bags(network) and not nodes(network), 60, "the end of the network")
+        words = network.wait_for(lambda: [w for p in nodes(network).values() for w in p.command], 30, "nodes")
+        folder = next(Path(word).parent for word in words if word.endswith("run.json"))
+        network.wait_for(lambda: not folder.exists(), 60, "the end of the network, as launch sees it")
         assert process.poll() is None
         os.killpg(process.pid, signal.SIGINT)
     output, _ = process.communicate(timeout=60)
