@@ -81,7 +81,8 @@ def install_by_uv(file: str, cache: Path) -> int:
 
 def install_by_pip() -> int:
     """Its exit code; a line for every twenty packages that it looks for."""
-    command = [*PIP, "install", "--progress-bar", "off", *hashed("lock.txt")]
+    # All are listed. Looking for what they need, pip ignores pins of packages that others need with extras.
+    command = [*PIP, "install", "--no-deps", "--progress-bar", "off", *hashed("lock.txt")]
     count, found = (HERE / "lock.txt").read_text().count("=="), 0
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as pip:
         assert pip.stdout is not None

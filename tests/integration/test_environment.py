@@ -16,7 +16,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 
 RUN = {"processes": 2, "duration": 5}
-READ_ONLY = 'mount --bind "$1" "$1" && mount -o remount,ro,bind / && export TMPDIR="$1" && shift && exec "$@"'
+READ_ONLY = 'mount --bind "$1" "$1" && mount -o remount,ro,bind / && shift && exec "$@"'
 
 
 def undisturbed(network: Any, run: subprocess.Popen[str]) -> None:
@@ -64,15 +64,33 @@ def test_a_full_stderr(network: Any) -> None:
     assert json.loads(run.stdout)["failures"] == []
 
 
-def test_a_read_only_root(network: Any) -> None:
-    """Only the working directory can be written, as in a hardened container."""
-    works = ["unshare", "--mount", "sh", "-c", READ_ONLY, "sh", str(network.directory), "true"]
-    if not shutil.which("unshare") or subprocess.run(works, capture_output=True).returncode:
+def on_a_read_only_root(writable: Path, *command: str | Path) -> list[str]:
+    """A command on a root of which one folder can be written, as in a hardened container."""
+    enter = ["unshare", "--mount", "sh", "-c", READ_ONLY, "sh", str(writable)]
+    if not shutil.which("unshare") or subprocess.run([*enter, "true"], capture_output=True).returncode:
         pytest.skip("this machine: cannot make a root that is read-only (needs root and unshare)")
+    return [*enter, *map(str, command)]
+
+
+def test_a_read_only_root(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(network.directory))
     program = Path(sys.executable).with_name("msg-agents")
     command = [program, "run", network.file(run=RUN), "--out", network.directory / "runs", "--json"]
-    run = subprocess.Popen([*works[:-1], *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = on_a_read_only_root(network.directory, *command)
+    run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     undisturbed(network, run)
+
+
+def test_no_place_for_temporary_files(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One error, and no bag is left."""
+    monkeypatch.delenv("TMPDIR", raising=False)
+    program = Path(sys.executable).with_name("msg-agents")
+    command = [program, "run", network.file(run=RUN), "--out", network.directory / "runs"]
+    command = on_a_read_only_root(network.directory, *command)
+    run = subprocess.run(command, cwd="/", capture_output=True, text=True)
+    assert (run.returncode, run.stdout) == (2, "")
+    assert re.fullmatch(r"error: TMPDIR: No usable temporary directory found in .*: set it to .*\n", run.stderr)
+    assert not list((network.directory / "runs").glob("*"))
 
 
 def _foreign(folder: Path, code: str) -> str:

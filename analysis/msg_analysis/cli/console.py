@@ -73,6 +73,8 @@ def _exit_codes() -> Iterator[None]:
             place = "stdout" if _stdout_can_fail() else "a file"
             _drop_stdout()
             complain(f"{place}: {error.strerror}: the result could not be written")
+        elif "temporary directory" in str(error.strerror):
+            complain(f"TMPDIR: {error.strerror}: set it to a directory that can be written")
         else:
             raise
         raise Exit(ExitCode.BAD_INPUT) from error
