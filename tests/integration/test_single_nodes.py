@@ -20,7 +20,11 @@ from msg_analysis.twin.check import check
 
 @pytest.fixture
 def run_file(network: Any) -> Path:
-    prepare = network.start("prepare", network.file())
+    return prepared(network)
+
+
+def prepared(network: Any, **run: Any) -> Path:
+    prepare = network.start("prepare", network.file(run=run))
     stdout, stderr = prepare.communicate(timeout=60)
     assert prepare.returncode == 0, stderr
     file = network.directory / "run.json"
@@ -104,6 +108,31 @@ def test_alone(network: Any, run_file: Path, command: tuple[str, ...], missing: 
     assert error[2].split(", ") == missing
     assert f"in ROS_DOMAIN_ID {domain} and" in stderr
     assert "Traceback" not in stderr
+
+
+def test_the_others_end_without_an_agent(network: Any) -> None:
+    """A process of agents leaves and does not come back: all end by themselves, and the bag is closed."""
+    run_file, bag = prepared(network, pace="realtime", duration=900, speed=5), network.directory / "runs/mine"
+    options = ("--await", "recorder", "--patience", "2")
+    with free_domain() as domain:
+        *others, leaving = (
+            network.start(*command, ROS_DOMAIN_ID=str(domain))
+            for command in (
+                ("switcher", run_file, *options),
+                ("agent", run_file, *(p for i in "2345" for p in ("--agent", i)), *options),
+                ("recorder", run_file, "--out", bag, *options[2:]),
+                ("agent", run_file, "--agent", "1", *options),
+            )
+        )
+        network.wait_until_moving()
+        leaving.terminate()
+        assert leaving.wait(30) == 3
+        for node in others:
+            _, stderr = node.communicate(timeout=60)
+            assert (node.returncode, "left the network" in stderr) == (2, True), stderr
+    trajectory = read_bag(bag)
+    assert (trajectory.completeness.complete, check(trajectory).difference) == (False, None)
+    assert "complete: 'false'" in (bag / "metadata.yaml").read_text()
 
 
 def test_a_missing_agent_is_named_by_the_others(network: Any, run_file: Path) -> None:

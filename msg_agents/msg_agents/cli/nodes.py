@@ -195,6 +195,7 @@ def switcher(
 @_node_options
 @click.option("--out", type=PATH, metavar="BAG", required=True, help="Bag to write; must not exist.")
 @storage_options
+@_patience
 def recorder(
     run_record: Path, *, out: Path, compression: Compression, split_size: float | None, **options: Any
 ) -> None:
