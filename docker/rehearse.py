@@ -25,11 +25,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from image import base_system, build_options
 
 HERE = Path(__file__).resolve().parent
 BASE, IMAGE = "localhost/msg-agents-base", "localhost/msg-agents"
-DEBIAN, PACKAGES = "bookworm", "ca-certificates,python3,python3-venv,python3-dev"
-PIP_CONF, CERTIFICATES = Path("/etc/pip.conf"), Path("/etc/ssl/certs")
 PATIENCE = 300.0  # s for a service
 
 
@@ -52,22 +51,14 @@ class Buildah:
 
     def base(self, folder: Path) -> str:
         """A Debian with Python as an image."""
-        system = folder / "base"
-        if not (system / "usr/bin/python3").exists():
-            shutil.rmtree(system, ignore_errors=True)
-            print(f"debootstrap {DEBIAN} into {system}", file=sys.stderr)
-            run("debootstrap", "--variant=minbase", f"--include={PACKAGES}", DEBIAN, system)
         container = self("from", "scratch")
-        run("cp", "--archive", f"{system}/.", self("mount", container))
+        run("cp", "--archive", f"{base_system(folder)}/.", self("mount", container))
         self("commit", "--rm", container, BASE)
         return BASE
 
     def build(self, base: str) -> None:
-        """The Dockerfile, on a base; with this machine's certificates, and where it gets Python packages from."""
-        volumes = [path for path in (PIP_CONF, CERTIFICATES) if path.exists()]
-        options = [word for path in volumes for word in ("--volume", f"{path}:{path}:ro")]
-        self("bud", "--isolation", "chroot", "--format", "docker", "--build-arg", f"BASE={base}", *options,
-             "--file", HERE / "Dockerfile", "--tag", IMAGE, HERE.parent)  # fmt: skip
+        """The Dockerfile, on a base."""
+        self("bud", "--isolation", "chroot", "--format", "docker", *build_options(base), "--tag", IMAGE, HERE.parent)
 
 
 def interpolated(text: str) -> str:
@@ -136,8 +127,13 @@ class Services:
         self.processes[name] = subprocess.Popen(
             ["ip", "netns", "exec", self._prefix + name, "unshare", "--mount", "--propagation", "private",
              "/bin/sh", "-ec", "; ".join((*mounts, f"cd {self._root}", enter)), name, *command],
-            env=environment | {"HOME": "/tmp"},
+            env=environment | {"HOME": self._home(user)},
         )  # fmt: skip
+
+    def _home(self, user: str) -> str:
+        """The home of a user of the image, as an engine sets it: / if there is none."""
+        accounts = (line.split(":") for line in (self._root / "etc/passwd").read_text(encoding="utf-8").splitlines())
+        return next((account[5] for account in accounts if account[2] == user), "/")
 
     def healthy(self, name: str) -> bool:
         """Whether the health check of a running service passes."""
