@@ -95,7 +95,7 @@ def run_file(tmp_path: Path) -> Path:
         ({"noise": {"delay": 1}}, ["--pace", "realtime"], ["noise.delay: 1"]),
         ({}, ["--pace", "realtime", "--speed", "0"], ["run.speed: 0", "> 0"]),
         ({}, ["--pace", "fast"], ["error: --pace: run.pace", "fast"]),
-        ({}, ["--processes", "many", "--seed", "1"], ["error: --seed, --processes: run.processes", "many"]),
+        ({}, ["--processes", "many", "--seed", "1"], ["error: --processes: run.processes", "many"]),
         ({}, ["--processes", "0"], ["run.processes"]),
         ({"run": {"dt": -1}}, ["--seed", "1"], ["bad.yaml: run.dt"]),
         ({}, ["--seed", "-1"], ["run.seed", "-1"]),

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from msg_agents.discovery import ros_domain
-from msg_agents.discovery.ros_domain import DOMAINS, PORT_BASE, PORTS_PER_DOMAIN, free_domain
+from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN, free_domain
 from msg_analysis.errors import InputError
 
 HOLD = """
@@ -28,19 +28,11 @@ with domain.free_domain() as held:
 
 
 @pytest.fixture(autouse=True)
-def _own_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Locks of our own, so that runs on the same machine neither disturb the tests nor are disturbed."""
-    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
-
-
-def unused(count: int) -> range:
-    """Domains in a row whose ports nobody uses."""
-    busy = {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in ros_domain._ports_in_use()}
-    return next(
-        range(first, first + count)
-        for first in reversed(DOMAINS)
-        if first + count <= DOMAINS.stop and not busy & set(range(first, first + count))
-    )
+def reserved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[range]:
+    """Three domains in a row that no other run takes meanwhile; for the tests, locks of our own."""
+    with free_domain(3) as first:
+        monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))
+        yield range(first, first + 3)
 
 
 @contextmanager
@@ -59,8 +51,8 @@ def holder(domains: range, directory: Path) -> Iterator[tuple[subprocess.Popen[s
             process.kill()
 
 
-def test_holders_get_different_domains(monkeypatch: pytest.MonkeyPatch) -> None:
-    domains = unused(3)
+def test_holders_get_different_domains(reserved: range, monkeypatch: pytest.MonkeyPatch) -> None:
+    domains = reserved[:3]
     monkeypatch.setattr(ros_domain, "DOMAINS", domains)
     with ExitStack() as stack:
         assert {stack.enter_context(free_domain()) for _ in domains} == set(domains)
@@ -70,8 +62,10 @@ def test_holders_get_different_domains(monkeypatch: pytest.MonkeyPatch) -> None:
         assert again in domains
 
 
-def test_a_killed_holder_gives_its_domain_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    domains = unused(1)
+def test_a_killed_holder_gives_its_domain_back(
+    reserved: range, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    domains = reserved[:1]
     monkeypatch.setattr(ros_domain, "DOMAINS", domains)
     with holder(domains, tmp_path) as (process, held):
         assert held == domains[0]
@@ -85,9 +79,9 @@ def test_a_killed_holder_gives_its_domain_back(monkeypatch: pytest.MonkeyPatch, 
 
 @pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])
 def test_a_domain_whose_ports_are_in_use_is_left_alone(
-    monkeypatch: pytest.MonkeyPatch, family: socket.AddressFamily
+    reserved: range, monkeypatch: pytest.MonkeyPatch, family: socket.AddressFamily
 ) -> None:
-    domains = unused(2)
+    domains = reserved[:2]
     monkeypatch.setattr(ros_domain, "DOMAINS", domains)
     with socket.socket(family, socket.SOCK_DGRAM) as somebody:
         try:
@@ -99,8 +93,8 @@ def test_a_domain_whose_ports_are_in_use_is_left_alone(
                 assert chosen == domains[1]
 
 
-def test_the_lock_is_released_when_the_run_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ros_domain, "DOMAINS", unused(1))
+def test_the_lock_is_released_when_the_run_fails(reserved: range, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_domain, "DOMAINS", reserved[:1])
     for _ in range(2):
         with pytest.raises(RuntimeError, match="the run failed"), free_domain():
             raise RuntimeError("the run failed")
@@ -108,12 +102,12 @@ def test_the_lock_is_released_when_the_run_fails(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="run as root: only root can be another user")
 def test_lock_files_of_another_user_do_not_use_up_the_domains(
-    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+    reserved: range, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     shared = Path(tempfile.mkdtemp(dir="/tmp"))  # pytest's own directories are closed to others
     request.addfinalizer(lambda: shutil.rmtree(shared))
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(shared))
-    monkeypatch.setattr(ros_domain, "DOMAINS", unused(1))
+    monkeypatch.setattr(ros_domain, "DOMAINS", reserved[:1])
     shared.chmod(0o1777)  # as /tmp is; Linux guards files of others in such directories
     with free_domain() as held:
         pass
