@@ -34,9 +34,9 @@ def test_command_line_on_the_path() -> None:
 
 
 def test_verb() -> None:
-    """What ``ros2 msg-agents`` loads; this entry point is all that ros2cli looks for."""
+    """All that ros2cli looks for to know ``ros2 msg-agents``."""
     (verb,) = entry_points(group="ros2cli.command", name="msg-agents")
-    assert verb.load().main
+    assert verb.value == "msg_agents.cli.entry_points:Verb"
 
 
 def test_share() -> None:
