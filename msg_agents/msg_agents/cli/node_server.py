@@ -31,9 +31,9 @@ def main() -> None:
     prepare()
     from msg_agents.processes.fork_server import EARLY, await_run
 
-    *options, descriptor = sys.argv[1:3] if EARLY in sys.argv else sys.argv[1:2]
-    control = socket.socket(fileno=int(descriptor))
-    serve_nodes(await_run(control) if options else control)
+    early = sys.argv[1] == EARLY
+    control = socket.socket(fileno=int(sys.argv[2 if early else 1]))
+    serve_nodes(await_run(control) if early else control)
 
 
 def prepare() -> None:

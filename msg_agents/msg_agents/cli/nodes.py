@@ -266,3 +266,21 @@ def load_record(path: Path) -> RunRecord:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}): expected a run record from msg-agents prepare") from error
     return RunRecord.from_json(text, str(path))
+
+
+def record_of(bag: Path | None, run_record: Path | None) -> RunRecord | None:
+    """The run record of a bag or a file; None without either."""
+    if bag is not None and run_record is not None:
+        raise click.UsageError("--bag and --experiment: expected at most one of them")
+    if run_record is not None:
+        from msg_analysis.errors import InputError
+
+        try:
+            return load_record(run_record)
+        except InputError as error:
+            raise InputError(f"--experiment: {error}: expected a run record, such as log/run.json of a run") from error
+    if bag is not None:
+        from msg_analysis.bags.reader import read_record
+
+        return read_record(bag)
+    return None

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
+from msg_agents.cli import nodes
 from msg_agents.cli.ros_command import RosCommand
 from msg_agents.cli.web_options import WebRosCommand, announce, page, web_options
 from msg_agents.processes.environment import LAST_DOMAIN
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from msg_agents.nodes.watching.live import Watched
     from msg_agents.watching.display import Display
     from msg_agents.watching.snapshot import SnapshotSource
-    from msg_analysis.model.run.record import RunRecord
 
 _domain = click.option(
     "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Overrides ROS_DOMAIN_ID of the environment."
@@ -305,7 +305,7 @@ def live(
     from msg_analysis.report.terminal.live_text import live_document
 
     _enter(domain)
-    record = _record_of(bag, run_record)
+    record = nodes.record_of(bag, run_record)
     console = result_console()
     panel = console.is_terminal and not as_json
     with page(web, web_host) as served:
@@ -335,25 +335,6 @@ def live(
     sys.stderr.flush()
     # All is done, and leaving the middleware may hang.
     os._exit(ExitCode.FINE if found.finished else ExitCode.INCOMPLETE)
-
-
-def _record_of(bag: Path | None, run_record: Path | None) -> RunRecord | None:
-    """The run record of a bag or a file; None without either."""
-    if bag is not None and run_record is not None:
-        raise click.UsageError("--bag and --experiment: expected at most one of them")
-    if run_record is not None:
-        from msg_agents.cli.nodes import load_record
-        from msg_analysis.errors import InputError
-
-        try:
-            return load_record(run_record)
-        except InputError as error:
-            raise InputError(f"--experiment: {error}: expected a run record, such as log/run.json of a run") from error
-    if bag is not None:
-        from msg_analysis.bags.reader import read_record
-
-        return read_record(bag)
-    return None
 
 
 class LiveView:
