@@ -220,7 +220,7 @@ while True:
 
 def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
     """Everything that cannot be, in any order, sent to a run that is under way; the intruder is killed at last."""
-    file = network.file(run={"duration": 1250, "processes": 3})
+    file = network.file(run={"duration": 1000, "processes": 3})
     with free_domain() as domain:
         options = ("--out", network.directory / "runs", "--domain", str(domain), "--json")
         run = network.start("run", file, *options)
@@ -233,7 +233,7 @@ def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Ra
         )
         try:
             assert intruder.stdout is not None
-            assert int(intruder.stdout.readline()) < 18_000  # it was in time
+            assert int(intruder.stdout.readline()) < 17_000  # it was in time
             result = network.completed(run)
         finally:
             intruder.kill()
