@@ -95,12 +95,12 @@ def configurations(steps: int) -> dict[str, Callable[[], float]]:
         "100 agents in 4 processes, bare loop": lambda: bare_loop.measure(
             agents=LARGE, processes=PROCESSES, steps=steps // 15, batch=True, pin=True
         ),
-        "100 agents in 4 processes, network": lambda: network(steps // 10, agents=LARGE, processes=PROCESSES),
+        "100 agents in 4 processes, network": lambda: network(steps // 4, agents=LARGE, processes=PROCESSES),
         "100 agents in 4 processes, bare loop, recorded": lambda: bare_loop.measure(
             agents=LARGE, processes=PROCESSES, steps=steps // 15, recorder=True, batch=True, pin=True
         ),
         "100 agents in 4 processes, network, recorded": lambda: network(
-            steps // 15, agents=LARGE, processes=PROCESSES, record=True
+            steps // 4, agents=LARGE, processes=PROCESSES, record=True
         ),
         "network on SingleThreadedExecutor": lambda: network(steps // 2, executor="single"),
     }

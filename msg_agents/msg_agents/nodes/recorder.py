@@ -19,8 +19,8 @@ from msg_analysis.wire import topics
 from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.topics import Topic, agent_name, network_topics
 
-LEAST_WRITE, MOST_WRITE = 2**15, 2**18
-"""Bytes of states after which they are written: 4 kB for each agent, within these bounds. Many at once cost a fraction
+LEAST_WRITE, MOST_WRITE = 2**15, 2**20
+"""Bytes of states after which they are written: 16 kB for each agent, within these bounds. Many at once cost a fraction
 of one by one, but in longer turns the recorder delays agents on the same core."""
 WRITE_PERIOD = 0.1  # s of wall time after which fewer are written, in slow runs and at the end
 UNNAMED = "_NODE_NAME_UNKNOWN_"
@@ -163,4 +163,4 @@ class Recorder(NetworkNode):
 
 def write_size(agents: int) -> int:
     """Bytes of states after which the recorder of so many agents writes them."""
-    return min(max(2**12 * agents, LEAST_WRITE), MOST_WRITE)
+    return min(max(2**14 * agents, LEAST_WRITE), MOST_WRITE)

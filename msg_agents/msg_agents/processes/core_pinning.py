@@ -8,24 +8,21 @@ from itertools import accumulate
 
 from msg_agents.processes.process_plan import RECORDER, ProcessPlan
 
-RECORDING = 0.25
-"""Cost of a message for the recorder, relative to the cost of the step that made it for the agent."""
-
 
 def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) -> dict[str, int]:
-    """A core for each process by name, where agent processes and recorder outnumber two or more cores; else empty.
+    """A core for each agent process by name, where they and the recorder outnumber two or more cores; else empty.
 
     ``plans``: in the order of ``plan_network``, so that neighbours share a core. ``first``: index of the first core.
     """
     # In lockstep every message wakes the process that receives it. To wake it on another core costs an interrupt there,
     # and without pinning the scheduler spreads communicating processes over the cores: with two cores, the demo network
     # makes a third to a half fewer steps per second (docs/performance.md). Networks with successive values of ``first``
-    # begin at different cores, and so share them evenly. The switcher, which needs hardly any time, gets no core.
-    agents = sum(len(plan.agents) for plan in plans)
-    loads = {
-        plan.name: len(plan.agents) or RECORDING * agents for plan in plans if plan.agents or plan.name == RECORDER
-    }
-    if len(cores) < 2 or len(loads) <= len(cores):
+    # begin at different cores, and so share them evenly. The recorder gets no core: agents wait for each other, so a
+    # core that it slows down holds up the others, which then are idle; the scheduler moves it there. The switcher needs
+    # hardly any time.
+    loads = {plan.name: len(plan.agents) for plan in plans if plan.agents}
+    recorded = any(plan.name == RECORDER for plan in plans)
+    if len(cores) < 2 or len(loads) + recorded <= len(cores):
         return {}
     total = sum(loads.values())
     ends = accumulate(loads.values())

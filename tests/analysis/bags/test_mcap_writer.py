@@ -1,11 +1,15 @@
-"""Files are those of the library ``mcap``, byte for byte."""
+"""Files are those of the library ``mcap``, byte for byte, where it compresses as much as we do."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from functools import partial
 
+import mcap.writer
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.records import Attachment
@@ -24,6 +28,13 @@ MESSAGES = st.lists(
     ),
     max_size=60,
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _same_level() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mcap.writer.zstandard, "compress", partial(zstandard.compress, level=mcap_writer.ZSTD_LEVEL))
+        yield
 
 
 @given(MESSAGES, st.sampled_from(sorted(TYPES)), st.sampled_from([100, 2000, 10**6]))
