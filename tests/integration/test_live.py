@@ -27,8 +27,10 @@ rclpy.init()
 node = rclpy.create_node("listener")
 found = []
 qos = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-node.create_subscription(Estimate, "estimate", found.append, qos)
-print("ready", flush=True)
+estimate = node.create_subscription(Estimate, "estimate", found.append, qos)
+while not estimate.get_publisher_count():
+    rclpy.spin_once(node, timeout_sec=0.1)
+print("matched", flush=True)
 while not found or found[-1].steps < 300:
     rclpy.spin_once(node, timeout_sec=1.0)
 last = found[-1]
@@ -51,11 +53,10 @@ def test_a_replay_gives_the_numbers_of_the_comparison(network: Any, domain: int)
     bag = network.directory / "bag"
     write_trajectory(trajectory, bag)
     listener = subprocess.Popen([sys.executable, "-P", "-c", LISTENER], stdout=subprocess.PIPE, text=True)
-    assert listener.stdout
-    assert listener.stdout.readline() == "ready\n"
     live = network.start("live", "--reliable", "--json", "--timeout", "60")
-    # Slow enough for the middleware, which may need some seconds, to bring listener and watcher together.
-    ended(network.start("play", bag, "--rate", "2.5", "--await", "live"))
+    assert listener.stdout
+    assert listener.stdout.readline() == "matched\n"
+    ended(network.start("play", bag, "--rate", "10", "--await", "live"))
     stdout, _ = ended(live)
     found, wanted = json.loads(stdout), compare(read_bag(bag)).to_json()
     heard = json.loads(listener.communicate(timeout=60)[0])
