@@ -86,7 +86,7 @@ def test_what_needs_no_ros_does_without(folder: str) -> None:
 
 
 def test_the_folders_without_ros() -> None:
-    pure = {"stepping", "terminal", "discovery", "processes", "recovery", "replay", "watching", "running"}
+    pure = {"stepping", "terminal", "discovery", "processes", "recovery", "replay", "watching", "running", "doctor"}
     assert set(folders_without_ros()) == pure | {"cli"}
 
 

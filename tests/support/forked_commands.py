@@ -43,6 +43,7 @@ PROGRAMS = {
 }
 PREPARED = (
     "msg_agents.cli.replay",
+    "msg_agents.doctor.examination",
     "msg_agents.nodes.replay.player",
     "msg_agents.nodes.watching.live",
     "msg_agents.running.runner",
@@ -198,7 +199,7 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
         sys.argv = command[2:]
         return importlib.import_module(NODE_SERVER).main  # type: ignore[no-any-return]
     sys.argv = command
-    if command[1:2] in (["run"], ["host"]):
+    if command[1:2] in (["run"], ["host"], ["doctor"]):
         leave_one_waiting(serve_waiting, request["kept"])
     place, name = PROGRAMS[Path(command[0]).name]
     return lambda: sys.exit(getattr(importlib.import_module(place), name)())

@@ -14,6 +14,7 @@ import click
 
 import msg_agents
 from msg_agents.cli import nodes, replay
+from msg_agents.cli.doctor import doctor
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.web_options import WebCommand, announce, page, web_options
 from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS
@@ -326,6 +327,7 @@ def host(
 
 
 for _command in (
+    doctor,
     nodes.agent,
     nodes.switcher,
     nodes.recorder,

@@ -18,8 +18,8 @@ DOMAINS = range(1, 102)
 PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
 
 
-def _ports_in_use() -> set[int]:
-    """UDP ports bound on this machine."""
+def domains_with_ports_in_use() -> set[int]:
+    """Domains of which somebody has bound a UDP port on this machine."""
     ports: set[int] = set()
     for table in ("/proc/net/udp", "/proc/net/udp6"):
         try:
@@ -27,7 +27,7 @@ def _ports_in_use() -> set[int]:
         except OSError:
             continue
         ports.update(int(line.split()[1].rpartition(":")[2], 16) for line in lines)
-    return ports
+    return {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in ports}
 
 
 def _open_lock(path: Path) -> int:
@@ -48,7 +48,7 @@ def free_domain(count: int = 1) -> Iterator[int]:
     ``count``: as many in a row, for a network that needs their ports; the first one is its domain. They are held by
     locks on files, which the system releases when this process ends, however it ends.
     """
-    busy = {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in _ports_in_use()}
+    busy = domains_with_ports_in_use()
     free = [domain for domain in DOMAINS if domain not in busy]
     candidates = [first for first in free if set(range(first, first + count)) <= set(free)]
     random.shuffle(candidates)
@@ -58,6 +58,12 @@ def free_domain(count: int = 1) -> Iterator[int]:
                 yield first
                 return
     raise InputError(f"no free ROS domain among {DOMAINS[0]}..{DOMAINS[-1]}: end some runs or give --domain")
+
+
+def is_held(domain: int) -> bool:
+    """Whether a run holds a domain."""
+    with ExitStack() as locks:
+        return not _lock(domain, locks)
 
 
 def _lock(domain: int, locks: ExitStack) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 from msg_agents.discovery.profiles import LOOPBACK_PROFILE, UDP_PROFILE
@@ -15,6 +16,7 @@ TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
 RESTARTS = 3  # of killed processes in a run, by default
 LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
 DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 LOGS_VARIABLE = "ROS_LOG_DIR"
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
@@ -29,8 +31,15 @@ def check_domain() -> None:
 
 def discovery_scope() -> str:
     """Where the nodes of this process find others, as text."""
-    domain, reach = os.environ.get("ROS_DOMAIN_ID", "0"), os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    domain, reach = os.environ.get("ROS_DOMAIN_ID", "0"), os.environ.get(RANGE_VARIABLE, "SUBNET")
     return f"in ROS_DOMAIN_ID {domain} and within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}"
+
+
+def log_directory() -> Path | None:
+    """Where ROS writes its log files by the environment; None without a home."""
+    ros_home, home = os.environ.get("ROS_HOME"), os.environ.get("HOME")
+    place = os.environ.get(LOGS_VARIABLE) or (ros_home and f"{ros_home}/log") or (home and f"{home}/.ros/log")
+    return Path(place).expanduser() if place else None
 
 
 def can_log() -> bool:
@@ -38,11 +47,9 @@ def can_log() -> bool:
 
     Without them no node starts.
     """
-    ros_home, home = os.environ.get("ROS_HOME"), os.environ.get("HOME")
-    place = os.environ.get(LOGS_VARIABLE) or (ros_home and f"{ros_home}/log") or (home and f"{home}/.ros/log")
-    if not place:
+    path = log_directory()
+    if path is None:
         return False
-    path = Path(place).expanduser()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -50,10 +57,20 @@ def can_log() -> bool:
     return os.access(path, os.W_OK | os.X_OK)
 
 
+def other_logs(directory: Path) -> dict[str, str]:
+    """Changes to our environment that let ROS log to a directory, if it cannot write to the usual one."""
+    return {} if can_log() else {LOGS_VARIABLE: str(directory)}
+
+
 def ensure_logs() -> None:
     """Give this process another directory for the log files of ROS if it cannot write to the usual one."""
-    if not can_log():
-        os.environ[LOGS_VARIABLE] = str(Path(tempfile.gettempdir()) / f"msg_agents_log_{os.getuid()}")
+    os.environ.update(other_logs(Path(tempfile.gettempdir()) / f"msg_agents_log_{os.getuid()}"))
+
+
+def require_discovery(environment: Mapping[str, str]) -> None:
+    """InputError if nodes may not find each other in this environment."""
+    if environment.get(RANGE_VARIABLE) == "OFF":
+        raise InputError(f"{RANGE_VARIABLE}: OFF: the nodes of a run would not find each other: unset it")
 
 
 def tolerate_warnings() -> None:
@@ -78,9 +95,9 @@ def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str,
     A discovery server is not used: with one, the nodes of a run on this machine would not find each other without it.
     """
     environment = start_environment() | {"ROS_DOMAIN_ID": str(domain)}
-    local = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST") == "LOCALHOST"
+    local = environment.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
     if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
-        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SYSTEM_DEFAULT"  # the profile decides
+        environment[RANGE_VARIABLE] = "SYSTEM_DEFAULT"  # the profile decides
         environment.update(dict.fromkeys(PROFILE_VARIABLES, str(profile)))
         environment.pop(SERVER_VARIABLE, None)
     return environment
@@ -93,9 +110,9 @@ def without_shared_memory() -> dict[str, str]:
     """
     if any(os.environ.get(name) for name in (*PROFILE_VARIABLES, TRANSPORTS_VARIABLE)):
         return {}
-    if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") == "LOCALHOST":  # adds shared memory to any profile
+    if os.environ.get(RANGE_VARIABLE) == "LOCALHOST":  # adds shared memory to any profile
         return {
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
+            RANGE_VARIABLE: "SYSTEM_DEFAULT",
             **dict.fromkeys(PROFILE_VARIABLES, str(LOOPBACK_PROFILE)),
         }
     return dict.fromkeys(PROFILE_VARIABLES, str(UDP_PROFILE))

@@ -12,15 +12,12 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
+from msg_agents.processes.shared_memory import MEMORY, free_space
 from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 
 PREFIX = "msg_agents_run_"
-MEMORY = Path("/dev/shm")
-"""A file system in memory, where there is one: a page of a file on a disk costs about twice as much to write for the
-first time, and again after each time the system has saved it."""
-
 SPARE = 4  # times the room that is needed must be free there, so that other programs have enough
 YOUTH = 60.0  # s; younger folders may belong to a run that has not locked its own yet
 
@@ -33,7 +30,7 @@ def workshop(room: int | None = None) -> Iterator[Path]:
     folder is then in memory, if there is plenty.
     """
     _clear_abandoned()
-    parent = MEMORY if room is not None and _free(MEMORY) > SPARE * room else None
+    parent = MEMORY if room is not None and free_space(MEMORY) > SPARE * room else None
     path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
     lock = os.open(path, os.O_RDONLY)
     try:
@@ -42,14 +39,6 @@ def workshop(room: int | None = None) -> Iterator[Path]:
     finally:
         shutil.rmtree(path, ignore_errors=True)
         os.close(lock)
-
-
-def _free(directory: Path) -> int:
-    """Bytes that we could write there."""
-    try:
-        return shutil.disk_usage(directory).free if os.access(directory, os.W_OK) else 0
-    except OSError:
-        return 0
 
 
 def _clear_abandoned() -> None:

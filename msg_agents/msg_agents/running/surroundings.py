@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from msg_agents.discovery.introducer import Introducer
+from msg_agents.discovery.loopback import require_loopback
 from msg_agents.discovery.profiles import INTRODUCED_PROFILE, domains_for
 from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import LOGS_VARIABLE, PROFILE_VARIABLES, can_log, node_environment
+from msg_agents.processes.environment import PROFILE_VARIABLES, node_environment, other_logs, require_discovery
 from msg_agents.processes.middleware_check import require_middleware
+from msg_agents.processes.shared_memory import require_shared_memory
 
 ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files of ROS
 
@@ -32,19 +34,21 @@ def surroundings(
     changes: Mapping[str, str],  # of the environment
     participants: int,  # of the run
 ) -> Iterator[Surroundings]:
-    """Provide them for a run; InputError: no domain is free, or there is no middleware."""
+    """Provide them for a run; InputError: no domain is free, there is no middleware, or processes could not meet."""
     with ExitStack() as stack:
         if domain is None:
             domain = stack.enter_context(free_domain(domains_for(participants)))
         environment = node_environment(domain, INTRODUCED_PROFILE) | dict(changes)
         introducer = None
         if will_introduce(changes):
+            require_loopback()
             try:
                 introducer = stack.enter_context(Introducer(domain))
             except OSError:  # many others are in this domain
                 environment = node_environment(domain) | dict(changes)
-        if not can_log():
-            environment[LOGS_VARIABLE] = str(folder / ROS_LOGS)
+        require_discovery(environment)
+        require_shared_memory()
+        environment |= other_logs(folder / ROS_LOGS)
         require_middleware(environment)
         yield Surroundings(domain, environment, introducer)
 
