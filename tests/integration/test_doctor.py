@@ -1,0 +1,146 @@
+"""The doctor on a healthy machine, and on ones that are made ill: it finds what a run then stumbles over."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msg_agents.discovery.profiles import LOOPBACK_PROFILE
+from msg_agents.discovery.ros_domain import free_domain
+
+PROGRAM = Path(sys.executable).with_name("msg-agents")
+NAMES = [
+    *("python", "cores", "clock", "open_files", "processes", "shared_memory", "home", "temporary_directory"),
+    *("loopback", "multicast", "socket_buffers", "rclpy", "profiles", "discovery_range", "discovery_server"),
+    *("static_peers", "middleware", "ros_domain_id", "free_domains", "round_trip"),
+]
+OF_MACHINE = {*NAMES[:10], "socket_buffers", "rclpy", "free_domains"}
+FULL = 'mount -t tmpfs -o size=64k none /dev/shm && head -c 65536 /dev/zero > /dev/shm/full; exec "$@"'
+
+
+def examined(process: subprocess.Popen[str]) -> tuple[int, dict[str, Any]]:
+    """Exit code, and the document with its checks by name."""
+    stdout, stderr = process.communicate(timeout=60)
+    assert stderr == ""
+    document = json.loads(stdout)
+    checks = {check["name"]: check for check in document["checks"]}
+    assert list(checks) == NAMES
+    statuses = [check["status"] for check in checks.values()]
+    assert document["errors"] == statuses.count("error")
+    assert document["warnings"] == statuses.count("warning")
+    assert document["can_run"] == (process.returncode == 0) == ("error" not in statuses)
+    return process.returncode, checks
+
+
+@pytest.fixture
+def plain_shell(network: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    for name in ("ROS_DISCOVERY_SERVER", "ROS_LOCALHOST_ONLY", "RMW_IMPLEMENTATION", "CYCLONEDDS_URI"):
+        monkeypatch.delenv(name, raising=False)
+    return network
+
+
+def test_healthy(plain_shell: Any) -> None:
+    """Nothing is found, and a message goes there and back."""
+    code, checks = examined(plain_shell.start("doctor", "--json"))
+    ill = {name for name, check in checks.items() if check["status"] != "ok"}
+    assert ill <= OF_MACHINE
+    if ill:
+        pytest.skip(f"this machine: {'; '.join(checks[name]['text'] for name in ill)}")
+    assert code == 0
+    assert 0 < checks["round_trip"]["value"] < 10
+
+
+def other_rclpy(folder: Path) -> Path:
+    """Of another ROS 2, which cannot be loaded: the folder for PYTHONPATH."""
+    package = folder / "lib/python3.9/site-packages/rclpy"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("raise ImportError('libpython3.9.so: not found')")
+    return package.parent
+
+
+def test_many_warnings(plain_shell: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """All at once, each on a line of its own; a run can work all the same, as the round trip shows."""
+    monkeypatch.delenv("HOME")
+    monkeypatch.delenv("ROS_LOG_DIR", raising=False)
+    monkeypatch.setenv("ROS_DISCOVERY_SERVER", "127.0.0.1:11811")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(other_rclpy(tmp_path).parents[2]))
+    with free_domain() as held:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(held))
+        command = ["sh", "-c", 'ulimit -n 64; exec "$@"', "sh", PROGRAM, "doctor"]
+        doctor = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (doctor.returncode, doctor.stderr) == (0, "")
+    *lines, last = doctor.stdout.splitlines()
+    found = {line[9:30].rstrip().replace(" ", "_"): line[:9].rstrip() for line in lines}
+    assert list(found) == NAMES
+    warned = {name for name, status in found.items() if status == "warning"}
+    assert warned >= {"open_files", "home", "rclpy", "discovery_server", "ros_domain_id"}
+    assert re.fullmatch(r"A run can work here \(\d+ warnings\)\.", last)
+    assert found["round_trip"] == "ok"
+
+
+def test_a_foreign_profile(plain_shell: Any, tmp_path: Path) -> None:
+    """One that lets nodes meet: the run works with it."""
+    profile = tmp_path / "mine.xml"
+    profile.write_text(LOOPBACK_PROFILE.read_text())
+    run = plain_shell.start("doctor", "--json", FASTRTPS_DEFAULT_PROFILES_FILE=str(profile))
+    code, checks = examined(run)
+    assert checks["profiles"]["status"] == "warning"
+    assert str(profile) in checks["profiles"]["text"]
+    assert (code, checks["round_trip"]["status"]) == (0, "ok")
+
+
+def refused(network: Any, name: str, enter: list[str], **variables: str) -> None:
+    """The doctor has this error, and a run the same, before anything is started."""
+    environment = os.environ | {"NO_COLOR": "1"} | variables
+    streams: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    code, checks = examined(subprocess.Popen([*enter, PROGRAM, "doctor", "--json"], env=environment, **streams))
+    assert (code, checks[name]["status"], checks["round_trip"]["status"]) == (2, "error", "warning")
+    run = [*enter, PROGRAM, "run", network.file(), "--no-record"]
+    outcome = subprocess.run(run, env=environment, capture_output=True, text=True, timeout=60)
+    assert (outcome.returncode, outcome.stdout) == (2, "")
+    assert outcome.stderr == f"error: {checks[name]['text']}\n"
+
+
+def test_a_foreign_middleware(plain_shell: Any) -> None:
+    refused(plain_shell, "middleware", [], RMW_IMPLEMENTATION="rmw_none_cpp")
+
+
+def test_a_sourced_foreign_ros(plain_shell: Any, tmp_path: Path) -> None:
+    refused(plain_shell, "middleware", [], PYTHONPATH=str(other_rclpy(tmp_path)), ROS_DISTRO="foxy")
+
+
+def test_no_discovery(plain_shell: Any) -> None:
+    refused(plain_shell, "discovery_range", [], ROS_AUTOMATIC_DISCOVERY_RANGE="OFF")
+
+
+def unshared(*words: str) -> list[str]:
+    """A command's beginning that gives it namespaces of its own."""
+    enter = ["unshare", *words]
+    if not shutil.which("unshare") or subprocess.run([*enter, "true"], capture_output=True).returncode:
+        pytest.skip(f"this machine: cannot do {' '.join(enter)} (needs root and unshare)")
+    return enter
+
+
+def test_a_full_shared_memory(plain_shell: Any) -> None:
+    refused(plain_shell, "shared_memory", unshared("--mount", "sh", "-c", FULL, "sh"))
+
+
+def test_no_loopback(plain_shell: Any) -> None:
+    """A new network namespace has an interface that is down."""
+    refused(plain_shell, "loopback", unshared("--net"))
+
+
+def test_few_descriptors(plain_shell: Any) -> None:
+    """Too few for two processes: the round trip says so, without a traceback."""
+    command = ["sh", "-c", 'ulimit -n 16; exec "$@"', "sh", PROGRAM, "doctor", "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    code, checks = examined(process)
+    assert (code, checks["round_trip"]["status"]) == (2, "error")
