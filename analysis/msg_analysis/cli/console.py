@@ -67,14 +67,16 @@ def _exit_codes() -> Iterator[None]:
         _drop_stdout()
         raise Exit(killed_by(signal.SIGPIPE)) from error
     except OSError as error:
+        from msg_analysis.common.files import no_temporary_directory
+
         if error.filename is not None:
             complain(f"{error.filename}: {error.strerror}")
         elif error.errno in NOT_WRITTEN:
             place = "stdout" if _stdout_can_fail() else "a file"
             _drop_stdout()
             complain(f"{place}: {error.strerror}: the result could not be written")
-        elif "temporary directory" in str(error.strerror):
-            complain(f"TMPDIR: {error.strerror}: set it to a directory that can be written")
+        elif words := no_temporary_directory(error):
+            complain(words)
         else:
             raise
         raise Exit(ExitCode.BAD_INPUT) from error

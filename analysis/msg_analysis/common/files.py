@@ -33,6 +33,13 @@ def require_utf8(path: Path) -> None:
         raise InputError(f"{shown}: not UTF-8: choose a name in UTF-8") from error
 
 
+def no_temporary_directory(error: OSError) -> str | None:
+    """What to say of the error of ``tempfile`` where there is no temporary directory; None: it is another error."""
+    if "temporary directory" not in str(error.strerror):
+        return None
+    return f"TMPDIR: {error.strerror}: set it to a directory that can be written"
+
+
 def write_whole(path: Path, content: bytes) -> Path:
     """Write under a temporary name and rename; after an OSError, what was at ``path`` is unchanged."""
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:

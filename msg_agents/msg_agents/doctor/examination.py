@@ -30,11 +30,11 @@ OF_SHELL = (
     discovery_checks.check_server,
     discovery_checks.check_peers,
 )
-WITH_FILES = {  # these need a temporary directory
-    "middleware": ros_checks.check_middleware,
-    "ros_domain_id": network_checks.check_own_domain,
-    "free_domains": network_checks.check_free_domains,
-}
+LATER = (  # each with the checks that it needs to be without an error
+    ("middleware", ros_checks.check_middleware, {"rclpy", "temporary_directory"}),
+    ("ros_domain_id", network_checks.check_own_domain, {"temporary_directory"}),
+    ("free_domains", network_checks.check_free_domains, {"temporary_directory"}),
+)
 
 
 def examine() -> Iterator[Check]:
@@ -44,8 +44,8 @@ def examine() -> Iterator[Check]:
         found = check()
         failed |= {found.name} if found.status == "error" else set()
         yield found
-    for name, make in WITH_FILES.items():
-        found = _not_tried(name) if "temporary_directory" in failed else make()
+    for name, make, needed in LATER:
+        found = _not_tried(name) if needed & failed else make()
         failed |= {found.name} if found.status == "error" else set()
         yield found
     yield _not_tried("round_trip") if failed else check_round_trip()

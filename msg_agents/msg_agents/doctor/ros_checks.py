@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import sys
 import sysconfig
@@ -13,7 +12,7 @@ from pathlib import Path
 from msg_agents.discovery.profiles import INTRODUCED_PROFILE
 from msg_agents.doctor.check import Check, refusal, warn_if
 from msg_agents.processes.environment import node_environment, other_logs
-from msg_agents.processes.middleware_check import require_middleware
+from msg_agents.processes.middleware_check import require_middleware, require_rclpy
 
 PREFIXES_VARIABLE = "AMENT_PREFIX_PATH"
 PACKAGES = ("lib/python3*/site-packages", "local/lib/python3*/dist-packages", "lib/python3*/dist-packages")
@@ -23,14 +22,9 @@ DEFAULT_MIDDLEWARE = "rmw_fastrtps_cpp"
 def check_rclpy() -> Check:
     """Which ROS 2 the run would load, and which others it could be confused with."""
     name = "rclpy"
-    found = importlib.util.find_spec("rclpy")
-    if found is None or found.origin is None:
-        return Check(
-            name,
-            "error",
-            f"not found by {sys.executable}: run `make setup`, or use a terminal in which ROS 2 is sourced",
-        )
-    winner = Path(found.origin).parent.resolve()
+    if found := refusal(name, require_rclpy):
+        return found
+    winner = require_rclpy()
     ours = {Path(sysconfig.get_path(key)).resolve() for key in ("purelib", "platlib")}
     kind = "the wheel of this Python" if winner.parent in ours else "a ROS installation"
     others = sorted({str(place) for place in _places() if place != winner})

@@ -59,6 +59,8 @@ def check_round_trip() -> Check:
     except _EnoughError:
         failures = []
     else:
+        if result.interrupted:
+            raise KeyboardInterrupt
         failures = result.failures
     if failures or not watch.rate:
         what = failures[0] if failures else f"not within {LIMIT:g} s"

@@ -15,6 +15,7 @@ from msg_agents.doctor.check import Check, refusal, warn_if
 from msg_agents.processes.environment import LOGS_VARIABLE, can_log, log_directory
 from msg_agents.processes.shared_memory import MEMORY, free_space, require_shared_memory
 from msg_analysis.common.cores import count_cores
+from msg_analysis.common.files import no_temporary_directory
 
 MEGABYTE = 1_000_000
 LITTLE_MEMORY = 16 * MEGABYTE  # of shared memory; Docker gives a container 67 MB
@@ -115,7 +116,7 @@ def check_temporary_directory() -> Check:
     try:
         directory = Path(tempfile.gettempdir())
     except FileNotFoundError as error:
-        return Check(name, "error", f"TMPDIR: {error.strerror}: set it to a directory that can be written")
+        return Check(name, "error", no_temporary_directory(error) or str(error))
     free = free_space(directory)
     warning = None
     if free < LITTLE_DISK:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import subprocess
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 
 from msg_analysis.errors import InputError
 
@@ -25,11 +27,22 @@ check_for_type_support(AgentState)
 """
 
 
+def require_rclpy() -> Path:
+    """The folder of the rclpy that this Python finds; InputError: there is none."""
+    found = importlib.util.find_spec("rclpy")
+    if found is None or found.origin is None:
+        raise InputError(
+            f"rclpy: not found by {sys.executable}: run `make setup`, or use a terminal in which ROS 2 is sourced"
+        )
+    return Path(found.origin).parent.resolve()
+
+
 def require_middleware(environment: Mapping[str, str]) -> None:
     """InputError, with the variable to unset, unless rclpy and the messages can be loaded in this environment.
 
     It is tried, in a process of its own, only where a variable could lead to another ROS 2 than that of this Python.
     """
+    require_rclpy()
     present = [name for name in SUSPECTS if environment.get(name)]
     if not present:
         return

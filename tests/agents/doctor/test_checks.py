@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import resource
 import socket
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -129,6 +131,24 @@ def test_no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert "HOME: not set" in system_checks.check_logs().text
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
     assert system_checks.check_logs().status == "warning"
+
+
+def test_no_rclpy() -> None:
+    """In a Python that finds none, the error is that of a run."""
+    code = (
+        "import sys\n"
+        "from msg_agents.doctor.ros_checks import check_rclpy\n"
+        "from msg_agents.processes.middleware_check import require_middleware\n"
+        "sys.path[:] = []\n"
+        "print(check_rclpy().status)\n"
+        "print(check_rclpy().text)\n"
+        "require_middleware({})"
+    )
+    process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
+    status, text = process.stdout.splitlines()
+    assert (process.returncode, status) == (1, "error")
+    assert process.stderr.endswith(f"InputError: {text}\n")
+    assert text.startswith(f"rclpy: not found by {sys.executable}: run `make setup`")
 
 
 @pytest.mark.parametrize(
