@@ -2,7 +2,18 @@
 # installed into .venv, every package pinned with its hashes.
 
 PYTHON ?= python3
-VENV := .venv
+# Of the wheels; each distribution has a folder in requirements/ and an environment of its own. From the command line
+# only: one that is sourced is used without make, and must not change what make does.
+ROS_DISTRO := jazzy
+unexport ROS_DISTRO
+SUFFIX := $(patsubst %,-%,$(filter-out jazzy,$(ROS_DISTRO)))
+DISTROS := $(sort $(patsubst requirements/%/runtime.in,%,$(wildcard requirements/*/runtime.in)))
+ifneq ($(filter $(DISTROS),$(ROS_DISTRO)),$(ROS_DISTRO))
+$(error ROS_DISTRO=$(ROS_DISTRO): no requirements for it: expected one of: $(DISTROS))
+endif
+
+VENV := .venv$(SUFFIX)
+LOCK := requirements/$(ROS_DISTRO)
 BIN := $(VENV)/bin
 BUILT := $(VENV)/built
 INTERFACES := ros_ws/src/msg_agents_interfaces
@@ -20,13 +31,13 @@ unexport PYTHONDONTWRITEBYTECODE
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
-setup: $(VENV)/.packages ## Set up .venv with everything
+setup: $(VENV)/.packages ## Set up .venv with everything (ROS_DISTRO=kilted: .venv-kilted, as for all targets)
 
-$(VENV)/.locked: requirements/lock.txt requirements/interfaces.txt requirements/uv.txt requirements/install.py
+$(VENV)/.locked: $(LOCK)/lock.txt $(LOCK)/interfaces.txt requirements/uv.txt requirements/install.py
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("error: %s is Python %d.%d: need 3.11 or newer, give PYTHON=..." % (sys.executable, *sys.version_info[:2]))'
 	@echo "Setting up $(VENV) (about a minute, once)" >&2
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python requirements/install.py
+	$(BIN)/python requirements/install.py $(ROS_DISTRO)
 	@touch $@
 
 $(VENV)/.interfaces: $(VENV)/.locked $(wildcard $(INTERFACES)/msg/*) $(INTERFACES)/CMakeLists.txt $(INTERFACES)/package.xml $(INTERFACES)/pyproject.toml
@@ -102,17 +113,18 @@ docs: setup ## Build the documentation into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 # Build the workspace as a ROS 2 user does. With ROS 2 from wheels, the virtual environment is the underlay.
+WORKSPACE := build/colcon$(SUFFIX)
 COLCON := cd ros_ws && env AMENT_PREFIX_PATH=$(CURDIR)/$(VENV) CMAKE_PREFIX_PATH=$(CURDIR)/$(VENV) PATH=$(CURDIR)/$(BIN):$$PATH \
-  colcon --log-base ../build/colcon/log
-COLCON_PLACES := --build-base ../build/colcon/build --install-base ../build/colcon/install
+  colcon --log-base ../$(WORKSPACE)/log
+COLCON_PLACES := --build-base ../$(WORKSPACE)/build --install-base ../$(WORKSPACE)/install
 
 colcon: setup ## Build ros_ws with colcon on the wheels
-	rm -rf build/colcon
+	rm -rf $(WORKSPACE)
 	$(COLCON) build $(COLCON_PLACES)
 
 colcon-test: colcon ## Build ros_ws with colcon and test what it has installed
 	$(COLCON) test $(COLCON_PLACES) --return-code-on-test-failure --event-handlers console_direct-
-	$(COLCON) test-result --test-result-base ../build/colcon/build
+	$(COLCON) test-result --test-result-base ../$(WORKSPACE)/build
 
 # Of their own, so that what the software needs stays as it is pinned.
 build/lint/.installed:
@@ -133,14 +145,19 @@ build/compose/.installed:
 container: setup build/compose/.installed ## Build the image and try the compose file: with an engine, or without one (root)
 	$(BIN)/python docker/trial.py --compose build/compose/bin/docker-compose
 
-COMPILE := pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --upgrade --quiet \
-  --custom-compile-command "make lock"
+COMPILE := $(CURDIR)/$(BIN)/uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+  --no-annotate --quiet --custom-compile-command "make lock"
+LOCKED := --output-file lock.txt runtime.in interfaces.in ../dev.in
 
-lock: setup ## Pin the newest versions
-	cd requirements && ../$(BIN)/uv $(COMPILE) --output-file lock.txt runtime.in build.in dev.in
-	cd requirements && ../$(BIN)/uv $(COMPILE) --constraint lock.txt --output-file interfaces.txt interfaces.in
-	cd requirements && ../$(BIN)/uv $(COMPILE) --output-file uv.txt uv.in
+# Other distributions start from the lock of the first, so that all have the same versions where ROS allows it.
+lock: setup ## Pin the newest versions, for all distributions
+	cd requirements && $(COMPILE) --upgrade --output-file uv.txt uv.in
+	cd requirements/jazzy && $(COMPILE) --upgrade $(LOCKED)
+	set -e; for other in $(filter-out jazzy,$(DISTROS)); do cp requirements/jazzy/lock.txt requirements/$$other/; \
+	  (cd requirements/$$other && $(COMPILE) $(LOCKED)); done
+	set -e; for each in $(DISTROS); do \
+	  (cd requirements/$$each && $(COMPILE) --upgrade --constraint lock.txt --output-file interfaces.txt interfaces.in); done
 
 clean: ## Remove all that was made, runs excepted
-	rm -rf $(VENV) build site .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-* build site .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} + ; rm -rf */*.egg-info

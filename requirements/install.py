@@ -1,8 +1,9 @@
-"""Installs the packages of lock.txt into the environment of this Python: by uv, or by pip where uv cannot do it.
+"""Installs the packages of a ROS 2 distribution into the environment of this Python: by uv, or by pip where uv cannot.
 
-uv, several times as fast, is a package like the others (uv.txt). It does not read pip's settings, so it gets those that
-say where packages are. Both check the hash of every file, and neither writes outside of the environment. uv installs
-first what builds the package of the messages (interfaces.txt), which is then built while the rest is being installed.
+The argument is the name of the distribution: lock.txt in its folder has the packages. uv, several times as fast, is a
+package like the others (uv.txt). It does not read pip's settings, so it gets those that say where packages are. Both
+check the hash of every file, and neither writes outside of the environment. uv installs first what builds the package
+of the messages (interfaces.txt), which is then built while the rest is being installed.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 HERE = Path(__file__).resolve().parent
+UV = HERE / "uv.txt"
 INTERFACES = HERE.parent / "ros_ws" / "src" / "msg_agents_interfaces"
 BUILT = Path(sys.prefix) / "built"  # folder for its wheel, which the Makefile installs
 PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-cache-dir"]
@@ -33,39 +35,40 @@ SETTINGS = {
 """Of pip; the variable by which uv has the same, and what stands between several values in it."""
 
 
-def main() -> None:
+def main(distribution: str) -> None:
     """Install; the exit code is that of the program that did it."""
-    if subprocess.run([*PIP, "install", "--quiet", *hashed("uv.txt")]).returncode:
+    packages = HERE / distribution
+    if subprocess.run([*PIP, "install", "--quiet", *hashed(UV)]).returncode:
         print(f"uv cannot be had: {BY_PIP}", file=sys.stderr)
-    elif not install_in_two_parts():
+    elif not install_in_two_parts(packages):
         return
     else:
         print(f"uv has failed: {BY_PIP}", file=sys.stderr)
-    sys.exit(install_by_pip())
+    sys.exit(install_by_pip(packages))
 
 
-def hashed(file: str) -> list[str]:
+def hashed(file: Path) -> list[str]:
     """Options for a file of packages with their hashes."""
-    return ["--require-hashes", "--requirement", str(HERE / file)]
+    return ["--require-hashes", "--requirement", str(file)]
 
 
-def install_in_two_parts() -> int:
+def install_in_two_parts(packages: Path) -> int:
     """Exit code of uv."""
     cache = Path(sys.prefix) / "uv_cache"  # from where it links files to their places
     try:
-        code = install_by_uv("interfaces.txt", cache)
+        code = install_by_uv(packages / "interfaces.txt", cache)
         if code:
             return code
         # If it fails, the Makefile builds it again, and says why.
         build = [*PIP, "wheel", "--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--wheel-dir", str(BUILT)]
         quiet = subprocess.DEVNULL
         with subprocess.Popen([*build, str(INTERFACES)], stdin=quiet, stdout=quiet, stderr=quiet):
-            return install_by_uv("lock.txt", cache)
+            return install_by_uv(packages / "lock.txt", cache)
     finally:
         shutil.rmtree(cache, ignore_errors=True)
 
 
-def install_by_uv(file: str, cache: Path) -> int:
+def install_by_uv(file: Path, cache: Path) -> int:
     """Its exit code; what it prints, without the names of all packages."""
     uv = str(Path(sysconfig.get_path("scripts")) / "uv")
     # Which of several indexes a file is from does not matter: its hash is checked.
@@ -79,11 +82,12 @@ def install_by_uv(file: str, cache: Path) -> int:
     return process.returncode
 
 
-def install_by_pip() -> int:
+def install_by_pip(packages: Path) -> int:
     """Its exit code; a line for every twenty packages that it looks for."""
     # All are listed. Looking for what they need, pip ignores pins of packages that others need with extras.
-    command = [*PIP, "install", "--no-deps", "--progress-bar", "off", *hashed("lock.txt")]
-    count, found = (HERE / "lock.txt").read_text().count("=="), 0
+    lock = packages / "lock.txt"
+    command = [*PIP, "install", "--no-deps", "--progress-bar", "off", *hashed(lock)]
+    count, found = lock.read_text().count("=="), 0
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as pip:
         assert pip.stdout is not None
         for line in pip.stdout:
@@ -118,4 +122,4 @@ def exists(place: str) -> bool:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -1,15 +1,19 @@
-"""What ``make setup`` runs: uv gets the places in which pip looks for packages."""
+"""What ``make setup`` runs, with which packages: uv gets the places in which pip looks for them."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
+import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-FILE = Path(__file__).parents[2] / "requirements" / "install.py"
+REQUIREMENTS = Path(__file__).parents[2] / "requirements"
+FILE = REQUIREMENTS / "install.py"
+DISTRIBUTIONS = sorted(file.parent.name for file in REQUIREMENTS.glob("*/runtime.in"))
 
 
 @pytest.fixture
@@ -58,18 +62,57 @@ def pinned(file: str) -> dict[str, list[str]]:
     """Hashes by package, version, and the Pythons that it is for."""
     found: dict[str, list[str]] = {}
     name = ""
-    for line in (FILE.parent / file).read_text().splitlines():
+    for line in (REQUIREMENTS / file).read_text().splitlines():
         words = line.rstrip(" \\").strip()
-        if words.startswith("--hash="):
+        if words.startswith("--hash=sha256:"):
             found[name].append(words)
-        elif "==" in words and not words.startswith("#"):
+        elif words and not words.startswith("#"):
+            assert re.match(r"[\w.-]+==\S+( ; .*)?$", words), f"{file}: {words}: neither a pin nor a hash"
             name = words
             found[name] = []
     return found
 
 
-def test_what_is_installed_first_is_what_is_installed_in_the_end() -> None:
-    first, everything = pinned("interfaces.txt"), pinned("lock.txt")
+def test_there_are_distributions() -> None:
+    assert {"jazzy", "kilted"} <= set(DISTRIBUTIONS)
+
+
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_what_is_installed_first_is_what_is_installed_in_the_end(distribution: str) -> None:
+    first, everything = pinned(f"{distribution}/interfaces.txt"), pinned(f"{distribution}/lock.txt")
     assert "scikit-build-core" in " ".join(first)
-    assert all(first.values())
+    assert all(everything.values())
     assert first.items() <= everything.items()
+
+
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_a_lock_is_of_one_distribution(distribution: str) -> None:
+    names = " ".join(pinned(f"{distribution}/lock.txt"))
+    assert f"ros-{distribution}-rclpy==" in names
+    assert [other for other in DISTRIBUTIONS if f"ros-{other}-" in names] == [distribution]
+
+
+def make(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """What make would do, without doing it."""
+    outside = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    command = ["make", "--no-print-directory", "--dry-run", "--always-make", "--directory", str(FILE.parents[1])]
+    return subprocess.run([*command, *words], env=outside | environment, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("distribution", "folder"), [(name, ".venv" if name == "jazzy" else f".venv-{name}") for name in DISTRIBUTIONS]
+)
+def test_each_distribution_has_its_environment(distribution: str, folder: str) -> None:
+    shown = make("setup", f"ROS_DISTRO={distribution}").stdout
+    assert f"{folder}/bin/python requirements/install.py {distribution}\n" in shown
+    assert set(re.findall(r"\.venv[\w-]*", shown)) == {folder}
+
+
+def test_a_sourced_ros_changes_nothing() -> None:
+    assert make("setup", ROS_DISTRO="kilted").stdout == make("setup").stdout == make("setup", "ROS_DISTRO=jazzy").stdout
+
+
+def test_an_unknown_distribution() -> None:
+    result = make("demo", "ROS_DISTRO=foxy")
+    assert (result.returncode, result.stdout) == (2, "")
+    assert f"ROS_DISTRO=foxy: no requirements for it: expected one of: {' '.join(DISTRIBUTIONS)}." in result.stderr

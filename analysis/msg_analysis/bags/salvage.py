@@ -10,9 +10,10 @@ import itertools
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -131,7 +132,7 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
                 counts.append(entry.count)
             else:
                 counts.append(_copy(entry.file.path, copy))
-        write_metadata(workshop, bag_information(counts, _custom(entries)))
+        write_metadata(workshop, _information(entries, counts))
         workshop.rename(out)
     except OSError as error:
         raise BagError(f"{out}: cannot be written ({error.strerror}): choose another place") from error
@@ -170,7 +171,7 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
                 if count.name != file.name:
                     file.unlink()
         counts = [count for _, _, count in saved]
-        write_metadata(directory, bag_information(counts, _custom(entries)))
+        write_metadata(directory, _information(entries, counts))
         (directory / RECORDING_MARKER).unlink(missing_ok=True)
     except OSError as error:
         raise BagError(f"{directory}: cannot be written ({error.strerror}): nothing was lost, try again") from error
@@ -219,15 +220,29 @@ def _report(entry: FileInventory) -> SalvageReport:
     return SalvageReport(entry.count.messages, source.whole_bytes, dropped, lost, damaged, torn=source.torn)
 
 
-def _custom(entries: Sequence[FileInventory]) -> dict[str, str]:
-    """Our entries in metadata.yaml: the run of the torn bag, if it is known, and that the bag was salvaged."""
+def _information(entries: Sequence[FileInventory], counts: Sequence[FileCount]) -> dict[str, Any]:
+    """What metadata.yaml says of the new bag: that it was salvaged, and what is known of the torn one."""
     custom = {"complete": "false", "salvaged": "true"}
     for entry in entries:
-        for record in entry.file.metadata:
-            with contextlib.suppress(ValueError, KeyError, TypeError, RecursionError):  # another's of that name
-                if record.name == RECORD_NAME:
-                    return {"run": str(json.loads(record.metadata["record"])["run"]), **custom}
-    return custom
+        record = _run_record(entry.file)
+        if "run" in record:
+            return bag_information(counts, {"run": str(record["run"]), **custom}, _distribution(record))
+    return bag_information(counts, custom, "")
+
+
+def _run_record(file: StoredFile) -> dict[str, Any]:
+    """The run record that the recorder wrote into the file; empty where there is none."""
+    for record in file.metadata:
+        with contextlib.suppress(ValueError, KeyError, RecursionError):  # another's of that name
+            if record.name == RECORD_NAME and isinstance(found := json.loads(record.metadata["record"]), dict):
+                return found
+    return {}
+
+
+def _distribution(record: Mapping[str, Any]) -> str:
+    """The ROS 2 that a run was recorded with; empty where its record does not say."""
+    versions = record.get("versions")
+    return str(versions.get("ros_distro", "")) if isinstance(versions, dict) else ""
 
 
 def _readable(file: StoredFile) -> Iterator[Batch]:
@@ -259,9 +274,8 @@ def _copy(file: Path, copy: Path) -> FileCount:
             writer.add_metadata(record.name, record.metadata)
         for item in source.attachments:
             writer.add_attachment(item)
-        writer.add_metadata(
-            ROSBAG2_RECORD, {"serialized_metadata": dump(bag_information([count], {"salvaged": "true"}))}
-        )
+        information = bag_information([count], {"salvaged": "true"}, _distribution(_run_record(source)))
+        writer.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(information)})
         writer.finish()
         stream.flush()
         os.fsync(stream.fileno())

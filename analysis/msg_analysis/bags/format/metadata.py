@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from msg_analysis.common.bounded_input import load_yaml, read_text
+from msg_analysis.common.version import ros_distribution
 from msg_analysis.errors import BagError
 
 METADATA_FILE = "metadata.yaml"
@@ -51,8 +52,13 @@ class FileCount:
         return max(0, self.end - self.start)
 
 
-def bag_information(files: Sequence[FileCount], custom: Mapping[str, str]) -> dict[str, Any]:
-    """What metadata.yaml says of a bag with these files, in their order; ``custom`` holds our own entries."""
+def bag_information(
+    files: Sequence[FileCount], custom: Mapping[str, str], distribution: str | None = None
+) -> dict[str, Any]:
+    """What metadata.yaml says of a bag with these files, in their order; ``custom`` holds our own entries.
+
+    ``distribution``: the ROS 2 that it was recorded with; None: the one here. Empty if unknown, as in rosbag2.
+    """
     topics = total_channels(files)
     start = min(file.start for file in files)
     return {
@@ -87,7 +93,7 @@ def bag_information(files: Sequence[FileCount], custom: Mapping[str, str]) -> di
             for file in files
         ],
         "custom_data": dict(custom),
-        "ros_distro": os.environ.get("ROS_DISTRO", "jazzy"),
+        "ros_distro": ros_distribution() if distribution is None else distribution,
     }
 
 

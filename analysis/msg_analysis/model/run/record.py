@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.blas_threads import one_blas_thread
-from msg_analysis.common.version import __version__
+from msg_analysis.common.version import __version__, ros_distribution
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.protocol_binding import info_of
@@ -37,8 +37,10 @@ def software_versions() -> dict[str, str]:
     """Versions of what computes a run's numbers, and where that is."""
     import scipy  # here, since the processes of a run only read their record
 
+    ros = {"ros_distro": distribution} if (distribution := ros_distribution()) else {}
     return {
         "msg_analysis": __version__,
+        **ros,
         "python": platform.python_version(),
         "numpy": np.__version__,
         "scipy": scipy.__version__,
