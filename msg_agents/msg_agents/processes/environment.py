@@ -10,6 +10,7 @@ from pathlib import Path
 
 from msg_agents.discovery.profiles import LOOPBACK_PROFILE, UDP_PROFILE
 from msg_analysis.common.blas_threads import SINGLE_THREAD
+from msg_analysis.common.version import ros_distribution
 from msg_analysis.errors import InputError
 
 TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
@@ -89,6 +90,13 @@ def start_environment() -> dict[str, str]:
     }
 
 
+def profile_variables(profile: Path, distribution: str | None = None) -> dict[str, str]:
+    """What leads the middleware of a ROS 2, by default the one here, to a profile: Kilted's warns of the old name."""
+    name = ros_distribution() if distribution is None else distribution
+    read = PROFILE_VARIABLES[1:] if name > "jazzy" else PROFILE_VARIABLES  # ROS 2 is named in alphabetical order
+    return dict.fromkeys(read, str(profile))
+
+
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
     """Our environment with what the nodes need; another discovery range or profile of the user's is kept.
 
@@ -98,7 +106,7 @@ def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str,
     local = environment.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
     if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
         environment[RANGE_VARIABLE] = "SYSTEM_DEFAULT"  # the profile decides
-        environment.update(dict.fromkeys(PROFILE_VARIABLES, str(profile)))
+        environment.update(profile_variables(profile))
         environment.pop(SERVER_VARIABLE, None)
     return environment
 
@@ -113,6 +121,6 @@ def without_shared_memory() -> dict[str, str]:
     if os.environ.get(RANGE_VARIABLE) == "LOCALHOST":  # adds shared memory to any profile
         return {
             RANGE_VARIABLE: "SYSTEM_DEFAULT",
-            **dict.fromkeys(PROFILE_VARIABLES, str(LOOPBACK_PROFILE)),
+            **profile_variables(LOOPBACK_PROFILE),
         }
-    return dict.fromkeys(PROFILE_VARIABLES, str(UDP_PROFILE))
+    return profile_variables(UDP_PROFILE)

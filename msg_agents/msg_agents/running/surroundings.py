@@ -56,5 +56,5 @@ def surroundings(
 def will_introduce(changes: Mapping[str, str]) -> bool:
     """Whether the middleware will follow our profile: not if that of the user, or of several hosts, is used."""
     environment = node_environment(0, INTRODUCED_PROFILE) | dict(changes)
-    ours = environment.get(PROFILE_VARIABLES[0]) == str(INTRODUCED_PROFILE)
+    ours = environment.get(PROFILE_VARIABLES[-1]) == str(INTRODUCED_PROFILE)
     return ours and environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")

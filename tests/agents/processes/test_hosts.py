@@ -101,7 +101,7 @@ def test_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: str |
     environment = Hosts.parse(document(), experiment()).environment(experiment(), tmp_path)
     assert environment["ROS_DOMAIN_ID"] == "42"
     assert environment[PEERS_VARIABLE].split() == ["192.0.2.1", "192.0.2.2", "192.0.2.3"]
-    assert environment[own or PROFILE_VARIABLES[0]] == ("/mine.xml" if own else str(tmp_path / "hosts.xml"))
+    assert environment[own or PROFILE_VARIABLES[-1]] == ("/mine.xml" if own else str(tmp_path / "hosts.xml"))
 
 
 HOSTS = document()["hosts"]
