@@ -17,7 +17,8 @@ from msg_agents.processes.environment import PROFILE_VARIABLES, node_environment
 OLD, NEW = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 FOLDER = Path(profiles.__file__).parent
 # All that the profiles have and Fast DDS 3 has renamed: its profiles are made by
-#     cd msg_agents/msg_agents/discovery; for i in loopback introduced; do sed s/OLD/NEW/g $i.xml > fast_dds_3/$i.xml; done
+#     cd msg_agents/msg_agents/discovery
+#     for i in loopback introduced; do sed s/heartbeatPeriod/heartbeat_period/ $i.xml > fast_dds_3/$i.xml; done
 RENAMED = ("heartbeatPeriod", "heartbeat_period")
 
 
