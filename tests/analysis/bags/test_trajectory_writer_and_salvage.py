@@ -196,7 +196,8 @@ def test_200_flipped_bytes(recorded: tuple[Trajectory, Path], tmp_path: Path) ->
             assert report.kept_messages == len(_messages(out))
             assert {(topic, raw) for topic, _, raw in _messages(out)} <= everything
             if report.damaged_chunks and not report.torn:
-                assert report.lost_messages == len(everything) - report.kept_messages
+                # 0, not known, if the byte is one by which the summary is found false.
+                assert report.lost_messages in (0, len(everything) - report.kept_messages)
             shutil.rmtree(out)
     assert costs > 20
 
