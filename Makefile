@@ -79,8 +79,8 @@ test-fast: setup $(VENV)/.compiled ## Run the tests that start no network
 	$(TEST) $(SEVERAL_AT_ONCE) --ignore tests/integration
 
 # What another distribution could break, as briefly as possible: equal to the twin in lockstep, kills and takeovers, real
-# time, strangers, the bag, discovery, parameters, watchers that print nothing else.
-ROS_TESTS := $(addprefix tests/integration/test_,lockstep.py bag.py kill.py restart.py realtime.py strangers.py introductions.py ros.py markers.py) \
+# time, strangers, the bag, discovery, watchers that print nothing else.
+ROS_TESTS := $(addprefix tests/integration/test_,lockstep.py bag.py kill.py restart.py realtime.py strangers.py introductions.py markers.py) \
   tests/agents/discovery tests/analysis/common/test_version.py
 
 test-ros: setup ## Run the tests that depend on ROS 2 most: test-ros ROS_DISTRO=kilted
