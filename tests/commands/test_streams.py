@@ -23,7 +23,7 @@ from msg_analysis.api import Experiment
 
 ROOT = Path(__file__).parents[2]
 LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"
-NETWORK = {"run", "play", "live", "markers", "agent", "switcher", "recorder"}
+NETWORK = {"run", "doctor", "play", "live", "markers", "agent", "switcher", "recorder"}
 OVERVIEWS = [(program, option) for program in ("msg-analysis", "msg-agents") for option in ("--help", "--version")]
 NEW = "NEW"  # a name that is not there yet
 WORDS = {  # what each of the others is given

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,6 +12,11 @@ from msg_agents.processes.fork_server import early_server
 from msg_analysis.cli.console import examples, print_json, result_console
 from msg_analysis.cli.options import json_option
 from msg_analysis.common.exit_codes import ExitCode
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from msg_agents.doctor.check import Check
 
 STYLES = {"ok": "green", "warning": "bold yellow", "error": "bold red"}
 
@@ -23,16 +29,13 @@ def doctor(*, as_json: bool) -> None:
     The last check runs two processes for a second. Exit code 2: a run cannot work; warnings do not change it.
     """
     click.get_current_context().with_resource(early_server())
-    from rich.text import Text
-
     from msg_agents.doctor.examination import examine
 
     console, found = result_console(), []
     for check in examine():
         found.append(check)
         if not as_json:
-            words = (f"{check.status:<9}", STYLES[check.status]), (f"{check.name.replace('_', ' '):<21}", "bold")
-            console.print(Text.assemble(*words, check.text), soft_wrap=True)
+            _print_check(console, check)
     counts = Counter(check.status for check in found)
     can_run = not counts["error"]
     if as_json:
@@ -42,6 +45,21 @@ def doctor(*, as_json: bool) -> None:
         console.print(_summary(counts["error"], counts["warning"]), soft_wrap=True)
     if not can_run:
         sys.exit(ExitCode.BAD_INPUT)
+
+
+def _print_check(console: Console, check: Check) -> None:
+    """One line; terminals get the text folded in a column of its own."""
+    from rich.table import Table
+    from rich.text import Text
+
+    status, name = Text(f"{check.status:<8}", STYLES[check.status]), Text(f"{check.name.replace('_', ' '):<20}", "bold")
+    if console.is_terminal:
+        row = Table.grid(padding=(0, 1))
+        row.add_row(status, name, Text(check.text, overflow="fold"))
+        row.columns[0].no_wrap = row.columns[1].no_wrap = True
+        console.print(row)
+    else:
+        console.print(Text(" ").join([status, name, Text(check.text)]))
 
 
 def _summary(errors: int, warnings: int) -> str:
