@@ -16,6 +16,8 @@ import yaml
 ROOT = Path(__file__).parents[2]
 PACKAGES = sorted(file.parent for file in (ROOT / "ros_ws/src").glob("*/package.xml"))
 KEYS = yaml.safe_load((ROOT / "tests/data/rosdep_keys.yaml").read_text())["keys"]
+NOTICE = (ROOT / "tests/data/licence_notice.txt").read_text()
+WITHOUT = {"launch_support.py", "network.launch.py", "replay.launch.py"}  # which have no notice yet
 OF_PYTHON = {"python3-yaml": "pyyaml"}  # packages whose key has another name
 BROUGHT = {"markupsafe"}  # by jinja2, as a package of a distribution, too
 
@@ -61,3 +63,21 @@ def test_what_has_no_key_comes_by_pip(package: Path, monkeypatch: pytest.MonkeyP
     keys = {OF_PYTHON.get(key, key.removeprefix("python3-")) for key in KEYS["rosdep/python.yaml"]}
     assert required(package, monkeypatch) - {p.name for p in PACKAGES} - BROUGHT <= keys | by_pip()
     assert "pydantic" in by_pip()  # the key gives version 1 on Ubuntu 24.04
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda p: p.name)
+def test_released_with_changes_and_licence(package: Path) -> None:
+    """What the tools of ROS look for in the folder of a package itself."""
+    assert (package / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+    changes = (package / "CHANGELOG.rst").read_text().splitlines()
+    assert changes[1] == f"Changelog for package {package.name}"
+    assert changes[4].split()[0] in ("Forthcoming", manifest(package).findtext("version"))
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda p: p.name)
+def test_every_file_has_the_notice_of_the_licence(package: Path) -> None:
+    """As ``ament_copyright`` wants it; a new file begins with the lines of tests/data/licence_notice.txt."""
+    files = {file for file in package.rglob("*.py") if "build" not in file.relative_to(package).parts}
+    assert files
+    missing = {file.name for file in files if not file.read_text(encoding="utf-8").startswith(NOTICE)}
+    assert missing <= WITHOUT

@@ -1,3 +1,17 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 from pathlib import Path
 
 from setuptools import find_packages, setup
@@ -9,8 +23,8 @@ setup(
     version="0.1.0",
     description="Examples of protocols for msg_agents: Metropolis weights, saturated coupling, integral action",
     license="Apache-2.0",
-    author="The msg_agents authors",
-    maintainer="The msg_agents authors",
+    author="msg_agents maintainers",
+    maintainer="msg_agents maintainers",
     maintainer_email="maintainers@msg-agents.example.org",
     python_requires=">=3.11",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
