@@ -69,7 +69,7 @@ def first_third_hears_all(agents: int) -> dict[str, Any]:
 )
 def test_processes_that_hear_most_of_a_network(network: Any, experiment: Any, processes: Any) -> None:
     """A process is killed and comes back: all is there, and as the twin says."""
-    run = {"duration": 15, "start": "zero", "processes": processes, "replicas": 16}
+    run = {"duration": 30, "start": "zero", "processes": processes, "replicas": 16}
     process = network.record(network.file(**experiment, run=run), "--restarts", "1", "--json")
     network.wait_until_moving()
     network.processes("agent")[-1].kill()
