@@ -25,6 +25,7 @@ from typing import Any
 import forked_commands
 import pytest
 import yaml
+from started_processes import started_processes
 
 pytest.importorskip("rclpy")
 
@@ -286,22 +287,18 @@ def twin_bag(network: Network) -> Path:
 @pytest.fixture
 def plain(network: Network) -> Iterator[Callable[[Path, dict[str, int]], subprocess.Popen[str]]]:
     """Start ``tests/support/plain_recorder.py`` for so many messages of these topics, of all together."""
-    started = []
+    with started_processes() as started:
 
-    def start(file: Path, topics: dict[str, int]) -> subprocess.Popen[str]:
-        total = str(sum(topics.values()))
-        started.append(
-            subprocess.Popen(
-                [sys.executable, "-P", "-c", PLAIN_RECORDER.read_text(), file, total, *topics],
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
+        def start(file: Path, topics: dict[str, int]) -> subprocess.Popen[str]:
+            total = str(sum(topics.values()))
+            started.append(
+                subprocess.Popen(
+                    [sys.executable, "-P", "-c", PLAIN_RECORDER.read_text(), file, total, *topics],
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    text=True,
+                )
             )
-        )
-        return started[-1]
+            return started[-1]
 
-    yield start
-    for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+        yield start

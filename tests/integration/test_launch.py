@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from started_processes import started_processes
 from terminal import Terminal
 
 from msg_agents.running.run_folder import PREFIX
@@ -52,26 +53,22 @@ def older(network: Any) -> Iterator[None]:
 @pytest.fixture
 def launch(network: Any) -> Iterator[Launch]:
     """Start ``ros2 launch`` with these words, in a process group of its own and without a terminal."""
-    started: list[subprocess.Popen[str]] = []
+    with started_processes() as started:
 
-    def start(*words: str | Path) -> subprocess.Popen[str]:
-        started.append(
-            subprocess.Popen(
-                command(*words),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                start_new_session=True,
+        def start(*words: str | Path) -> subprocess.Popen[str]:
+            started.append(
+                subprocess.Popen(
+                    command(*words),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.STDOUT,
+                    text=True,
+                    start_new_session=True,
+                )
             )
-        )
-        return started[-1]
+            return started[-1]
 
-    yield start
-    for process in started:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
+        yield start
 
 
 def command(*words: str | Path) -> list[str]:
