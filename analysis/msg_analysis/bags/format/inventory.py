@@ -50,6 +50,7 @@ class FileInventory:
     file: StoredFile
     count: FileCount
     summary: Summary | None = None  # None where the file has none that is correct
+    stated_messages: int | None = None  # how many messages its summary says that it has
     problem: str | None = None  # why nothing of the file can be read
 
     def watch(self) -> Iterator[Batch]:
@@ -67,7 +68,7 @@ class FileInventory:
         for number in self.file.channels:
             self._channel(number)
         if self.file.torn is None and isinstance(self.file, McapFile):
-            self.summary = summary_of(self.file.path)
+            self.summary, self.stated_messages = summary_of(self.file.path)
 
     def _channel(self, number: int) -> ChannelCount:
         channel = self.file.channels[number]
@@ -82,16 +83,13 @@ class FileInventory:
         file = self.file
         if not isinstance(file, McapFile) or file.unpacked_messages:
             return False
-        return self.lost_messages == 0 and not file.damaged_chunks and not file.false_indexes
+        sound = self.summary is not None and self.lost_messages == 0
+        return sound and not file.damaged_chunks and not file.false_indexes
 
     @property
     def lost_messages(self) -> int | None:
-        """How many messages fewer were read than its summary states; None without a summary."""
-        statistics = self.summary.statistics if self.summary else None
-        if statistics is None:
-            return None
-        promised: int = statistics.message_count
-        return max(0, promised - self.count.messages)
+        """How many messages fewer were read than its summary states; None where that is not known."""
+        return None if self.stated_messages is None else max(0, self.stated_messages - self.count.messages)
 
     @property
     def compression(self) -> str | None:
@@ -112,20 +110,28 @@ class Inventory:
         return self.files[-1]
 
 
-def summary_of(file: Path) -> Summary | None:
-    """The summary at the end of an MCAP file; None where it has none, or where it or its chunk indexes are wrong."""
+def summary_of(file: Path) -> tuple[Summary | None, int | None]:
+    """The summary at the end of an MCAP file, and the number of messages that it states.
+
+    No summary where it or its chunk indexes are wrong. The number is known also where the CRC shows that the summary is
+    right: then the head of a chunk is damaged.
+    """
     try:
         with file.open("rb") as stream:
             stream.seek(-_FOOTER.size, io.SEEK_END)
             start, _, crc = _FOOTER.unpack(stream.read())
             stream.seek(start)
             if crc and crc != zlib.crc32(stream.read()[:-_BEHIND_CRC]):  # the library does not check it
-                return None
+                return None, None
             stream.seek(0)
             summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary()
-            return summary if summary and all(_is_there(stream, index) for index in summary.chunk_indexes) else None
+            if summary is None:
+                return None, None
+            right = all(_is_there(stream, index) for index in summary.chunk_indexes)
+            stated = summary.statistics.message_count if summary.statistics and (right or crc) else None
+            return summary if right else None, stated
     except Exception:  # the library raises many kinds of errors on damage
-        return None
+        return None, None
 
 
 def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
