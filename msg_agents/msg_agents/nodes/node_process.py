@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import faulthandler
 import gc
 import os
@@ -148,14 +149,21 @@ def run_nodes(
             node.finish(complete=complete, deadline=deadline)
         if reporter:
             reporter.write_status_file()
-        # Launchers without a terminal pass on a SIGINT that all have got. Python gives it its default action while it
-        # ends, unless it is ignored: the process would be killed before the middleware has removed its shared memory.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        _ignore_interrupts()
         if prefix and ends_at_once():
             leave_at_once(nodes, spinner, prefix)
         else:
             leave(nodes, spinner, complete=complete)
     return complete
+
+
+def _ignore_interrupts() -> None:
+    """Ignore SIGINT until the process has ended."""
+    # Launchers without a terminal pass on a SIGINT that all have got. Python gives it its default action while it ends,
+    # unless it is ignored: the process would be killed before the middleware has removed its shared memory.
+    # The C library first: a signal that came while Python replaces its handler would be printed as an error.
+    ctypes.CDLL(None).signal(signal.SIGINT, ctypes.c_void_p(signal.SIG_IGN))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def own_prefix(node: Node) -> bytes:
