@@ -71,6 +71,28 @@ def test_equals_the_twin(network: Any, case: str, processes: Any) -> None:
     assert np.array_equal(result.trajectory.agent_modes[1:], np.repeat(again.modes[:, None], 5, axis=1))
 
 
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_chain_that_jumps_in_nearly_every_step(network: Any, processes: int) -> None:
+    """Agents that use up a thousand sojourns before their next report is due say so, and get more.
+
+    The leader is held at the reference: it waits for nobody. Agents of one process wait for no message.
+    """
+    result = network.run(
+        network.experiment(
+            problem="tracking",
+            time="discrete",
+            graphs={"one": {"arcs": [[1, 2]]}, "other": {"arcs": [[1, 2], [2, 1]]}},
+            switching={"transition": [[0.05, 0.95], [0.95, 0.05]]},
+            leaders={"agents": [1], "gain": "inf"},
+            run={"dt": 1, "duration": 2500, "start": "zero", "processes": processes},
+        )
+    )
+    assert result.failures == []
+    assert result.trajectory is not None
+    outcome = check(result.trajectory)
+    assert (outcome.difference, outcome.missing) == (None, 0)
+
+
 def test_a_network_on_another_processor(network: Any) -> None:
     """What it records is what the twin of this processor gives, from the experiment alone."""
     file = network.file(**CASES["discrete"])

@@ -146,6 +146,11 @@ class Synchronizer(AgentInputs[Value]):
         """Whether the next step can be made now."""
         return not self._missing and (self.step <= self._limit or self._within_window())
 
+    @property
+    def awaits_graph(self) -> bool:
+        """Whether it cannot go on because the graph of the next step is not known."""
+        return self._needed is None and not self.finished
+
     def inputs(self) -> tuple[int, list[Value]]:
         """Mode of the step that is ready, and the states x_j(step) of the agents that its row uses, j ascending."""
         assert self._needed is not None

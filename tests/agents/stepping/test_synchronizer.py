@@ -384,7 +384,9 @@ def test_alone() -> None:
 def test_waiting_for() -> None:
     node: Synchronizer[str] = Synchronizer(agent=1, steps=1, inputs=[[0, 2]], peers=[0, 2], window=3)
     assert node.waiting_for() == "the graph of step 0"
+    assert node.awaits_graph
     node.learn(0, 0, 0, 0)
+    assert not node.awaits_graph
     assert node.waiting_for() == "step 0 of agent 1, agent 3"
     node.offer(0, 0, "a")
     assert node.waiting_for() == "step 0 of agent 3"
@@ -392,6 +394,7 @@ def test_waiting_for() -> None:
     assert node.waiting_for() == "nothing"
     make_step(node)
     assert node.waiting_for() == "nothing, it has finished"
+    assert not node.awaits_graph
 
 
 def test_inputs_must_be_peers() -> None:

@@ -125,6 +125,7 @@ class Agent(NetworkNode):
         # The recorder reads the batches of the process instead.
         self._expected = [*map(agent_name, self.far), *(name for name in readers if name != RECORDER)]
         self._next_progress = 0.0
+        self._reported = -1  # step of the last report
         self._stall = StallDetector()
         self._far_states: list[Subscription] = []
         self._last_sent = 0.0  # time at which the last state was sent [s of the monotonic clock]
@@ -302,5 +303,6 @@ class Agent(NetworkNode):
         raise NotImplementedError
 
     def _report(self) -> None:
-        self._group.report(self._law.agent, self._law.step)
+        self._reported = self._law.step
+        self._group.report(self._law.agent, self._reported)
         self._next_progress = time.monotonic() + self._group.progress_period

@@ -23,6 +23,7 @@ from typing import Any
 
 from msg_agents.nodes.agents.agent import Agent
 from msg_agents.nodes.diagnostics import Health
+from msg_agents.nodes.ros.timers import after
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, Synchronizer
 from msg_analysis.model.experiment.protocol_binding import ProtocolError
 from msg_analysis.wire.messages import ActiveGraph
@@ -37,6 +38,7 @@ class LockstepAgent(Agent):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._turns = self._group.turns
+        self._will_report = False  # whether ``_report_later`` will be called
         self._synchronizer: Synchronizer[bytes] = Synchronizer(
             agent=self._law.agent,
             steps=self.record.experiment.steps,
@@ -107,3 +109,12 @@ class LockstepAgent(Agent):
             self._publish_state(mode + 1)
             if time.monotonic() >= self._next_progress or synchronizer.finished:
                 self._report()
+        # It may have used up all published sojourns since its last report, and the switcher waits for the next one.
+        if synchronizer.awaits_graph and law.step > self._reported and not self._will_report:
+            self._will_report = True
+            after(self, max(0.0, self._next_progress - time.monotonic()), self._report_later)
+
+    def _report_later(self) -> None:
+        self._will_report = False
+        if self._law.step > self._reported:
+            self._report()
