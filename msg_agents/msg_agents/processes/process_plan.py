@@ -50,9 +50,14 @@ class ProcessPlan:
     resumes: bool = False  # whether the same command takes over after the process was killed
 
     @property
+    def nodes(self) -> list[str]:
+        """Names of its nodes."""
+        return [agent_name(agent) for agent in self.agents] or [self.name]
+
+    @property
     def first_node(self) -> str:
         """Name of its first node."""
-        return agent_name(self.agents[0]) if self.agents else self.name
+        return self.nodes[0]
 
 
 @dataclass(frozen=True, slots=True)

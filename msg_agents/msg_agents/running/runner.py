@@ -242,6 +242,7 @@ def run_network(
                         supervisor.cores = place(plans, available_cores(), first=around.domain)
                     supervisor.start(plans)
                     view.begin(record, checkpoints if share is None else None)
+                    view.started(supervisor.by_node)
                     _watch(supervisor, experiment, result, restarts, interruption, view, follow_clock=not use_sim_time)
                     view.end()
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
@@ -326,6 +327,7 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
         result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
         view.note(result.restarts[-1])
         supervisor.restart(child)
+        view.started(supervisor.by_node)
     return True
 
 

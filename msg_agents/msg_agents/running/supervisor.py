@@ -199,6 +199,11 @@ class Supervisor:
             child.early = behind and time.monotonic() > child.ended + EARLY
 
     @property
+    def by_node(self) -> dict[str, Process]:
+        """The newest process of every node."""
+        return {node: child.process for child in self.children for node in child.plan.nodes}
+
+    @property
     def running(self) -> list[Child]:
         """Children that have not ended."""
         return [child for child in self.children if child.running]

@@ -16,9 +16,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from msg_analysis.common.forked_processes import Process
 from msg_analysis.model.run.record import RunRecord
 
 
@@ -30,6 +31,9 @@ class View:
 
     def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
         """The processes have been started; ``checkpoints``: directory of the agents' states, if they are kept here."""
+
+    def started(self, processes: Mapping[str, Process]) -> None:
+        """The processes, by the names of their nodes; again after each restart."""
 
     def look(self, steps: Sequence[int]) -> None:
         """The newest step of every agent (-1: none; empty before the start), about 20 times a second."""
