@@ -41,27 +41,27 @@ NETWORKS = 10
 
 @click.command(
     epilog=examples(
-        "msg-agents doctor", "msg-agents doctor --json", "msg-agents doctor --network --networks 50 --seed 7"
+        "msg-agents doctor", "msg-agents doctor --json", "msg-agents doctor --network --networks 50 --first-seed 7"
     )
 )
 @click.option(
     "--network", is_flag=True, help="Instead run random networks with random faults, and compare them with their twins."
 )
 @click.option(
-    "--networks", type=click.IntRange(1), metavar="N", show_default=str(NETWORKS), help="How many; with --network."
+    "--networks", type=click.IntRange(1), metavar="N", show_default=str(NETWORKS), help="How many random networks."
 )
 @click.option(
-    "--seed",
+    "--first-seed",
     type=click.IntRange(0),
-    metavar="S",
+    metavar="N",
     show_default="0",
-    help="Seed of the first network; each next one has the next seed.",
+    help="Seed of the first random network; the next one has the next seed.",
 )
 @click.option(
     "--out", type=PATH, metavar="DIR", show_default="runs", help="Directory in which networks that fail are kept."
 )
 @json_option
-def doctor(*, network: bool, networks: int | None, seed: int | None, out: Path | None, as_json: bool) -> None:
+def doctor(*, network: bool, networks: int | None, first_seed: int | None, out: Path | None, as_json: bool) -> None:
     """Say what this machine and shell would do to a run, and what to do about it.
 
     The last check runs two processes for a second. Exit code 2: a run cannot work; warnings do not change it.
@@ -69,12 +69,12 @@ def doctor(*, network: bool, networks: int | None, seed: int | None, out: Path |
     With --network: whether random networks in lockstep, whose processes are killed and stopped, are equal to their
     twins to the last bit. Exit code 1: one differs; 3: none differs, but one has failed.
     """
-    given = {"--networks": networks, "--seed": seed, "--out": out}
+    given = {"--networks": networks, "--first-seed": first_seed, "--out": out}
     if alone := [option for option, value in given.items() if value is not None and not network]:
         raise click.UsageError(f"{alone[0]} {given[alone[0]]}: it is for random networks: add --network")
     click.get_current_context().with_resource(early_server())
     if network:
-        _run_networks(NETWORKS if networks is None else networks, seed or 0, out or Path("runs"), as_json)
+        _run_networks(NETWORKS if networks is None else networks, first_seed or 0, out or Path("runs"), as_json)
     else:
         _examine(as_json)
 
@@ -118,7 +118,7 @@ def _summary(errors: int, warnings: int) -> str:
     return f"A run cannot work here{noted}." if errors else f"A run can work here{noted}."
 
 
-def _run_networks(count: int, seed: int, out: Path, as_json: bool) -> None:
+def _run_networks(count: int, first_seed: int, out: Path, as_json: bool) -> None:
     from msg_agents.doctor.networks.outcome import exit_code, to_json
     from msg_agents.doctor.networks.trial import require_directory, run_trial
     from msg_agents.terminal.interruption import Interruption
@@ -128,7 +128,7 @@ def _run_networks(count: int, seed: int, out: Path, as_json: bool) -> None:
     outcomes: list[Outcome] = []
     with NetworkProgress("networks") as progress, Interruption() as interruption:
         for number in range(count):
-            outcomes.append(run_trial(seed + number, out))
+            outcomes.append(run_trial(first_seed + number, out))
             interruption.check()
             progress.done(number + 1, count, sum(not outcome.good for outcome in outcomes))
             if not outcomes[-1].good:
@@ -141,7 +141,7 @@ def _run_networks(count: int, seed: int, out: Path, as_json: bool) -> None:
 
 
 def _failure(outcome: Outcome) -> str:
-    kept = f"kept in {outcome.folder}, again: msg-agents doctor --network --networks 1 --seed {outcome.seed}"
+    kept = f"kept in {outcome.folder}, again: msg-agents doctor --network --networks 1 --first-seed {outcome.seed}"
     return f"network {outcome.seed}: {outcome.verdict.text} ({kept})"
 
 

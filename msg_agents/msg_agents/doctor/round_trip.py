@@ -21,6 +21,7 @@ from collections.abc import Sequence
 
 from msg_agents.doctor.check import Check
 from msg_agents.running.runner import run_network
+from msg_agents.terminal.interruption import raise_for
 from msg_agents.watching.view import View
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
@@ -73,8 +74,7 @@ def check_round_trip() -> Check:
     except _EnoughError:
         failures = []
     else:
-        if result.interrupted:
-            raise KeyboardInterrupt
+        raise_for(result.interrupted_by)
         failures = result.failures
     if failures or not watch.rate:
         what = failures[0] if failures else f"not within {LIMIT:g} s"

@@ -76,8 +76,8 @@ class RunResult:
         directory; None if nothing was to be recorded on this host
     failures
         what went wrong, one line each
-    interrupted
-        whether a signal (Ctrl-C, for example) ended the run, or the comparison; then the bag is not read
+    interrupted_by
+        number of the signal (Ctrl-C: SIGINT) that ended the run, or the comparison; then the bag is not read
     wall_time
         s from the first state of the slowest agent to its last one, as reported a few times a second
     rate
@@ -99,7 +99,7 @@ class RunResult:
     experiment: ValidExperiment
     bag: Path | None
     failures: list[str] = field(default_factory=list)
-    interrupted: bool = False
+    interrupted_by: int | None = None
     wall_time: float = 0.0
     rate: float = 0.0
     restarts: list[str] = field(default_factory=list)
@@ -108,6 +108,11 @@ class RunResult:
     trajectory: Trajectory | None = None
     comparison: Comparison | None = None
     report: Path | None = None
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a signal has ended the run, or the comparison."""
+        return self.interrupted_by is not None
 
     @property
     def recorded(self) -> bool:
@@ -126,7 +131,7 @@ class RunResult:
         during
             when, in words; may be empty
         """
-        self.interrupted = True
+        self.interrupted_by = by
         name = "Ctrl-C" if by == signal.SIGINT else signal.Signals(by).name
         self.failures.insert(0, f"stopped by {name} {during}".rstrip())
 

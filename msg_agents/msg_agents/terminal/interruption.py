@@ -44,6 +44,14 @@ def _under_nohup(number: signal.Signals) -> bool:
     return number != signal.SIGINT and signal.getsignal(number) is signal.SIG_IGN
 
 
+def raise_for(caught: int | None) -> None:
+    """Raise KeyboardInterrupt for Ctrl-C, SystemExit for another signal; nothing for None."""
+    if caught == signal.SIGINT:
+        raise KeyboardInterrupt
+    if caught is not None:
+        raise SystemExit(killed_by(caught))
+
+
 class Interruption:
     """Keeps the first signal until ``check``, as a context.
 
@@ -68,10 +76,7 @@ class Interruption:
 
     def check(self) -> None:
         """Raise KeyboardInterrupt after Ctrl-C, SystemExit after another signal."""
-        if self.caught == signal.SIGINT:
-            raise KeyboardInterrupt
-        if self.caught is not None:
-            raise SystemExit(killed_by(self.caught))
+        raise_for(self.caught)
 
     def _catch(self, number: int, _: object) -> None:
         self.caught = self.caught or number

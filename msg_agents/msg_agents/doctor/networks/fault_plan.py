@@ -24,8 +24,8 @@ from msg_agents.processes.environment import RESTARTS
 from msg_agents.processes.process_plan import RECORDER, SWITCHER
 from msg_analysis.wire.topics import agent_name
 
-LATEST = 0.9  # of the steps: later, the run might be over before the fault
-LONGEST_WAIT = 0.3  # s between a step and the fault: steps are reported ten times a second
+LATEST = 0.7  # of the steps: later, the run might be over before the fault
+LONGEST_WAIT = 0.1  # s between a step and the fault: steps are reported ten times a second
 LONGEST_STOP = 1.5  # s
 ONE_ENDS_IN = 8  # networks
 

@@ -29,6 +29,7 @@ from msg_agents.doctor.networks.outcome import Outcome, judge
 from msg_agents.doctor.networks.random_networks import random_document
 from msg_agents.running.run_folder import make_bag_directory, workshop
 from msg_agents.running.runner import run_network
+from msg_agents.terminal.interruption import raise_for
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 
@@ -36,7 +37,7 @@ EXPERIMENT_FILE, OUTCOME_FILE = "experiment.json", "outcome.json"
 
 
 def run_trial(seed: int, out: Path) -> Outcome:
-    """Run the network of a seed as ``msg-agents run`` does; KeyboardInterrupt if a signal has ended it.
+    """Run the network of a seed as ``msg-agents run`` does; KeyboardInterrupt or SystemExit if a signal has ended it.
 
     Unless it went well, its bag with the logs, its experiment and the outcome are kept in a new folder in ``out``.
     """
@@ -48,8 +49,8 @@ def run_trial(seed: int, out: Path) -> Outcome:
         plan = plan_faults(seed, experiment.agents, experiment.steps)
         injection = FaultInjection(plan)
         result = run_network(experiment, folder, restarts=plan.restarts, view=injection)
-        if result.interrupted and not injection.stood_still:
-            raise KeyboardInterrupt
+        if not injection.stood_still:
+            raise_for(result.interrupted_by)
         outcome = Outcome(
             seed=seed,
             agents=experiment.agents,
