@@ -153,10 +153,11 @@ def _print_networks(outcomes: Sequence[Outcome]) -> None:
     console = result_console()
     shown = outcomes if len(outcomes) <= ROWS else [outcome for outcome in outcomes if not outcome.good]
     if shown:
-        heads = ("seed", "agents", "processes", "graphs", "steps", "kills", "stops", "states", "seconds")
+        heads = ("seed", "agents", "processes", "graphs", "steps", "kills", "stops", "stalls", "states", "seconds")
         table = number_table(console, "Random networks", "result", *heads)
         for each in shown:
-            numbers = (each.seed, each.agents, each.processes, each.graphs, each.steps, each.kills, each.stops)
-            table.add_row(each.verdict.status, *map(str, numbers), str(each.verdict.compared), f"{each.wall_time:.1f}")
+            size = (each.seed, each.agents, each.processes, each.graphs, each.steps)
+            found = (each.kills, each.stops, len(each.stalls), each.verdict.compared)
+            table.add_row(each.verdict.status, *map(str, size + found), f"{each.wall_time:.1f}")
         print_table(console, table)
     console.print(summary(outcomes), soft_wrap=True)

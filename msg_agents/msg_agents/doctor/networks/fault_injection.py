@@ -33,7 +33,7 @@ class FaultInjection(View):
     def __init__(self, plan: FaultPlan, patience: float = PATIENCE) -> None:
         super().__init__(lambda _: None, lambda _: None)
         self._pending = list(plan.faults)
-        self.patience = patience
+        self._patience = patience
         self._processes: Mapping[str, Process] = {}
         self._reached: dict[int, float] = {}  # when each step of the plan was seen to have been reached
         self._stopped: list[tuple[float, Process]] = []  # until when
@@ -42,7 +42,7 @@ class FaultInjection(View):
         self.delivered: list[Fault] = []  # the others found their process ended
         self.notes: list[str] = []  # of restarts and stalls
         self.process_count = 0
-        self.stood_still = False
+        self.standstill: str | None = None  # why the run was ended
 
     def started(self, processes: Mapping[str, Process]) -> None:
         """See View."""
@@ -64,8 +64,9 @@ class FaultInjection(View):
                 self._deliver(fault, now)
         if list(steps) != self._newest:
             self._newest, self._moved = list(steps), now
-        if now > self._moved + self.patience and not self.stood_still:
-            self.stood_still = True
+        if now > self._moved + self._patience and self.standstill is None:
+            cause = f": {self.notes[-1]}" if self.notes else ""
+            self.standstill = f"ended after {self._patience:g} s without a step{cause}"
             signal.raise_signal(signal.SIGINT)  # so that the run ends in order, and its logs are kept
 
     def end(self) -> None:

@@ -39,6 +39,11 @@ class Fault:
     wait: float  # s after that
     stopped: float | None = None  # s between SIGSTOP and SIGCONT; None: SIGKILL
 
+    @property
+    def kills(self) -> bool:
+        """Whether the process is killed."""
+        return self.stopped is None
+
     def to_json(self) -> dict[str, Any]:
         """As docs/commands.md describes it."""
         return asdict(self)
@@ -54,7 +59,7 @@ class FaultPlan:
     @property
     def survivable(self) -> bool:
         """Whether the run goes on after all of them, and is complete."""
-        killed = [fault.node for fault in self.faults if fault.stopped is None]
+        killed = [fault.node for fault in self.faults if fault.kills]
         return RECORDER not in killed and len(killed) <= self.restarts
 
 

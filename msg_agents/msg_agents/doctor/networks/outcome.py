@@ -23,17 +23,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from msg_agents.doctor.networks.fault_injection import FaultInjection
 from msg_agents.doctor.networks.fault_plan import Fault, FaultPlan
 from msg_agents.running.runner import RunResult
 from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.common.text.number_words import counted
 from msg_analysis.twin.check import check
 
 Status = Literal["equal", "ended", "differs", "failed"]
 GOOD = ("equal", "ended")
 STATUSES: dict[Status, str] = {
     "equal": "equal to the twin to the last bit",
-    "ended": "ended by their faults as documented, equal so far",
+    "ended": "ended by faults as documented, and equal until then",
     "differs": "different from the twin",
     "failed": "failed",
 }
@@ -60,6 +60,7 @@ class Outcome:
     steps: int
     faults: Sequence[Fault]  # those that met a running process
     restarts: Sequence[str]  # one line each
+    stalls: Sequence[str]  # what was waited for, one line each
     verdict: Verdict
     wall_time: float  # s, all included
     folder: Path | None = None  # where it is kept
@@ -72,7 +73,7 @@ class Outcome:
     @property
     def kills(self) -> int:
         """Processes that were killed."""
-        return sum(fault.stopped is None for fault in self.faults)
+        return sum(fault.kills for fault in self.faults)
 
     @property
     def stops(self) -> int:
@@ -92,6 +93,7 @@ class Outcome:
             "steps": self.steps,
             "faults": [fault.to_json() for fault in self.faults],
             "restarts": list(self.restarts),
+            "stalls": list(self.stalls),
             "wall_time": self.wall_time,
             "folder": None if self.folder is None else str(self.folder),
         }
@@ -118,14 +120,20 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     """All networks in one sentence."""
     counts = Counter(outcome.verdict.status for outcome in outcomes)
     found = "; ".join(f"{counts[status]} {words}" for status, words in STATUSES.items() if counts[status])
-    states, kills, stops = (
-        sum(column) for column in zip(*((o.verdict.compared, o.kills, o.stops) for o in outcomes), strict=True)
-    )
-    return f"{len(outcomes)} networks, {kills} kills, {stops} stops, {states} states compared: {found}."
+    done = {
+        "network": len(outcomes),
+        "kill": sum(outcome.kills for outcome in outcomes),
+        "stop": sum(outcome.stops for outcome in outcomes),
+        "state": sum(outcome.verdict.compared for outcome in outcomes),
+    }
+    return f"{', '.join(counted(number, thing) for thing, number in done.items())} compared: {found}."
 
 
-def judge(result: RunResult, plan: FaultPlan, injection: FaultInjection) -> Verdict:
-    """Compare a run with its twin, and its end with what its faults allow."""
+def judge(result: RunResult, plan: FaultPlan, standstill: str | None = None) -> Verdict:
+    """Compare a run with its twin, and its end with what the faults allow that it has met.
+
+    ``standstill``: why it made no step any more, if it was ended for that.
+    """
     trajectory = result.trajectory
     compared = missing = twice = 0
     if trajectory is not None:
@@ -133,10 +141,9 @@ def judge(result: RunResult, plan: FaultPlan, injection: FaultInjection) -> Verd
         compared, missing, twice = outcome.compared, outcome.missing, trajectory.completeness.duplicates
         if outcome.difference:
             return Verdict("differs", outcome.difference, compared)
-    if injection.stood_still:
-        cause = injection.notes[-1] if injection.notes else "cause unknown"
-        return Verdict("failed", f"no step for {injection.patience:g} s: {cause}", compared)
-    if wrong := _unexpected_restarts(result.restarts, injection.delivered):
+    if standstill is not None:
+        return Verdict("failed", standstill, compared)
+    if wrong := _unexpected_restart(result.restarts, plan.faults):
         return Verdict("failed", wrong, compared)
     if result.failures:
         caused = not plan.survivable and all(CONSEQUENCES.match(line) for line in result.failures)
@@ -146,9 +153,9 @@ def judge(result: RunResult, plan: FaultPlan, injection: FaultInjection) -> Verd
     return Verdict("equal", f"{compared} states", compared)
 
 
-def _unexpected_restarts(restarts: Sequence[str], faults: Sequence[Fault]) -> str | None:
+def _unexpected_restart(restarts: Sequence[str], faults: Sequence[Fault]) -> str | None:
     """The first restart that no fault is the cause of."""
-    kills = sum(fault.stopped is None for fault in faults)
+    kills = sum(fault.kills for fault in faults)
     crashes = [line for line in restarts if ": killed by SIGKILL" not in line]
     extra = crashes or restarts[kills:]
     return f"restarted without a fault: {extra[0]}" if extra else None

@@ -49,7 +49,7 @@ def run_trial(seed: int, out: Path) -> Outcome:
         plan = plan_faults(seed, experiment.agents, experiment.steps)
         injection = FaultInjection(plan)
         result = run_network(experiment, folder, restarts=plan.restarts, view=injection)
-        if not injection.stood_still:
+        if injection.standstill is None:
             raise_for(result.interrupted_by)
         outcome = Outcome(
             seed=seed,
@@ -59,7 +59,8 @@ def run_trial(seed: int, out: Path) -> Outcome:
             steps=experiment.steps,
             faults=injection.delivered,
             restarts=result.restarts,
-            verdict=judge(result, plan, injection),
+            stalls=[line for line in injection.notes if line not in result.restarts],
+            verdict=judge(result, replace(plan, faults=tuple(injection.delivered)), injection.standstill),
             wall_time=time.monotonic() - began,
         )
         if outcome.good:
