@@ -269,3 +269,19 @@ def test_help_and_version() -> None:
     assert "Examples:" in execute("run", "--help").stdout
     assert execute("--version").stdout.startswith("msg-agents, version ")
     refused(execute("fly"), "fly")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--networks", "3"], ["--networks 3", "add --network"]),
+        (["--first-seed", "0"], ["--first-seed 0", "add --network"]),
+        (["--network", "--networks", "0"], ["--networks", "0 is not in the range x>=1"]),
+        (["--network", "--first-seed", "-1"], ["--first-seed", "-1 is not in the range x>=0"]),
+        (["--network", "--out", "a_file/runs"], ["--out: a_file/runs: ", "a_file is a file: give a directory"]),
+    ],
+)
+def test_random_networks_refuse_wrong_options(tmp_path: Path, words: list[str], named: list[str]) -> None:
+    (tmp_path / "a_file").write_text("")
+    refused(call("doctor", *words, directory=tmp_path), *named)
+    assert [path.name for path in tmp_path.iterdir()] == ["a_file"]
