@@ -58,6 +58,8 @@ def test_every_agent_exactly_once(agents: int, processes: int) -> None:
     assert len(hosts) == min(agents, processes)
     assert [agent for host in hosts for agent in host.agents] == list(range(agents))
     assert [number for host in hosts for number in numbers(host)] == list(range(1, agents + 1))
+    nodes = [node for process in plan(agents, processes) for node in process.nodes]
+    assert nodes == ["recorder", *(f"agent_{agent + 1}" for agent in range(agents)), "switcher"]
     sizes = [len(host.agents) for host in hosts]
     assert max(sizes) - min(sizes) <= 1
     assert len({host.name for host in hosts}) == len(hosts)
