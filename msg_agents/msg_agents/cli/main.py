@@ -31,7 +31,7 @@ from msg_agents.cli import nodes, replay
 from msg_agents.cli.doctor import doctor
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.web_options import WebCommand, announce, page, web_options
-from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS
+from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
 from msg_agents.processes.fork_server import early_server
 from msg_analysis.cli.console import CommandGroup, examples, print_json, print_text
 from msg_analysis.cli.options import (
@@ -128,6 +128,13 @@ _write_report = click.option(
     show_default="a free one",
     help="ROS_DOMAIN_ID.",
 )
+@click.option(
+    "--await",
+    "readers",
+    multiple=True,
+    metavar="NODE",
+    help=f"A node of yours that must read the states before the run starts, within {USER_TIMEOUT:g} s. Repeatable.",
+)
 @nodes.use_sim_time
 @click.option(
     "--pin/--no-pin",
@@ -153,6 +160,7 @@ def run(
     processes: str | None,
     restarts: int,
     domain: int | None,
+    readers: tuple[str, ...],
     use_sim_time: bool,
     pin: bool,
     no_fork: bool,
@@ -184,6 +192,7 @@ def run(
                 None if no_record else out,
                 domain=domain,
                 restarts=restarts,
+                readers=readers,
                 use_sim_time=use_sim_time,
                 storage=storage(compression, split_size),
                 pin=pin,
@@ -257,7 +266,7 @@ def prepare(experiment: Path) -> None:
     "--discovery-timeout",
     type=PositiveFloat(),
     metavar="SECONDS",
-    default=120.0,
+    default=USER_TIMEOUT,
     help="How long to wait for the other hosts [s].",
 )
 @click.option(

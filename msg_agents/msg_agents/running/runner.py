@@ -19,7 +19,7 @@ from __future__ import annotations
 import shutil
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -137,6 +137,7 @@ def run_network(
     *,
     domain: int | None = None,
     restarts: int = RESTARTS,
+    readers: Sequence[str] = (),
     use_sim_time: bool = False,
     storage: Storage = DEFAULT_STORAGE,
     pin: bool = True,
@@ -163,6 +164,9 @@ def run_network(
     restarts
         how often, in all, processes of agents and the switcher are started again when they were killed (or crashed for
         the first time); one more failure ends the run. 0: no states are kept for a restart
+    readers
+        names of other nodes, in the same domain, that must read the states of all agents before the run starts, as
+        those of a tool do that must not miss a message
     use_sim_time
         whether the nodes take the time from ``/clock``, which another process publishes in the same domain
     storage
@@ -234,6 +238,7 @@ def run_network(
                         use_sim_time=use_sim_time,
                         storage=storage,
                         share=share,
+                        readers=readers,
                         most=MOST_PROCESSES if around.introducer else MOST_UNAIDED,
                     )
                     if around.introducer:
