@@ -80,9 +80,8 @@ class CycloneAgent:
         """Announce the name as soon as all that it reads is there, and wait until all that read it are."""
         deadline = time.monotonic() + PATIENCE
         node = self._node
-        written = {"graph": 1, "end": 1} | {state_topic(j + 1): 1 for j in self._peers}
-        while not all(len(node.readers[name].get_matched_publications()) >= n for name, n in written.items()):
-            _pause(deadline, "those whose topics it reads")
+        while lacking := set(node.without_writer()) - {"resend"}:  # agents write that when they have something to ask
+            _pause(deadline, "the writers of " + ", ".join(sorted(lacking)))
         node.announce()
         own = state_topic(self._number)
         while not (

@@ -6,7 +6,7 @@ The package cyclonedds reads the annotations of the types as they are: they must
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from cyclonedds.core import Qos
 from cyclonedds.domain import DomainParticipant
@@ -152,9 +152,10 @@ class Node:
         self._announced = DataReader(self.participant, names, LATCHED)
         self._nodes: dict[bytes, list[NodeEntitiesInfo]] = {}  # by the identity of their participant
 
-    def read(self, topic: str) -> DataReader:
-        """Subscribe to a topic."""
+    def read(self, topic: str, *policies: Any) -> DataReader:
+        """Subscribe to a topic, with more policies if wanted, such as a limit of what may wait to be taken."""
         kind, qos = TOPICS.get(topic, (AgentState, STREAM))
+        qos = Qos(*policies, base=qos)
         self.readers[topic] = DataReader(self.participant, Topic(self.participant, f"rt/{topic}", kind), qos)
         return self.readers[topic]
 
@@ -164,10 +165,15 @@ class Node:
         self.writers[topic] = DataWriter(self.participant, Topic(self.participant, f"rt/{topic}", kind), qos)
         return self.writers[topic]
 
+    def without_writer(self) -> list[str]:
+        """Topics that it reads and for which it knows no writer yet."""
+        return [topic for topic, reader in self.readers.items() if not reader.get_matched_publications()]
+
     def announce(self) -> None:
         """Say the name and which endpoints belong to it: from then on, nodes that wait for this name take it for ready.
 
-        DDS itself knows no nodes; in ROS 2 every participant lists its nodes on the topic ``ros_discovery_info``.
+        So it must know their writers: it would miss what one that it does not know sends it. DDS itself knows no nodes;
+        in ROS 2 every participant lists its nodes on the topic ``ros_discovery_info``.
         """
         readers, writers = ([_gid(e.guid.bytes) for e in s.values()] for s in (self.readers, self.writers))
         node = NodeEntitiesInfo("/", self.name, readers, writers)

@@ -19,10 +19,6 @@ it of each endpoint as it makes them: messages grow with the third power of the 
 (introduced.xml) by which they announce themselves only to the numbers of visitors, one of which is taken here. When a
 process has all its endpoints, its announcement is passed on, as it is, to those that it has to do with, and no other
 process of the run ever hears of it. Visitors, such as the user's tools, are introduced to all.
-
-A participant of another vendor need not have a number: Cyclone DDS has none by default, and hears of others by
-multicast only, at the network's interface. So this program announces itself there, too, with messages that do not leave
-the machine, and who answers is a visitor.
 """
 
 from __future__ import annotations

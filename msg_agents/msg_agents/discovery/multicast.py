@@ -26,7 +26,10 @@ LOOPBACK_INTERFACES = ("lo", "lo0")  # on Linux, elsewhere
 
 
 def announce_here(datagram: bytes, domain: int) -> None:
-    """Send an announcement to the participants on this machine that hear a domain's group from an interface."""
+    """Send an announcement to the participants on this machine that hear a domain's group at an interface.
+
+    One of Cyclone DDS has no number by default, and hears of others only there.
+    """
     for index, name in socket.if_nameindex():
         if name in LOOPBACK_INTERFACES:  # the processes of the run hear the group there, and would all answer
             continue
