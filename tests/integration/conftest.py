@@ -31,7 +31,8 @@ pytest.importorskip("rclpy")
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.running.run_folder import PREFIX
-from msg_agents.running.runner import RunResult, run_network
+from msg_agents.running.run_result import RunResult
+from msg_agents.running.runner import run_network
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.model.experiment.experiment import ValidExperiment

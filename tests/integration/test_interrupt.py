@@ -86,7 +86,8 @@ def test_while_the_run_is_compared_with_the_prediction(network: Any) -> None:
 
 def test_at_any_moment_after_the_network(network: Any) -> None:
     """As soon as the logs are being kept: whatever is done then, the result is printed, and the bag is whole."""
-    run = network.start("run", network.file(run={"duration": 1}), "--out", network.directory / "runs", "--json")
+    many = {"duration": 5, "replicas": 500}  # so that the comparison takes longer than this test needs to see the logs
+    run = network.start("run", network.file(run=many), "--out", network.directory / "runs", "--json")
     network.wait_for(lambda: list(network.directory.glob("runs/*/log")), 60, "the end of the network")
     run.send_signal(signal.SIGINT)
     stdout, stderr = run.communicate(timeout=60)

@@ -31,8 +31,9 @@ from msg_agents.cli import nodes, replay
 from msg_agents.cli.doctor import doctor
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.web_options import WebCommand, announce, page, web_options
-from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS
+from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
 from msg_agents.processes.fork_server import early_server
+from msg_agents.terminal.interruption import Interruption
 from msg_analysis.cli.console import CommandGroup, examples, print_json, print_text
 from msg_analysis.cli.options import (
     BAG,
@@ -50,7 +51,7 @@ from msg_analysis.cli.storage_options import storage, storage_options
 from msg_analysis.common.exit_codes import ExitCode
 
 if TYPE_CHECKING:
-    from msg_agents.running.runner import ReportWhen
+    from msg_agents.running.run_result import ReportWhen
     from msg_analysis.bags.format.storage_options import Compression
 
 
@@ -73,6 +74,13 @@ _write_report = click.option(
     show_default=True,
     help="When to write report.html: on-failure means that the verdict is not `agrees`.",
 )
+
+
+def _interruption() -> Interruption:
+    """That of a run, from the start of its processes to the end of this command: its comparison comes after its end."""
+    interruption = Interruption()
+    click.get_current_context().call_on_close(interruption.end)
+    return interruption
 
 
 @main.command(
@@ -128,6 +136,13 @@ _write_report = click.option(
     show_default="a free one",
     help="ROS_DOMAIN_ID.",
 )
+@click.option(
+    "--await",
+    "readers",
+    multiple=True,
+    metavar="NODE",
+    help=f"A node of yours that must read the states before the run starts, within {USER_TIMEOUT:g} s. Repeatable.",
+)
 @nodes.use_sim_time
 @click.option(
     "--pin/--no-pin",
@@ -153,6 +168,7 @@ def run(
     processes: str | None,
     restarts: int,
     domain: int | None,
+    readers: tuple[str, ...],
     use_sim_time: bool,
     pin: bool,
     no_fork: bool,
@@ -173,6 +189,7 @@ def run(
     from msg_agents.running.runner import run_network
     from msg_agents.watching.run_view import RunView
 
+    interruption = _interruption()
     changes = {"seed": seed, "duration": duration, "pace": pace, "speed": speed, "processes": processes}
     what = load_with_overrides(experiment, changes)
     with page(web, web_host) as served:
@@ -184,14 +201,17 @@ def run(
                 None if no_record else out,
                 domain=domain,
                 restarts=restarts,
+                readers=readers,
                 use_sim_time=use_sim_time,
                 storage=storage(compression, split_size),
                 pin=pin,
                 fork=not no_fork,
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
+                interruption=interruption,
             )
-        finish(result, as_json, view.display.end, analyse=not no_analyse, report=write_report)
+        say, analyse = view.display.end, not no_analyse
+        finish(result, as_json, say, interruption=interruption, analyse=analyse, report=write_report)
 
 
 @main.command(epilog=examples("msg-agents check runs/line_ring_20250101_120000", "msg-agents check"))
@@ -257,7 +277,7 @@ def prepare(experiment: Path) -> None:
     "--discovery-timeout",
     type=PositiveFloat(),
     metavar="SECONDS",
-    default=120.0,
+    default=USER_TIMEOUT,
     help="How long to wait for the other hosts [s].",
 )
 @click.option(
@@ -312,6 +332,7 @@ def host(
     from msg_agents.watching.run_view import RunView
     from msg_analysis.model.experiment.problems import show
 
+    interruption = _interruption()
     record = nodes.load_record(run_record)
     what = record.experiment
     places = Hosts.load(hosts, what)
@@ -334,8 +355,9 @@ def host(
             environment=places.environment(what, folder),
             record=record,
             share=share,
+            interruption=interruption,
         )
-    finish(result, as_json, analyse=not no_analyse, report=write_report)
+    finish(result, as_json, interruption=interruption, analyse=not no_analyse, report=write_report)
     if not share.home and not as_json:
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
 

@@ -31,7 +31,7 @@ from msg_analysis.common.long_work import watched
 from msg_analysis.common.text.json_numbers import json_text
 
 if TYPE_CHECKING:
-    from msg_agents.running.runner import ReportWhen, RunResult
+    from msg_agents.running.run_result import ReportWhen, RunResult
     from msg_analysis.model.experiment.experiment import ValidExperiment
 
 
@@ -40,21 +40,24 @@ def finish(
     as_json: bool,
     say: Callable[[dict[str, Any]], None] = lambda _: None,
     *,
+    interruption: Interruption,
     analyse: bool = True,
     report: ReportWhen = "always",
 ) -> None:
-    """Print the failures, judge what was recorded, show the result, and exit with its code."""
+    """Print the failures, judge what was recorded, show the result, and exit with its code.
+
+    ``interruption``: of the run; a signal ends the comparison, too, and nothing else.
+    """
     for line in result.failures:
         complain(line, "failed:")
     if analyse and not result.interrupted:
-        with Interruption() as interruption:  # an exception in the middle of an import may become another one
-            from msg_agents.running.runner import conclude
-            from msg_analysis.cli.progress import WorkProgress
+        # While signals are kept: an exception in the middle of an import may become another one.
+        from msg_agents.running.run_result import conclude
+        from msg_analysis.cli.progress import WorkProgress
 
-            progress = WorkProgress()
+        progress = WorkProgress()
         try:
-            interruption.check()
-            with progress, watched(progress):
+            with interruption.let_through(), progress, watched(progress):
                 conclude(result, report)
         except KeyboardInterrupt:
             result.interrupt(signal.SIGINT, "while the run was compared with the prediction")

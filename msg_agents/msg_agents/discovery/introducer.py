@@ -34,8 +34,10 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
+from msg_agents.discovery.multicast import announce_here
 from msg_agents.discovery.profiles import FIRST_INTRODUCED
 from msg_agents.discovery.rtps import (
+    FAST_DDS,
     LOOPBACK,
     PREFIX_SIZE,
     Announcement,
@@ -152,11 +154,15 @@ class Introducer:
         if self._own_prefix is not None:
             self._announced = time.monotonic()
             port = self._socket.getsockname()[1]
-            self._tell_visitors(announcement_message(self._own_prefix, port, LEASE))
+            message = announcement_message(self._own_prefix, port, LEASE)
+            self._tell_visitors(message)
+            announce_here(message, self._domain)
 
     def _leave(self) -> None:
         if self._own_prefix is not None:
-            self._tell_visitors(disposal_message(self._own_prefix))
+            message = disposal_message(self._own_prefix)
+            self._tell_visitors(message)
+            announce_here(message, self._domain)
 
     def _tell_visitors(self, datagram: bytes) -> None:
         for participant in range(FIRST_INTRODUCED):
@@ -171,7 +177,7 @@ class Introducer:
                 self._pass_on(self._known[self._prefixes[name]])
 
     def _hear(self, datagram: bytes) -> None:
-        heard = read_announcement(datagram)
+        heard = read_announcement(datagram, self._own_prefix)
         if heard is None:
             return
         if not heard.port:
@@ -179,7 +185,7 @@ class Introducer:
             return
         if heard.prefix == self._own_prefix:
             return
-        if self._own_prefix is None and heard.port >= discovery_port(self._domain, FIRST_INTRODUCED):
+        if self._own_prefix is None and self._has_number_of_run(heard):
             self._own_prefix = heard.prefix[HOST] + os.urandom(PREFIX_SIZE - HOST.stop)
         now = time.monotonic()
         known = self._known.setdefault(heard.prefix, _Known(heard, now, now))
@@ -189,10 +195,14 @@ class Introducer:
         if now >= known.passed + REPEAT:
             self._pass_on(known)
 
+    def _has_number_of_run(self, announcement: Announcement) -> bool:
+        """Whether it comes from a Fast DDS participant with a number like those of the run."""
+        numbered = announcement.port >= discovery_port(self._domain, FIRST_INTRODUCED)
+        return numbered and announcement.vendor == FAST_DDS
+
     def _visits(self, known: _Known) -> bool:
         """Whether a participant is not of the run: has another number, or is not ready for long."""
-        introduced = known.announcement.port >= discovery_port(self._domain, FIRST_INTRODUCED)
-        if introduced and time.monotonic() <= known.first + PATIENCE:
+        if self._has_number_of_run(known.announcement) and time.monotonic() <= known.first + PATIENCE:
             return False
         return known.announcement.prefix not in self._prefixes.values()
 

@@ -18,11 +18,10 @@ from __future__ import annotations
 
 import socket
 
-from msg_agents.discovery.rtps import LOOPBACK
+from msg_agents.discovery.rtps import GROUP, LOOPBACK
 from msg_analysis.errors import InputError
 
 PATIENCE = 1.0  # s; in the kernel, a message is there at once
-GROUP = "239.255.0.1"  # of discovery (DDSI-RTPS 2.3, 9.6.1.4)
 WORD = b"msg_agents"
 
 

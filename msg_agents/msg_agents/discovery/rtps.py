@@ -30,9 +30,12 @@ from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN
 PREFIX_SIZE = 12  # bytes of a GUID that all endpoints of a participant share
 PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
 LOOPBACK = "127.0.0.1"
+GROUP = "239.255.0.1"  # of announcements by multicast (9.6.1.4)
 _MAGIC, _HEADER_SIZE = b"RTPS", 20
-_HEADER = _MAGIC + b"\x02\x03\x01\x0f"  # version 2.3, vendor eProsima, as of a Fast DDS participant
+FAST_DDS = b"\x01\x0f"  # the vendor (8.3.3.1.3)
+_HEADER = _MAGIC + b"\x02\x03" + FAST_DDS  # version 2.3
 _DATA, _TO_ONE = 0x15, 0x0E  # submessages
+_ANYBODY = bytes(PREFIX_SIZE)  # as the addressee: all that hear it (8.3.7.6)
 _LITTLE_ENDIAN, _INLINE_QOS, _WITH_DATA = 0x01, 0x02, 0x04  # flags
 _PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
 _KEY_HASH, _STATUS_INFO, _SENTINEL, _DISCOVERY_LOCATOR = 0x70, 0x71, 0x01, 0x32
@@ -46,6 +49,11 @@ _LATE = 1 << 30  # sequence number: higher than that of any announcement that th
 def discovery_port(domain: int, participant: int) -> int:
     """Port at which a participant of this number hears announcements (9.6.1.1)."""
     return PORT_BASE + PORTS_PER_DOMAIN * domain + 10 + 2 * participant
+
+
+def multicast_port(domain: int) -> int:
+    """Port of the group at which all participants of a domain hear announcements (9.6.1.1)."""
+    return PORT_BASE + PORTS_PER_DOMAIN * domain
 
 
 def discovery_ports(domain: int) -> range:
@@ -62,28 +70,39 @@ class Announcement:
     port: int  # at which it hears announcements; 0: it leaves
     datagram: bytes
 
+    @property
+    def vendor(self) -> bytes:
+        """The number of who made the middleware."""
+        return self.datagram[6:8]
 
-def read_announcement(datagram: bytes) -> Announcement | None:
-    """The announcement in a datagram; None if there is none, or it is not meant for everybody."""
+
+def read_announcement(datagram: bytes, reader: bytes | None = None) -> Announcement | None:
+    """The announcement in a datagram; None if there is none, or it is addressed to another one than the reader.
+
+    ``reader``: prefix of its GUID; what is addressed to it becomes an announcement to everybody.
+    """
     if datagram[:4] != _MAGIC:
         return None
     with contextlib.suppress(struct.error):  # it is cut off
-        for kind, flags, body in _submessages(datagram):
+        for kind, flags, begin, body in _submessages(datagram):
             if kind == _TO_ONE:
-                return None
+                if body[:PREFIX_SIZE] not in (_ANYBODY, reader):
+                    return None
+                datagram = datagram[:begin] + _ANYBODY + datagram[begin + PREFIX_SIZE :]
             if kind == _DATA and body[8:12] == _PARTICIPANT_WRITER and flags & _LITTLE_ENDIAN:
                 port = _port(flags, body) if flags & _WITH_DATA else 0
                 return None if port is None else Announcement(datagram[8:_HEADER_SIZE], port, datagram)
     return None
 
 
-def _submessages(datagram: bytes) -> Iterator[tuple[int, int, bytes]]:
+def _submessages(datagram: bytes) -> Iterator[tuple[int, int, int, bytes]]:
+    """Kind, flags, place of the body, and the body of every submessage."""
     position = _HEADER_SIZE
     while position < len(datagram):
         kind, flags = struct.unpack_from("BB", datagram, position)
         (size,) = struct.unpack_from("<H" if flags & _LITTLE_ENDIAN else ">H", datagram, position + 2)
         size = size or len(datagram) - position - 4  # 0: to the end
-        yield kind, flags, datagram[position + 4 : position + 4 + size]
+        yield kind, flags, position + 4, datagram[position + 4 : position + 4 + size]
         position += 4 + size
 
 

@@ -21,6 +21,7 @@ from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import TypeVar
 
+from rclpy.node import NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.task import Future
@@ -40,6 +41,7 @@ from msg_analysis.wire.signatures import sign
 from msg_analysis.wire.topics import Topic, agent_name
 
 ACK_TIMEOUT = 4.0  # s for readers to acknowledge the last messages; more than Fast DDS's default heartbeat period, 3 s
+BARE = "_CREATED_BY_BARE_DDS_APP_"  # name of the node of a reader whose participant has no known nodes
 NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
 Message = TypeVar("Message", ActiveGraph, Progress)
 
@@ -187,11 +189,23 @@ class NetworkNode(LeanNode):
             for reader in self.get_subscriptions_info_by_topic(publisher.topic_name)
         )
 
+    def _announced_reader(self, name: str, topic: str) -> bool:
+        """Whether a node in our namespace has announced a reader of a topic that is known.
+
+        From Fast DDS 3 on, readers of Cyclone DDS have no node: it does not repeat to which participant each belongs.
+        """
+        try:
+            return topic in dict(self.get_subscriber_names_and_types_by_node(name, self.get_namespace()))
+        except NodeNameNonExistentError:
+            return False
+
     def missing_readers(self, publisher: Publisher, expected: Sequence[str]) -> list[str]:
         """Names of the expected nodes that do not read a topic of this node yet."""
         readers = self.get_subscriptions_info_by_topic(publisher.topic_name)
         found = {reader.node_name for reader in readers}
         missing = [name for name in expected if name not in found]
+        if missing and BARE in found:
+            missing = [name for name in missing if not self._announced_reader(name, publisher.topic_name)]
         # Other readers are matched too: all must be, so that ours are among them. Readers that ask for history of a
         # topic that keeps none are never matched.
         latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL

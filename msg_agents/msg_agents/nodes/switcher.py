@@ -81,6 +81,8 @@ class Switcher(NetworkNode):
         self._on_progress = on_progress
         self._duplicates: set[str] = set()  # names seen at the last check
         self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
+        if self._mark and self._mark.exists():  # in the middle of a run, none of the user's nodes is awaited
+            readers = [name for name in readers if name == RECORDER]
         self._expected = [agent_name(i) for i in range(model.agents)] + readers
         self._experiment = self.publisher_of(topics.EXPERIMENT)
         self._graph = self.publisher_of(topics.GRAPH)

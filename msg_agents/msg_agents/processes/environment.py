@@ -31,6 +31,7 @@ TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
 RESTARTS = 3  # of killed processes in a run, by default
 LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
 DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
+USER_TIMEOUT = 120.0  # s for which they look for others that the user starts
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 LOGS_VARIABLE = "ROS_LOG_DIR"

@@ -169,8 +169,9 @@ class Hosts:
             return found
 
         find("maxInitialPeersRange").text = str(self.participants(experiment))
-        discovery = find("discovery_config")
-        discovery.clear()
+        find("transport_descriptor").remove(find("interfaceWhiteList"))  # messages go to other hosts
+        discovery = ET.Element(_tag("discovery_config"))
+        find("builtin").insert(0, discovery)
         for key, seconds in (("leaseDuration", LEASE), ("leaseAnnouncement", ANNOUNCEMENT)):
             ET.SubElement(ET.SubElement(discovery, _tag(key)), _tag("sec")).text = f"{seconds:.0f}"
         peers = find("initialPeersList")

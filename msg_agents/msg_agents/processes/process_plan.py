@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from msg_agents.processes.environment import DISCOVERY_TIMEOUT
+from msg_agents.processes.environment import DISCOVERY_TIMEOUT, USER_TIMEOUT
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, MEGABYTE, Storage
 from msg_analysis.common.cores import count_cores
 from msg_analysis.errors import InputError
@@ -109,6 +109,7 @@ def plan_network(
     parameter_services: bool = False,
     storage: Storage = DEFAULT_STORAGE,
     share: Share | None = None,
+    readers: Sequence[str] = (),  # nodes that the user starts, and that must read the topics before the run starts
     most: int = MOST_UNAIDED,
 ) -> list[ProcessPlan]:
     """The processes of a run, in the order in which to start them; with ``share``, those of this host only.
@@ -121,9 +122,12 @@ def plan_network(
     if parameter_services:
         common += ("--parameter-services",)
     timeout = discovery_timeout(experiment.agents, count) if share is None else share.discovery_timeout
+    if readers:
+        timeout = max(timeout, USER_TIMEOUT)
     if timeout != DISCOVERY_TIMEOUT:
         common += ("--discovery-timeout", f"{timeout:g}")
-    options = common + (("--await", RECORDER) if bag is not None or share is not None else ())
+    awaited = ([RECORDER] if bag is not None or share is not None else []) + list(readers)
+    options = common + tuple(part for name in awaited for part in ("--await", name))
     if checkpoints is not None:
         options += ("--checkpoint", str(checkpoints))
     if share is not None:

@@ -19,11 +19,9 @@ from __future__ import annotations
 import shutil
 import signal
 import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, nullcontext, suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
 
 from msg_agents.processes.core_pinning import place
 from msg_agents.processes.environment import RESTARTS
@@ -39,6 +37,7 @@ from msg_agents.processes.process_plan import (
 )
 from msg_agents.recovery.checkpoint import room_for
 from msg_agents.running.run_folder import make_bag_directory, workshop
+from msg_agents.running.run_result import RunResult
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, STEPS, Supervisor
 from msg_agents.running.surroundings import ROS_LOGS, surroundings, will_introduce
 from msg_agents.stepping.stall_detection import LagDetector, StallDetector
@@ -52,88 +51,10 @@ from msg_analysis.common.cores import available_cores
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.simulate import new_record
 from msg_analysis.wire.receiving import state_frame
 
-if TYPE_CHECKING:
-    from msg_analysis.inference.verdict.comparison import Comparison
-
-ReportWhen = Literal["always", "on-failure", "never"]
 POLL = 0.05  # s
-REPORT_FILE = "report.html"
-
-
-@dataclass(slots=True)
-class RunResult:
-    """What a run left behind.
-
-    Attributes
-    ----------
-    experiment
-        what was run
-    bag
-        directory; None if nothing was to be recorded on this host
-    failures
-        what went wrong, one line each
-    interrupted_by
-        number of the signal (Ctrl-C: SIGINT) that ended the run, or the comparison; then the bag is not read
-    wall_time
-        s from the first state of the slowest agent to its last one, as reported a few times a second
-    rate
-        steps of the slowest agent per second of wall time
-    restarts
-        processes that were killed, or crashed, and were started again, one line each
-    strangers
-        messages that the nodes refused: dictionaries with "node", "topic", "reason", "count"
-    reached
-        newest step of the slowest agent, as last reported; -1: none
-    trajectory
-        states of the bag; None if there is none, or it could not be read, or the run was interrupted
-    comparison
-        with the prediction; None before ``conclude``
-    report
-        file of the report; None: not written
-    """
-
-    experiment: ValidExperiment
-    bag: Path | None
-    failures: list[str] = field(default_factory=list)
-    interrupted_by: int | None = None
-    wall_time: float = 0.0
-    rate: float = 0.0
-    restarts: list[str] = field(default_factory=list)
-    strangers: list[dict[str, Any]] = field(default_factory=list)
-    reached: int = -1
-    trajectory: Trajectory | None = None
-    comparison: Comparison | None = None
-    report: Path | None = None
-
-    @property
-    def interrupted(self) -> bool:
-        """Whether a signal has ended the run, or the comparison."""
-        return self.interrupted_by is not None
-
-    @property
-    def recorded(self) -> bool:
-        """Whether there is a bag that can be read, although perhaps not to its end."""
-        if self.trajectory is None and not self.interrupted:
-            return False
-        return self.bag is not None and any(self.bag.glob("*.mcap"))
-
-    def interrupt(self, by: int, during: str) -> None:
-        """Note that a signal has ended the run or the comparison.
-
-        Parameters
-        ----------
-        by
-            number of the signal
-        during
-            when, in words; may be empty
-        """
-        self.interrupted_by = by
-        name = "Ctrl-C" if by == signal.SIGINT else signal.Signals(by).name
-        self.failures.insert(0, f"stopped by {name} {during}".rstrip())
 
 
 def run_network(
@@ -142,6 +63,7 @@ def run_network(
     *,
     domain: int | None = None,
     restarts: int = RESTARTS,
+    readers: Sequence[str] = (),
     use_sim_time: bool = False,
     storage: Storage = DEFAULT_STORAGE,
     pin: bool = True,
@@ -152,6 +74,7 @@ def run_network(
     environment: Mapping[str, str] | None = None,
     record: RunRecord | None = None,
     share: Share | None = None,
+    interruption: Interruption | None = None,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
 
@@ -168,6 +91,9 @@ def run_network(
     restarts
         how often, in all, processes of agents and the switcher are started again when they were killed (or crashed for
         the first time); one more failure ends the run. 0: no states are kept for a restart
+    readers
+        names of other nodes, in the same domain, that must read the states of all agents before the run starts, as
+        those of a tool do that must not miss a message
     use_sim_time
         whether the nodes take the time from ``/clock``, which another process publishes in the same domain
     storage
@@ -190,6 +116,8 @@ def run_network(
     share
         what this host runs, of several hosts; None: all. Without the recorder only the logs are kept, in the
         directory that would hold the bag
+    interruption
+        keeps signals from the start of the processes on, beyond the end of this call; None: one for this call only
 
     Returns
     -------
@@ -208,9 +136,9 @@ def run_network(
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
     bag = directory if share is None or share.home else None
     result = RunResult(experiment, bag)
+    kept = interruption or Interruption()
     try:
         with (
-            ExitStack() as to_the_end,
             workshop() as folder,
             surroundings(folder, domain, environment or {}, processes + 2) as around,
         ):
@@ -220,9 +148,9 @@ def run_network(
                 run_file = folder / "run.json"
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
                 longest = state_frame(record, whole=True).size
+                kept.keep()
                 with (
                     workshop(experiment.agents * room_for(longest)) if restarts else nullcontext() as checkpoints,
-                    Interruption() as interruption,
                     Supervisor(
                         folder,
                         variables,
@@ -239,6 +167,7 @@ def run_network(
                         use_sim_time=use_sim_time,
                         storage=storage,
                         share=share,
+                        readers=readers,
                         most=MOST_PROCESSES if around.introducer else MOST_UNAIDED,
                     )
                     if around.introducer:
@@ -248,22 +177,24 @@ def run_network(
                     supervisor.start(plans)
                     view.begin(record, checkpoints if share is None else None)
                     view.started(supervisor.by_node)
-                    _watch(supervisor, experiment, result, restarts, interruption, view, follow_clock=not use_sim_time)
+                    _watch(supervisor, experiment, result, restarts, kept, view, follow_clock=not use_sim_time)
                     view.end()
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
-                    _collect_failures(supervisor, result, interruption, restarts)
+                    _collect_failures(supervisor, result, kept, restarts)
             result.strangers = supervisor.account().strangers()
             if bag is not None:
                 try:
-                    _settle(bag, result)
+                    with kept.let_through():
+                        _settle(bag, result)
                 except KeyboardInterrupt:
                     result.interrupt(signal.SIGINT, "while the bag was read")
-            interruption = to_the_end.enter_context(Interruption())  # the rest takes no time: a signal can wait
             if directory is not None:
                 _keep_logs(folder, directory / "log", result)
-        if interruption.caught is not None and not result.interrupted:
-            result.interrupt(interruption.caught, "while the logs were kept")
+        if (number := kept.take()) is not None and not result.interrupted:
+            result.interrupt(number, "while the logs were kept")
     finally:
+        if interruption is None:
+            kept.end()
         if directory is not None:
             with suppress(OSError):
                 directory.rmdir()  # if it is empty
@@ -338,11 +269,11 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
 
 def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: Interruption, restarts: int) -> None:
     result.reached = min(supervisor.steps, default=-1)
-    if interruption.caught is not None:
+    if (number := interruption.take()) is not None:
         reached, steps = result.reached, result.experiment.steps
         unknown = all(child.plan.name != SWITCHER for child in supervisor.children)  # it is on another host
         where = "" if unknown else f"at step {reached} of {steps}" if reached >= 0 else "before step 0"
-        result.interrupt(interruption.caught, where)
+        result.interrupt(number, where)
     for child in supervisor.failures:
         words = child.last_words()
         line = f"{child.plan.name}: {child.failure}" + (f": {words}" if words else "")
@@ -387,34 +318,3 @@ def _settle(bag: Path, result: RunResult) -> None:
         result.failures.append(
             "last recorded step: " + ", ".join(f"agent {i + 1}: {k if k >= 0 else 'none'}" for i, k in enumerate(last))
         )
-
-
-def conclude(result: RunResult, report: ReportWhen = "always") -> None:
-    """Compare the bag of a run with its prediction, and write report.html into the bag.
-
-    Does nothing if there is no bag, or it was not read.
-
-    Parameters
-    ----------
-    result
-        from ``run_network``; its ``comparison`` is set
-    report
-        when the report is written; "on-failure": if the verdict is not "agrees"
-
-    Raises
-    ------
-    InputError
-        there is no prediction (too large, unbounded), the bag lacks what is needed, or the report cannot be written
-    """
-    if result.trajectory is None or result.bag is None:
-        return
-    from msg_analysis.inference.verdict.compare import compare
-
-    comparison = compare(result.trajectory)
-    if report == "always" or (report == "on-failure" and comparison.verdict != "agrees"):
-        from msg_analysis.report.html.report_page import write_report
-
-        file = result.bag / REPORT_FILE
-        write_report(comparison, result.trajectory, file, restarts=result.restarts, strangers=result.strangers)
-        result.report = file
-    result.comparison = comparison

@@ -17,6 +17,8 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self
 
@@ -44,16 +46,16 @@ def _under_nohup(number: signal.Signals) -> bool:
     return number != signal.SIGINT and signal.getsignal(number) is signal.SIG_IGN
 
 
-def raise_for(caught: int | None) -> None:
+def raise_for(number: int | None) -> None:
     """Raise KeyboardInterrupt for Ctrl-C, SystemExit for another signal; nothing for None."""
-    if caught == signal.SIGINT:
+    if number == signal.SIGINT:
         raise KeyboardInterrupt
-    if caught is not None:
-        raise SystemExit(killed_by(caught))
+    if number is not None:
+        raise SystemExit(killed_by(number))
 
 
 class Interruption:
-    """Keeps the first signal until ``check``, as a context.
+    """Keeps the first signal until somebody asks for it: from ``keep`` to ``end``, or as a context.
 
     An exception that a handler raises is lost in a generator that is being closed, or in a callback of an executor.
     """
@@ -62,21 +64,46 @@ class Interruption:
         self.caught: int | None = None  # number of the first signal
         self._handlers: dict[signal.Signals, Any] = {}
 
-    def __enter__(self) -> Self:
+    def keep(self) -> None:
+        """Keep signals from now on."""
         for number in SIGNALS:
-            if not _under_nohup(number):
+            if number not in self._handlers and not _under_nohup(number):
                 self._handlers[number] = signal.signal(number, self._catch)
+
+    def end(self) -> None:
+        """Keep no more signals."""
+        while self._handlers:
+            signal.signal(*self._handlers.popitem())
+
+    def __enter__(self) -> Self:
+        self.keep()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)
+        self.end()
+
+    @contextmanager
+    def let_through(self) -> Iterator[None]:
+        """Let signals raise their exceptions in here, the one that was kept at once."""
+        kept = bool(self._handlers)
+        self.end()
+        try:
+            self.check()
+            yield
+        finally:
+            if kept:
+                self.keep()
+
+    def take(self) -> int | None:
+        """The number of the kept signal, which is then kept no more."""
+        number, self.caught = self.caught, None
+        return number
 
     def check(self) -> None:
         """Raise KeyboardInterrupt after Ctrl-C, SystemExit after another signal."""
-        raise_for(self.caught)
+        raise_for(self.take())
 
     def _catch(self, number: int, _: object) -> None:
         self.caught = self.caught or number

@@ -73,6 +73,8 @@ print(node.get_node_names(), flush=True)
 time.sleep(60)
 """
 
+READER = bytes(range(100, 112))
+
 
 def submessage(flags: int, body: bytes, *, kind: int = 0x15, size: int | None = None) -> bytes:
     return bytes([kind, flags]) + (len(body) if size is None else size).to_bytes(2, "little") + body
@@ -90,6 +92,17 @@ def submessage(flags: int, body: bytes, *, kind: int = 0x15, size: int | None = 
 )
 def test_announcements(datagram: bytes) -> None:
     assert read_announcement(datagram) == Announcement(PREFIX, 7474, datagram)
+
+
+def test_what_is_addressed_to_the_reader_is_made_an_announcement_to_all() -> None:
+    """As Cyclone DDS answers, once to a participant of its own, once to none in particular (a prefix of zeros)."""
+    rest = TIMESTAMP + submessage(5, DATA + PARAMETERS)
+    own = HEADER + submessage(1, READER, kind=0x0E) + rest
+    to_all = HEADER + submessage(1, bytes(12), kind=0x0E) + rest
+    assert read_announcement(own) is None
+    assert read_announcement(own, PREFIX) is None
+    assert read_announcement(own, READER) == Announcement(PREFIX, 7474, to_all)
+    assert read_announcement(to_all) == Announcement(PREFIX, 7474, to_all)
 
 
 def test_who_leaves_has_no_port() -> None:

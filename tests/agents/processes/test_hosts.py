@@ -86,6 +86,7 @@ def test_profile() -> None:
     ]  # fmt: skip
     texts = {found.tag.rpartition("}")[2]: found.text for found in tree.iter()}
     assert "ignoreParticipantFlags" not in texts
+    assert "interfaceWhiteList" not in texts
     assert texts["maxInitialPeersRange"] == str(3 + 2 + 8)
     assert texts["receiveBufferSize"] == "4194304"
     lease = next(found for found in tree.iter() if found.tag.endswith("}leaseDuration"))

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from msg_agents.doctor.networks.fault_plan import Fault, FaultPlan
-from msg_agents.running.runner import RunResult
+from msg_agents.running.run_result import RunResult
 from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.text.number_words import counted
 from msg_analysis.twin.check import check

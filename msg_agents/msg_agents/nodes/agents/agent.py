@@ -122,8 +122,9 @@ class Agent(NetworkNode):
         self.far = [j for j in peers if j not in near]
         self._near = [j for j in peers if j in near]
         self._listeners: list[Callable[[int, int, int, bytes, bytes], str | None]] = []
-        # The recorder reads the batches of the process instead.
-        self._expected = [*map(agent_name, self.far), *(name for name in readers if name != RECORDER)]
+        self._peer_names = [*map(agent_name, self.far)]
+        # The recorder reads the batches of the process instead, and in the middle of a run none of these is awaited.
+        self._others = [name for name in readers if name != RECORDER and self._resumed is None]
         self._next_progress = 0.0
         self._reported = -1  # step of the last report
         self._stall = StallDetector()
@@ -164,16 +165,17 @@ class Agent(NetworkNode):
             all(states.get_publisher_count() for states in self._far_states) and self._group.hears_all()
         ):
             return False
-        return self.has_readers(self._states, self._awaited()) and not self._group.missing_recorder()
+        expected = self._awaited() + self._others
+        return self.has_readers(self._states, expected) and not self._group.missing_recorder()
 
     def missing_nodes(self) -> list[str]:
         """See NetworkNode."""
-        return self.missing_readers(self._states, self._awaited()) + self._group.missing_recorder()
+        return self.missing_readers(self._states, self._awaited() + self._others) + self._group.missing_recorder()
 
     def _awaited(self) -> list[str]:
-        """Names of the nodes that must read its topic: not those that its batches reach."""
+        """Names of the peers that must read its topic: not those that its batches reach."""
         reached = self._group.reached()
-        return [name for name in self._expected if name not in reached] if reached else self._expected
+        return [name for name in self._peer_names if name not in reached] if reached else self._peer_names
 
     def finish(self, *, complete: bool, deadline: float) -> None:
         """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""

@@ -12,7 +12,7 @@ import pytest
 
 from msg_agents.doctor.networks.fault_plan import Fault, FaultPlan
 from msg_agents.doctor.networks.outcome import Outcome, Verdict, exit_code, judge, summary, to_json
-from msg_agents.running.runner import RunResult
+from msg_agents.running.run_result import RunResult
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.simulate import simulate
