@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Lets a process get SIGTERM when its parent has ended. As a program: does so, and becomes a command.
+"""Lets a process get a signal when its parent has ended. As a program: does so, and becomes a command.
 
 Arguments: PARENT_PID COMMAND... The signal is Linux only (PR_SET_PDEATHSIG); elsewhere the command runs without it.
 """
@@ -28,10 +28,10 @@ import sys
 PR_SET_PDEATHSIG = 1
 
 
-def end_with_parent(parent: int) -> None:
+def end_with_parent(parent: int, number: signal.Signals = signal.SIGTERM) -> None:
     """Ask for the signal; if the parent has ended already, end."""
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM))
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(number))
     if os.getppid() != parent:
         sys.exit(1)
 
