@@ -122,7 +122,7 @@ class Agent(NetworkNode):
         self.far = [j for j in peers if j not in near]
         self._near = [j for j in peers if j in near]
         self._listeners: list[Callable[[int, int, int, bytes, bytes], str | None]] = []
-        self._peer_names = [*map(agent_name, self.far)]
+        self._peer_names = list(map(agent_name, self.far))
         # The recorder reads the batches of the process instead, and in the middle of a run none of these is awaited.
         self._others = [name for name in readers if name != RECORDER and self._resumed is None]
         self._next_progress = 0.0
