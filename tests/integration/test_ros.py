@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import yaml
 from mcap.reader import make_reader
+from waiting import participants
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.running.launch_arguments import NETWORK_ARGUMENTS
@@ -198,6 +199,7 @@ def stranger(directory: Path) -> Path:
 def test_a_stranger(network: Any, domain: int) -> None:
     """A plain rclpy node sees graphs and states of a running network, and ends with it."""
     watching = start("python", stranger(network.directory), cwd=network.directory)
+    network.wait_for(lambda: participants(domain), 60, "the stranger has a node")  # later it would wait for ever
     file = network.file(run={"pace": "realtime", "speed": 2.5})  # 6 s
     result = network.completed(network.start("run", file, "--out", network.directory, "--domain", domain, "--json"))
     assert result["strangers"] == []

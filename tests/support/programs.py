@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import click
 
 from msg_agents.cli.main import main as agents
@@ -20,3 +22,8 @@ def context_of(program: str, name: str) -> click.Context:
     return click.Context(
         command_of(program, name), info_name=name, parent=group.make_context(program, ["-h"], resilient_parsing=True)
     )
+
+
+def without_progress(stderr: str) -> str:
+    """What is on stderr besides the lines that long work writes there every ten seconds, on a slow machine too."""
+    return re.sub(r"^[^:\n]+(: [a-z ]+)?: \d+ (of \d+|%).*\n", "", stderr, flags=re.M)

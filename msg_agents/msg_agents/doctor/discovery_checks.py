@@ -21,6 +21,7 @@ from pathlib import Path
 
 from msg_agents.doctor.check import Check, refusal, warn_if
 from msg_agents.processes.environment import (
+    LOCALHOST_VARIABLE,
     PROFILE_VARIABLES,
     RANGE_VARIABLE,
     SERVER_VARIABLE,
@@ -33,7 +34,6 @@ from msg_agents.processes.process_plan import MOST_UNAIDED
 VARIABLES_FILE = "FASTDDS_ENVIRONMENT_FILE"
 NOT_USED = (TRANSPORTS_VARIABLE, "CYCLONEDDS_URI")  # with the run's own profile of Fast DDS
 PEERS_VARIABLE = "ROS_STATIC_PEERS"
-LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"
 RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
 UNAIDED = f"its processes look for each other, at most {MOST_UNAIDED} with agents"
 
@@ -58,7 +58,7 @@ def check_range() -> Check:
         return found
     value, localhost = os.environ.get(RANGE_VARIABLE), os.environ.get(LOCALHOST_VARIABLE)
     warning = None
-    if localhost == "1":
+    if localhost == "1" and LOCALHOST_VARIABLE in node_environment(0):  # as with a profile or range of the user's
         warning = (
             f"{LOCALHOST_VARIABLE}: 1: replaced by {RANGE_VARIABLE} in ROS 2, but still stronger: nodes use "
             "shared memory, of which a killed process leaves its part behind: unset it"
@@ -67,7 +67,7 @@ def check_range() -> Check:
         warning = f"{RANGE_VARIABLE}: {value}: expected {', '.join(RANGES)}: unset it"
     elif value and value != "LOCALHOST":
         warning = f"{RANGE_VARIABLE}: {value}: a run keeps to it, perhaps beyond this machine: {UNAIDED}: unset it"
-    return warn_if(name, warning, "this machine")
+    return warn_if(name, warning, "this machine" + (f" ({LOCALHOST_VARIABLE}={localhost})" if localhost else ""))
 
 
 def check_server() -> Check:

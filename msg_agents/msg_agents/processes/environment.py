@@ -33,6 +33,7 @@ LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants on
 DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
 USER_TIMEOUT = 120.0  # s for which they look for others that the user starts
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"  # older; 1 is still stronger, and adds shared memory as LOCALHOST does
 SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 LOGS_VARIABLE = "ROS_LOG_DIR"
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
@@ -122,7 +123,8 @@ def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str,
     if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
         environment[RANGE_VARIABLE] = "SYSTEM_DEFAULT"  # the profile decides
         environment.update(profile_variables(profile))
-        environment.pop(SERVER_VARIABLE, None)
+        for name in (SERVER_VARIABLE, LOCALHOST_VARIABLE):
+            environment.pop(name, None)
     return environment
 
 
@@ -133,9 +135,11 @@ def without_shared_memory() -> dict[str, str]:
     """
     if any(os.environ.get(name) for name in (*PROFILE_VARIABLES, TRANSPORTS_VARIABLE)):
         return {}
-    if os.environ.get(RANGE_VARIABLE) == "LOCALHOST":  # adds shared memory to any profile
+    # Both add shared memory to any profile.
+    if os.environ.get(RANGE_VARIABLE) == "LOCALHOST" or os.environ.get(LOCALHOST_VARIABLE) == "1":
         return {
             RANGE_VARIABLE: "SYSTEM_DEFAULT",
+            LOCALHOST_VARIABLE: "",
             **profile_variables(LOOPBACK_PROFILE),
         }
     return profile_variables(UDP_PROFILE)

@@ -55,3 +55,16 @@ def test_the_middleware_here_takes_it(profile: Path, monkeypatch: pytest.MonkeyP
             check=False,
         )
     assert (node.returncode, node.stdout, node.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("value", ["0", "1"])
+def test_the_older_variable_for_this_machine_does_not_reach_the_nodes(
+    value: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With 1 they would have shared memory in spite of the profile."""
+    for name in (*PROFILE_VARIABLES, "ROS_AUTOMATIC_DISCOVERY_RANGE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", value)
+    environment = node_environment(0)
+    assert "ROS_LOCALHOST_ONLY" not in environment
+    assert environment[OLD].endswith("loopback.xml") or environment[NEW].endswith("loopback.xml")

@@ -158,7 +158,15 @@ def test_it_ends_when_its_user_is_killed(tmp_path: Path) -> None:
 
 
 def early_servers(parent: int) -> list[int]:
-    """Processes that a process has started as fork servers of a later run."""
+    """Processes that a process has started as fork servers of a later run, at least one.
+
+    Between its fork and its own command, such a process has the command of its parent.
+    """
+    wait_for(lambda: found_early_servers(parent))
+    return found_early_servers(parent)
+
+
+def found_early_servers(parent: int) -> list[int]:
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has just ended
