@@ -16,6 +16,7 @@ from browser import Log, chromium
 from terminal import Terminal
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
+RIGHTMOST = "Math.max(...[...document.querySelectorAll('section *')].map((one) => one.getBoundingClientRect().right))"
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 
 
@@ -105,7 +106,7 @@ def test_page_of_a_run(network: Any, page: Any) -> None:
     page.goto(address := _address(run))
     page.wait_for_selector("body[data-over=yes]")
     assert log.complaints == []
-    assert set(log.requests) == {address, f"{address}events"}
+    assert set(log.requests) == {address, f"{address}events", f"{address}report"}
     stdout, stderr = run.communicate(timeout=60)
     result = json.loads(stdout)
     assert "Traceback" not in stderr
@@ -115,6 +116,14 @@ def test_page_of_a_run(network: Any, page: Any) -> None:
     assert page.inner_text("#graph") in ("line", "ring")
     assert page.locator("#network line.active").count() in (4, 5)
     assert page.locator("#agents tr").count() == 5
+    # The page has kept the report, although nothing is served any more.
+    with page.context.expect_page() as opened:
+        page.click("#report-link")
+    shown = Log(opened.value)
+    opened.value.wait_for_load_state()
+    assert "net" in opened.value.title()
+    assert shown.complaints == []
+    assert page.inner_text("#report-path") == result["report"]
     error = result["system_error"]
     assert float(page.inner_text("#measured")) == pytest.approx(error["measured"], rel=1e-3)
     assert float(page.inner_text("#predicted")) == pytest.approx(error["predicted"], rel=1e-3)
@@ -139,6 +148,35 @@ def test_page_of_a_run_in_time_and_two_browsers(network: Any, page: Any) -> None
     assert log.complaints == []
     run.communicate(timeout=60)
     assert run.returncode == 3
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_page_of_agents_that_stop_and_go(network: Any, page: Any, scheme: str) -> None:
+    """A stopped agent turns grey and its silence is told; a killed one is an event, and its return. On a phone, too."""
+    page.emulate_media(color_scheme=scheme)
+    page.set_viewport_size({"width": 390, "height": 800})
+    run = network.start("run", _long(network), "--out", network.directory / "runs", "--web", "0")
+    log = _follow(page, _address(run))
+    assert page.locator("#agents tr.away").count() == 0
+    assert re.fullmatch(r"[\d.]+ ms", page.locator("#late", has_text="ms").inner_text())
+    (second,) = (each for each in network.processes() if "--agent" in each.command and each.agent == 2)
+    second.kill(signal.SIGSTOP)
+    page.wait_for_selector("#network .ball.away")
+    assert re.fullmatch(r"[\d.]+ s ago", page.locator("#agents tr").nth(1).locator("td.fresh").inner_text())
+    second.kill(signal.SIGCONT)
+    page.wait_for_selector("#network .ball.away", state="detached")
+    second.kill()
+    page.locator("#events li", has_text="agent_2: killed by SIGKILL").wait_for()
+    page.locator("#events li", has_text="agent 2 is back").wait_for()
+    assert page.locator("#trace .trace").count() >= 5
+    page.get_by_role("button", name="agent 2").press("Enter")
+    page.locator("#agent-keys [aria-pressed=false]").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    assert page.evaluate(RIGHTMOST) <= 390.5
+    run.send_signal(signal.SIGINT)
+    page.wait_for_selector("body[data-over=yes]")
+    assert log.complaints == []
+    run.communicate(timeout=60)
 
 
 def test_page_of_a_replay(network: Any, domain: int, twin_bag: Path, page: Any) -> None:

@@ -367,8 +367,7 @@ class LiveView:
         if self._source is None:
             self._source = SnapshotSource(experiment)
             self._display.begin(experiment)
-        # The steps of single agents are not counted here: the newest step of any agent stands for all.
-        self._display.draw(self._source.snapshot([report.newest], report), experiment)
+        self._display.draw(self._source.snapshot(watched.steps, report), experiment)
         if self._print_line is not None:
             self._print_line(live_line(report, watched.record, rate))
 

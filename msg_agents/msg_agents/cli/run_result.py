@@ -19,6 +19,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 def finish(
     result: RunResult,
     as_json: bool,
-    say: Callable[[dict[str, Any]], None] = lambda _: None,
+    say: Callable[[dict[str, Any], Path | None], None] = lambda *_: None,
     *,
     interruption: Interruption,
     analyse: bool = True,
@@ -62,7 +63,7 @@ def finish(
         except KeyboardInterrupt:
             result.interrupt(signal.SIGINT, "while the run was compared with the prediction")
             complain(result.failures[0], "failed:")
-    say(_ending(result))
+    say(_ending(result), result.report)
     _show(result, as_json)
     if _incomplete(result) or (analyse and result.bag is not None and result.comparison is None):
         sys.exit(ExitCode.INCOMPLETE)

@@ -25,9 +25,10 @@ from pathlib import Path
 import numpy as np
 
 from msg_agents.recovery.checkpoint import MARK, room_for
+from msg_analysis.model.arithmetic.step_clock import SECOND
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
-from msg_analysis.wire.messages import STATE_MODE
+from msg_analysis.wire.messages import STATE_HEAD, STATE_MODE
 from msg_analysis.wire.receiving import state_frame
 from msg_analysis.wire.topics import agent_name
 
@@ -88,6 +89,16 @@ class CheckpointReader:
         good = there[:-1] & there[1:] & (modes[1:] >= 1)
         self.missed += int((~good).sum())
         return steps[:-1][good], modes[1:][good] - 1, states[:-1][good], states[1:][good]
+
+    def stamps(self, steps: IntArray) -> IntArray:
+        """Stamps [ns] of these states of every agent, (b, m); -1 where a slot does not hold its step."""
+        slots, found = steps % self._capacity, []
+        for ring in self._rings:
+            head = np.ascontiguousarray(ring[slots, : STATE_HEAD.itemsize]).view(STATE_HEAD)[:, 0]
+            stamp = head["seconds"].astype(np.int64) * SECOND + head["nanoseconds"]
+            mark = np.ascontiguousarray(ring[slots, self._size :]).view("<u8")[:, 1]
+            found.append(np.where(mark == steps + 1, stamp, -1))
+        return np.stack(found, axis=1)
 
     def _read(self, ring: AnyArray, steps: IntArray) -> tuple[FloatArray, IntArray, BoolArray]:
         """States (b, width), modes from 1 (b,), and whether the slots still held these steps (b,)."""

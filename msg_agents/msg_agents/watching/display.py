@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -78,7 +79,7 @@ class Display:
         if self._web is not None:
             self._web.show(snapshot_document(snapshot))
 
-    def end(self, words: dict[str, Any]) -> None:
-        """Tell the page how the run ended: "text", and "verdict" or None."""
+    def end(self, words: dict[str, Any], report: Path | None = None) -> None:
+        """Tell the page how the run ended: "text", and "verdict" or None; it gets the report, too."""
         if self._web is not None:
-            self._web.end(words)
+            self._web.end(words, report)

@@ -28,6 +28,7 @@ from msg_agents.watching.checkpoint_reader import CheckpointReader
 from msg_analysis.common.blas_threads import one_blas_thread
 from msg_analysis.errors import InputError
 from msg_analysis.model.run.record import RunRecord
+from msg_analysis.types import IntArray
 
 if TYPE_CHECKING:
     from msg_analysis.inference.online.running_errors import LiveEstimate, LiveReport
@@ -87,4 +88,15 @@ class RunObserver:
             if not len(found[0]):
                 break
             estimate.add_whole(*found)
+            if self._record.experiment.run.pace == "realtime":
+                self._add_stamps(estimate, found[0])
         self.report = estimate.report()
+
+    def _add_stamps(self, estimate: LiveEstimate, steps: IntArray) -> None:
+        from msg_analysis.inference.online.recent_steps import WINDOW
+
+        steps = steps[-WINDOW:]
+        stamps = self._reader.stamps(steps)
+        for agent in range(stamps.shape[1]):
+            there = stamps[:, agent] >= 0
+            estimate.add_stamps(agent, steps[there].tolist(), stamps[there, agent].tolist())

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -27,7 +27,9 @@ from msg_agents.watching.run_observer import RunObserver
 from msg_agents.watching.snapshot import SnapshotSource
 from msg_agents.watching.terminal_panel import plain_line
 from msg_agents.watching.view import View
+from msg_analysis.common.forked_processes import Process
 from msg_analysis.common.text.notes import print_note
+from msg_analysis.wire.topics import agent_name
 
 if TYPE_CHECKING:
     from msg_agents.watching.web_server import WebServer
@@ -50,8 +52,11 @@ class RunView(View):
         self._source = SnapshotSource(experiment)
         self._observer: RunObserver | None = None
         self._note: str | None = None
+        self._begun = False
         self._shown, self._told = 0.0, time.monotonic()
         self._steps: Sequence[int] = ()
+        self._processes: list[Process | None] = [None] * experiment.agents  # by agent; those of this host
+        self._replaced: set[int] = set()  # agents that have got a new process since the last look
 
     def __enter__(self) -> Self:
         self.display.__enter__()
@@ -65,11 +70,14 @@ class RunView(View):
         self.display.__exit__(kind, error, trace)
 
     def note(self, line: str) -> None:
-        """Print a note, above the panel."""
+        """Print a note, above the panel; of a run that has begun, it is an event on the page."""
         print_note(line, self._console)
+        if self._begun:
+            self._source.happened(line)
 
     def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
         """Follow the run: its processes have been started. Without ``checkpoints`` its errors are not followed."""
+        self._begun = True
         self.display.begin(record.experiment)
         if not self.display.wanted:
             return  # lines do not show errors
@@ -77,6 +85,23 @@ class RunView(View):
             self._note = "errors are not shown: the states are not kept (--restarts 0), or not on this host"
         else:
             self._observer = RunObserver(record, checkpoints)
+
+    def started(self, processes: Mapping[str, Process]) -> None:
+        """See View."""
+        newest = [processes.get(agent_name(agent)) for agent in range(self._experiment.agents)]
+        for agent, (old, new) in enumerate(zip(self._processes, newest, strict=True)):
+            if old is not None and old is not new:
+                self._replaced.add(agent)
+        self._processes = newest
+
+    def _ended(self) -> set[int]:
+        """Agents whose process has ended before its last step, or had to be replaced."""
+        last, replaced, self._replaced = self._experiment.steps, self._replaced, set()
+        return replaced.union(
+            agent
+            for agent, (process, step) in enumerate(zip(self._processes, self._steps, strict=False))
+            if process is not None and step < last and process.poll() is not None
+        )
 
     def look(self, steps: Sequence[int], *, force: bool = False) -> None:
         """Show the newest step of every agent (-1: none; empty before the start), every ``REFRESH`` s or if forced."""
@@ -90,7 +115,7 @@ class RunView(View):
             return
         self._shown = now
         report, note = (observer.report, observer.note) if observer else (None, None)
-        snapshot = self._source.snapshot(steps, report, note or self._note)
+        snapshot = self._source.snapshot(steps, report, note or self._note, self._ended())
         self.display.draw(snapshot, self._experiment)
         if not self.display.panel and now - self._told >= LINES and snapshot.reached >= 0:
             self._told = now

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 
 WINDOW = 3.0  # s over which speeds are measured
 GRAIN = 0.25  # s; least time between two measurements
+MOST_SOJOURNS = 500  # that are shown beside the states
+MOST_EVENTS = 50  # the newest, which a page gets
+MOST_TRACED = 20  # agents whose states a page gets
+SILENT = 1.0  # s without a new step after which a page shows an agent as silent; five periods where that is longer
 
 
 class StepRates:
@@ -66,12 +70,39 @@ class StepRates:
         return (min(after) - min(before)) / (now - then)
 
 
+class Presence:
+    """Which agents make no new steps, and since when."""
+
+    def __init__(self) -> None:
+        self._steps: list[int] = []
+        self._moved: list[float] = []  # when each made its newest step [s]
+        self.gone: set[int] = set()  # agents (from 0) whose process has ended, until a new one makes a step
+
+    def add(self, steps: Sequence[int], ended: Iterable[int]) -> list[str]:
+        """Take the newest step of every agent, by index, and the agents whose process has ended; what is new."""
+        now = time.monotonic()
+        if len(steps) != len(self._steps):
+            self._steps, self._moved = list(steps), [now] * len(steps)
+        back = [agent for agent, (old, new) in enumerate(zip(self._steps, steps, strict=True)) if new > old]
+        for agent in back:
+            self._steps[agent], self._moved[agent] = steps[agent], now
+        returned = sorted(self.gone.intersection(back))
+        self.gone = self.gone.difference(back).union(ended)
+        return [f"agent {agent + 1} is back" for agent in returned if agent not in self.gone]
+
+    def ages(self) -> list[float]:
+        """Seconds since each agent has made its newest step."""
+        now = time.monotonic()
+        return [now - moved for moved in self._moved]
+
+
 class SojournFinder:
     """Finds the sojourn of a step of a run."""
 
     def __init__(self, experiment: ValidExperiment) -> None:
         self._rest: Iterator[Sojourn] = sojourns(experiment, first_graph(experiment))
         self._now = next(self._rest, None)
+        self._before: deque[Sojourn] = deque(maxlen=MOST_SOJOURNS)
 
     def at(self, step: int) -> Sojourn | None:
         """The sojourn of the step k -> k+1; steps must not decrease from call to call."""
@@ -79,8 +110,22 @@ class SojournFinder:
             following = next(self._rest, None)
             if following is None:  # the end of the run
                 break
+            self._before.append(self._now)
             self._now = following
         return self._now
+
+    def since(self, step: int) -> list[Sojourn]:
+        """The sojourns from that of a step to the present one, the last ``MOST_SOJOURNS`` of them."""
+        known = [*self._before, *([self._now] if self._now else [])]
+        return [sojourn for sojourn in known if sojourn.last_step >= step]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened in a run."""
+
+    step: int  # which all agents had reached
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +140,10 @@ class Snapshot:
     left: float | None = None  # s until the end at this ``rate``; None where not known
     report: LiveReport | None = None  # the errors up to now
     note: str | None = None  # about the errors
+    ages: list[float] = field(default_factory=list)  # s since each agent has made its newest step
+    gone: frozenset[int] = frozenset()  # agents (from 0) without a process, or with one that has made no step yet
+    path: list[Sojourn] = field(default_factory=list)  # sojourns from the oldest of ``report.recent`` on
+    events: tuple[Event, ...] = ()  # the newest ``MOST_EVENTS``
 
     @property
     def reached(self) -> int:
@@ -107,17 +156,45 @@ class SnapshotSource:
 
     def __init__(self, experiment: ValidExperiment) -> None:
         self._steps = experiment.steps
-        self._sojourns, self._rates = SojournFinder(experiment), StepRates()
+        self._sojourns, self._rates, self._presence = SojournFinder(experiment), StepRates(), Presence()
+        self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
+        self._refused: dict[str, int] = {}
+        self._reached = -1
 
-    def snapshot(self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None) -> Snapshot:
-        """The snapshot now, from the newest step of every agent (-1: none; empty before the start)."""
+    def happened(self, text: str) -> None:
+        """Something happened, now."""
+        self._events.append(Event(self._reached, text))
+
+    def snapshot(
+        self,
+        steps: Sequence[int],
+        report: LiveReport | None = None,
+        note: str | None = None,
+        ended: Iterable[int] = (),
+    ) -> Snapshot:
+        """The snapshot now, from the newest step of every agent (-1: none; empty before the start).
+
+        ``ended``: agents (from 0) whose process has ended before its last step.
+        """
         now = Snapshot(list(steps), report=report, note=note or (report.note if report else None))
+        self._reached = max(self._reached, now.reached)
+        for text in self._presence.add(steps, ended):
+            self.happened(text)
+        for reason, count in (report.refused if report else {}).items():
+            if reason not in self._refused:
+                self.happened(f"messages are refused: {reason} ({count} so far)")
+            self._refused[reason] = count
+        now = replace(
+            now, ages=self._presence.ages(), gone=frozenset(self._presence.gone), events=tuple(self._events)
+        )
         if now.reached < 0:
             return now
         self._rates.add(steps)
         now = replace(now, rates=self._rates.rates(), rate=self._rates.rate())
         left = (self._steps - now.reached) / now.rate if now.rate else None
-        return replace(now, left=left, sojourn=self._sojourns.at(min(now.reached, self._steps - 1)))
+        now = replace(now, left=left, sojourn=self._sojourns.at(min(now.reached, self._steps - 1)))
+        recent = report.recent if report else None
+        return now if recent is None else replace(now, path=self._sojourns.since(int(recent.steps[0])))
 
 
 def run_description(experiment: ValidExperiment) -> dict[str, Any]:
@@ -132,6 +209,9 @@ def run_description(experiment: ValidExperiment) -> dict[str, Any]:
         "steps": experiment.steps,
         "dt": experiment.step_length,
         "pace": experiment.run.pace,
+        "silent": max(SILENT, 5 * experiment.step_length / experiment.run.speed)
+        if experiment.run.pace == "realtime"
+        else SILENT,
         "leaders": list(experiment.leaders.agents) if experiment.leaders else [],
         "reference": experiment.reference if experiment.leaders else None,
         "graphs": [
@@ -149,7 +229,7 @@ def run_description(experiment: ValidExperiment) -> dict[str, Any]:
 def snapshot_document(snapshot: Snapshot) -> dict[str, Any]:
     """A snapshot for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1."""
     report, sojourn = snapshot.report, snapshot.sojourn
-    latest = report.latest if report else None
+    recent = report.recent if report else None
     return {
         "steps": snapshot.steps if len(snapshot.steps) > 1 else [],
         "reached": snapshot.reached,
@@ -159,7 +239,18 @@ def snapshot_document(snapshot: Snapshot) -> dict[str, Any]:
         "sojourn": None if sojourn is None else [sojourn.sequence + 1, sojourn.first_step, sojourn.last_step],
         "system": report.system.to_json() if report else None,
         "nodes": [node.to_json() for node in report.nodes] if report else None,
-        "values": None if latest is None else latest[2].tolist(),
-        "values_step": None if latest is None else latest[0],
+        "values": None if recent is None else recent.states[-1].tolist(),
+        "values_step": None if recent is None else int(recent.steps[-1]),
+        "trace": None
+        if recent is None
+        else {
+            "steps": recent.steps.tolist(),
+            "agents": [[float(f"{x:.4g}") for x in column] for column in recent.states.T[:MOST_TRACED].tolist()],
+            "sojourns": [[each.mode, each.first_step, each.last_step] for each in snapshot.path],
+        },
+        "lateness": report.lateness if report else None,
+        "ages": [round(age, 2) for age in snapshot.ages] if len(snapshot.ages) > 1 else [],
+        "gone": sorted(snapshot.gone),
+        "events": [[event.step, event.text] for event in snapshot.events],
         "note": snapshot.note,
     }

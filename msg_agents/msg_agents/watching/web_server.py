@@ -32,6 +32,7 @@ from collections import deque
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -47,9 +48,11 @@ SEND_TIMEOUT = 10.0  # s for a browser to take what it is sent
 ALIVE = 5.0  # s after which a comment is sent if there is nothing new, to detect lost browsers
 HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^:@/\[\]]+)(?::\d+)?")  # of a Host header: name, port
 FAREWELL = 1.5  # s for telling the browsers of the end
+REPORT_TIME = 5.0  # s for them to fetch the report after that
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "connect-src 'self'; img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",  # images and fonts are those of the report
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
@@ -70,6 +73,8 @@ class WebServer:
         self._ending: dict[str, Any] | None = None
         self._history: deque[list[float | None]] = deque(maxlen=HISTORY)
         self._browsers: dict[_Handler, None] = {}  # in the order in which they came
+        self._report: bytes | None = None
+        self._fetching = 0  # browsers that have been told of it and have not fetched it
         try:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
             self._server = _Server(self, host, port, family)
@@ -110,18 +115,39 @@ class WebServer:
                 self._history.append(finite([moment["values_step"], *(system[key] for key in keys)]))
             self._tell()
 
-    def end(self, words: dict[str, Any]) -> None:
-        """Show that the run is over (first call only): ``words`` are "text", and "verdict" or None."""
+    def end(self, words: dict[str, Any], report: Path | None = None) -> None:
+        """Show that the run is over (first call only): ``words`` are "text", and "verdict" or None.
+
+        Browsers keep the report, so that it can be opened there when nothing is served any more.
+        """
+        content = None
+        with contextlib.suppress(OSError):
+            content = report.read_bytes() if report is not None else None
         with self._changed:
-            self._ending = self._ending or finite(words)
+            if self._ending is None:
+                self._report = content
+                self._ending = finite({**words, "report": str(report) if content is not None else None})
             self._tell()
 
+    def report(self) -> bytes | None:
+        """The report for a browser; None: there is none."""
+        return self._report
+
+    def report_fetched(self) -> None:
+        """A browser has fetched the report, or will not."""
+        with self._changed:
+            self._fetching -= 1
+            self._changed.notify_all()
+
     def close(self) -> None:
-        """Tell the browsers that the run is over, for ``FAREWELL`` s at most, and stop serving."""
+        """Tell the browsers that the run is over, give them the report, and stop serving; a few seconds at most."""
         self.end({"text": "The run has ended.", "verdict": None})
         deadline = time.monotonic() + FAREWELL
         with self._changed:
             while self._browsers and (left := deadline - time.monotonic()) > 0:
+                self._changed.wait(left)
+            deadline = time.monotonic() + REPORT_TIME
+            while self._fetching > 0 and (left := deadline - time.monotonic()) > 0:
                 self._changed.wait(left)
         self._server.shutdown()
         self._server.server_close()
@@ -148,7 +174,11 @@ class WebServer:
                     self._changed.wait_for(lambda: self._number != number, ALIVE)  # noqa: B023  called here and now
                     number = self._number
                     events = self._events(told)
-                if not handler.send_events(events) or "end" in told:
+                sent = handler.send_events(events)
+                if sent and "end" in told and self._report is not None:
+                    with self._changed:
+                        self._fetching += 1
+                if not sent or "end" in told:
                     return
         finally:
             with self._changed:
@@ -253,10 +283,15 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, self.server.page, "text/html; charset=utf-8")
         elif path == "/events":
             self.server.web.follow(self)
+        elif path == "/report" and (report := self.server.web.report()) is not None:
+            try:
+                self._send(HTTPStatus.OK, report, "text/html; charset=utf-8")
+            finally:
+                self.server.web.report_fetched()
         elif path == "/favicon.ico":
             self._send(HTTPStatus.NO_CONTENT, b"", "image/x-icon")
         else:
-            self.refuse(HTTPStatus.NOT_FOUND, "not found: only / and /events are served")
+            self.refuse(HTTPStatus.NOT_FOUND, "not found: only /, /events and, at the end, /report are served")
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:  # noqa: ARG002
         """Answer a request that is none, or of another method."""

@@ -125,7 +125,21 @@ def test_the_observer_has_the_numbers_of_the_comparison(tmp_path: Path) -> None:
     )
     for node, other in zip(observer.report.nodes, wanted.node_errors, strict=True):
         assert (node.measured, node.z) == pytest.approx((other.measured, other.z), rel=1e-6)
-    assert observer.report.latest is not None
-    step, mode, values = observer.report.latest
-    assert (step, mode) == (399, trajectory.modes[399])
-    assert np.array_equal(values, trajectory.states[399, :, 0])
+    recent = observer.report.recent
+    assert recent is not None
+    steps = range(400 - len(recent.steps), 400)
+    assert len(steps) > 100
+    assert (recent.steps.tolist(), recent.modes.tolist()) == ([*steps], trajectory.modes[steps].tolist())
+    assert np.array_equal(recent.states, trajectory.states[steps, :, 0])
+
+
+def test_stamps(tmp_path: Path) -> None:
+    """Of the steps that the slots hold; the others have none."""
+    trajectory = simulate(_experiment())
+    writers = Writers(trajectory, tmp_path)
+    writers.write(50)
+    reader = CheckpointReader(trajectory.record, tmp_path)
+    assert reader.ready()
+    steps = np.array([0, 7, 50, 51])
+    wanted = [[0] * 3, [350_000_000] * 3, [2_500_000_000] * 3, [-1] * 3]  # dt = 0.05, in ns
+    assert reader.stamps(steps).tolist() == wanted

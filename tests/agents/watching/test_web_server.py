@@ -7,6 +7,7 @@ import http.client
 import json
 import re
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -116,7 +117,29 @@ def test_events(web: WebServer) -> None:
         found = []
         while event := events.next():
             found.append(event)
-        assert found[-1] == ("end", {"text": "over", "verdict": "agrees"})
+        assert found[-1] == ("end", {"text": "over", "verdict": "agrees", "report": None})
+
+
+def test_the_report_is_there_until_the_browsers_have_it(tmp_path: Path) -> None:
+    """They fetch it when they are told of the end; the server waits for them."""
+    report = tmp_path / "report.html"
+    report.write_text("<p>all is well</p>")
+    with WebServer("127.0.0.1", 0) as served:
+        assert _get(served, "/report").status == 404
+        browser = Events(served)
+        served.begin({"name": "net"})
+        assert browser.next() is not None
+        served.end({"text": "over", "verdict": "agrees"}, report)
+        closing = threading.Thread(target=served.close)
+        closing.start()
+        while (event := browser.next()) is not None and event[0] != "end":
+            pass
+        assert event == ("end", {"text": "over", "verdict": "agrees", "report": str(report)})
+        assert browser.next() is None
+        assert closing.is_alive()
+        answer = _get(served, "/report")
+        assert (answer.status, answer.read()) == (200, b"<p>all is well</p>")
+        closing.join()
 
 
 def test_who_is_slow_or_goes_holds_nobody_up(web: WebServer) -> None:

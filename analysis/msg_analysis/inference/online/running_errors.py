@@ -22,6 +22,7 @@ that is not stationary lasts, the expectation is stepped along: O(n m^3). Incomp
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,6 +31,7 @@ from msg_analysis.common.large_arrays import BLOCK_NUMBERS
 from msg_analysis.inference.errors.estimates import Estimate, beside
 from msg_analysis.inference.errors.time_means import Value, forms_of, packed_moments, values_of
 from msg_analysis.inference.observed.observation import bounded
+from msg_analysis.inference.online.recent_steps import Lateness, Recent, RecentSteps
 from msg_analysis.inference.online.step_collector import StepCollector
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict
@@ -52,8 +54,8 @@ class LiveReport:
     nodes: list[Estimate]
     note: str | None  # why there is no prediction, or no standard error; None where there are both
     refused: dict[str, int] = field(default_factory=dict)  # states or steps that do not count, by reason
-    # Newest whole step: number, graph from 0 (in real time: 0), first replica (m,)
-    latest: tuple[int, int, FloatArray] | None = None
+    recent: Recent | None = None  # the newest whole steps
+    lateness: list[float | None] | None = None  # of each agent in real time, see ``Lateness.medians``
 
     @property
     def missing(self) -> int:
@@ -77,7 +79,8 @@ class LiveEstimate:
         reason = experiment.protocol.unpredictable() if experiment.protocol else None
         prediction = None if reason else predict(experiment, record.step_model)
         self._errors = RunningErrors(record, prediction, nodes=nodes)
-        self._latest: tuple[int, int, FloatArray] | None = None
+        self._recent = RecentSteps()
+        self._lateness = None if lockstep else Lateness(experiment)
         self._newest = -1
         self._note = reason
         if prediction is not None and not lockstep:
@@ -94,10 +97,14 @@ class LiveEstimate:
         if not len(steps):
             return
         self._errors.add(steps, modes, states, after)
-        newest = int(np.argmax(steps))
-        self._newest = max(self._newest, int(steps[newest]))
-        if self._latest is None or steps[newest] > self._latest[0]:
-            self._latest = int(steps[newest]), int(modes[newest]), states[newest, :, 0].copy()
+        self._newest = max(self._newest, int(steps.max()))
+        self._recent.add(steps, modes, states)
+
+    def add_stamps(self, agent: int, steps: Iterable[int], stamps: Iterable[int]) -> None:
+        """In real time: the stamps [ns] of states of an agent (from 0), by which it is said how late it is."""
+        if self._lateness is not None:
+            for step, stamp in zip(steps, stamps, strict=True):
+                self._lateness.add(agent, step, stamp)
 
     def report(self) -> LiveReport:
         """The numbers so far."""
@@ -113,7 +120,8 @@ class LiveEstimate:
             nodes=nodes,
             note=self._note,
             refused={reason: count for reason, count in sorted(self.steps.refused.items()) if count},
-            latest=self._latest,
+            recent=self._recent.newest(),
+            lateness=self._lateness.medians() if self._lateness else None,
         )
 
 

@@ -32,6 +32,7 @@ from msg_analysis.inference.online.running_errors import LiveEstimate, LiveRepor
 from msg_analysis.model.arithmetic.step_clock import SECOND, StepClock
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.wire import topics
+from msg_analysis.wire.messages import stamp_ns
 
 ESTIMATE_PERIOD = 1.0  # s between two estimates
 MOST_SILENT = 5  # estimates without any state, after which a run that has ended or has no publishers is over
@@ -44,6 +45,7 @@ class Watched:
     record: RunRecord
     report: LiveReport
     finished: bool  # followed to its last step
+    steps: list[int]  # newest step of each agent that has arrived, by index; -1: none
 
 
 class Live(Watcher):
@@ -65,6 +67,7 @@ class Live(Watcher):
         self._qos = topics.STREAM if reliable else topics.PASSIVE
         self._on_report = on_report
         self._estimate: LiveEstimate | None = None
+        self._reached: list[int] = []  # see ``Watched.steps``
         self._before = (-1, time.monotonic())  # newest step of the last estimate, and its time
         self._silent = 0  # estimates in a row without a newer state
 
@@ -74,6 +77,8 @@ class Live(Watcher):
         record, experiment = self.record, self.record.experiment
         # Before the prediction, which takes some time: states that arrive meanwhile wait in the middleware.
         self._subscribe_to_states(topics.TRUTH if experiment.truth else topics.STATE, self._qos, whole=True)
+        self._reached = [-1] * experiment.agents
+        self._realtime = experiment.run.pace == "realtime"
         self._clock_of_steps = StepClock(experiment.step_length)
         self._estimate = LiveEstimate(record)
         every(self, ESTIMATE_PERIOD, self._report)
@@ -86,11 +91,14 @@ class Live(Watcher):
         for reason, count in self._refused.items():
             report.refused[reason] = report.refused.get(reason, 0) + count
         last = self.record.experiment.steps
-        return Watched(self.record, report, self._estimate.steps.newest >= last)
+        return Watched(self.record, report, self._estimate.steps.newest >= last, list(self._reached))
 
-    def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:  # noqa: ARG002  see Watcher
+    def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:
         if self._estimate is not None:
             self._estimate.add(agent, step, mode, state)
+            self._reached[agent] = max(self._reached[agent], step)
+            if self._realtime:
+                self._estimate.add_stamps(agent, (step,), (stamp_ns(message),))
 
     def _report(self) -> None:
         assert self._estimate is not None
