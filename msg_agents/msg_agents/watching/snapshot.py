@@ -184,9 +184,7 @@ class SnapshotSource:
             if reason not in self._refused:
                 self.happened(f"messages are refused: {reason} ({count} so far)")
             self._refused[reason] = count
-        now = replace(
-            now, ages=self._presence.ages(), gone=frozenset(self._presence.gone), events=tuple(self._events)
-        )
+        now = replace(now, ages=self._presence.ages(), gone=frozenset(self._presence.gone), events=tuple(self._events))
         if now.reached < 0:
             return now
         self._rates.add(steps)
