@@ -18,7 +18,6 @@ BIN := $(VENV)/bin
 BUILT := $(VENV)/built
 INTERFACES := ros_ws/src/msg_agents_interfaces
 EXAMPLES := ros_ws/src/msg_agents_example_protocols
-EXPERIMENTS := ros_ws/src/msg_agents_bringup/experiments
 RUNS := runs
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 LOCAL := --no-index --no-deps --no-build-isolation
@@ -58,7 +57,7 @@ $(VENV)/.compiled: $(VENV)/.locked
 	@touch $@
 
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
-	$(BIN)/msg-agents run $(EXPERIMENTS)/line_ring.yaml --out $(RUNS)
+	$(BIN)/msg-agents run line_ring --out $(RUNS)
 
 # Networks wait a good part of their time, for discovery for example: more at once than cores, each in a domain of its
 # own. Each worker gets neighbours in the list, so that most fixtures of a module are made once.

@@ -44,6 +44,7 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
+            "examples/experiments/*.yaml",
             "model/arithmetic/_kernel.pyi",
             "report/html/templates/*",
             "wire/definitions/*/msg/*.msg",

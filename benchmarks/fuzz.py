@@ -37,7 +37,7 @@ from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.report.documents.info import describe_bag, describe_experiment
 
 ROOT = Path(__file__).parents[1]
-EXPERIMENTS = [ROOT / "ros_ws/src/msg_agents_bringup/experiments", ROOT / "tests/data/golden"]
+EXPERIMENTS = [ROOT / "analysis/msg_analysis/examples/experiments", ROOT / "tests/data/golden"]
 MEMORY = 2 * 10**8  # bytes that an experiment is told that there are
 ADDRESS_SPACE = 2 * 10**9  # bytes that a process gets
 SECONDS = 60  # of CPU time

@@ -26,7 +26,7 @@ import bare_loop
 from msg_agents.running.runner import run_network
 from msg_analysis.model.experiment.experiment import ValidExperiment
 
-EXPERIMENT = Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml"
+EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
 LARGE, PROCESSES = 100, 4  # agents, and the processes that they share
 RATIOS = {
     "network / bare loop": ("network", "bare loop"),

@@ -1,6 +1,6 @@
 """The picture of the README: what one recorded run looks like, from its bag.
 
-.venv/bin/msg-agents run ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml
+.venv/bin/msg-agents run analysis/msg_analysis/examples/experiments/line_ring.yaml
 .venv/bin/python benchmarks/picture.py runs/line_ring_... docs/images/run.svg
 """
 

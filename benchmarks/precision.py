@@ -19,7 +19,7 @@ from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
 
-EXPERIMENT = Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml"
+EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
 REPLICAS = (16, 64, 256)
 TARGET = 0.01
 PILOT = 4000.0  # simulated time units of the twin

@@ -26,7 +26,7 @@ from typing import TypeVar
 
 import numpy as np
 
-EXPERIMENT = Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml"
+EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
 TOPICS = [f"/agent_{i}/state" for i in range(1, 6)]
 Result = TypeVar("Result")
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from msg_agents.discovery.ros_domain import free_domain
 
 PROGRAM = str(Path(sys.executable).with_name("msg-agents"))
-EXPERIMENT = str(Path(__file__).parents[1] / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml")
+EXPERIMENT = str(Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml")
 BEFORE = 3000  # steps made before the stop
 
 

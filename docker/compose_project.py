@@ -39,7 +39,7 @@ class Project:
     @contextlib.contextmanager
     def up(self, experiment: str) -> Iterator[None]:
         """All services on their way up; at the end they are removed with their network and volume."""
-        environment = self.engine.environment | {"EXPERIMENT": f"/opt/msg_agents/experiments/{experiment}.yaml"}
+        environment = self.engine.environment | {"EXPERIMENT": experiment}
         self.seen_healthy.clear()
         process = subprocess.Popen(
             [*self._command, "up", "--no-build"], env=environment, stdout=sys.stderr, start_new_session=True

@@ -77,7 +77,7 @@ def fault(project: Project, findings: Findings, command: str, service: str, want
 
 def single_containers(found: Engine, findings: Findings) -> None:
     """A run in one container, in different surroundings."""
-    command = ["run", "/opt/msg_agents/experiments/line_ring.yaml", "--out", "/runs", "--duration", "100", "--json"]
+    command = ["run", "line_ring", "--out", "/runs", "--duration", "100", "--json"]
     for name, options in SINGLE.items():
         words = ("run", "--rm", "--init", "--tmpfs", "/runs:mode=1777", *options, IMAGE, *command)
         result = json.loads(found(*words, check=False) or "{}")

@@ -22,6 +22,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "types",
         "common",
         "common/text",
+        "examples",
         "model/network",
         "model/arithmetic",
         "protocol",
@@ -76,6 +77,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "nodes/replay",
         "nodes/qos",
         "cli",
+        "cli/servers",
         "__main__",
     ],
 }

@@ -32,6 +32,7 @@ from msg_analysis.bags.reader import read_bag as read_trajectory
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.common.files import require_place
 from msg_analysis.errors import BagError, InputError, NotAvailableError
+from msg_analysis.examples.bundled import find
 from msg_analysis.inference.verdict.compare import compare as compare_trajectory
 from msg_analysis.inference.verdict.comparison import Comparison
 from msg_analysis.inference.verdict.pool import compare_pooled
@@ -71,6 +72,25 @@ class Experiment(model.ValidExperiment):
     """
 
     __slots__ = ()
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read an experiment file (YAML, of which JSON is a part), or an example that is installed with this package.
+
+        Parameters
+        ----------
+        path
+            of the file, or the name of an example, such as ``line_ring``; a file of that name in the current
+            directory, with or without ``.yaml``, wins. Paths in a file are relative to its directory
+
+        Raises
+        ------
+        InputError
+            there is neither a file nor an example, the file cannot be read, or it is not YAML
+        ExperimentError
+            the experiment is not valid; names every mistake
+        """
+        return super().load(find(path))
 
     @classmethod
     def of(cls, experiment: model.ValidExperiment) -> Self:

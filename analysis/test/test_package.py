@@ -22,7 +22,10 @@ import subprocess
 from importlib import resources
 from pathlib import Path
 
+import pytest
+
 import msg_analysis
+from msg_analysis.examples import bundled
 
 EXPERIMENT = """
 name: pair
@@ -49,3 +52,12 @@ def test_executable(tmp_path: Path) -> None:
 def test_data_files() -> None:
     assert (resources.files(msg_analysis) / "wire/definitions/std_msgs/msg/Header.msg").is_file()
     assert (resources.files(msg_analysis) / "report/html/templates").is_dir()
+
+
+def test_examples() -> None:
+    assert "line_ring" in bundled.names()
+
+
+@pytest.mark.parametrize("name", bundled.names())
+def test_example(name: str) -> None:
+    msg_analysis.Experiment.load(name).require_available()

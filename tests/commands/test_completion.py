@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from programs import COMMANDS, PROGRAMS, command_of
 
 from msg_analysis.api import Experiment
+from msg_analysis.examples.bundled import names
 
 BIN = Path(sys.executable).parent
 PAIR = {
@@ -56,8 +57,9 @@ def complete(line: str, shell: str = "bash") -> list[str]:
     [
         ("msg-analysis p", ["predict"]),
         ("msg-agents re", ["recorder"]),
-        ("msg-analysis predict ", ["empty/", "line.yaml", "result.json", "ring.yml", "run.json", "runs/"]),
-        ("msg-analysis predict l", ["line.yaml"]),
+        ("msg-analysis predict ", ["empty/", "line.yaml", "result.json", "ring.yml", "run.json", "runs/", *names()]),
+        ("msg-analysis predict li", ["line.yaml", "line_ring", "line_ring_realtime"]),
+        ("msg-analysis predict line.", ["line.yaml"]),
         ("msg-analysis predict .h", [".hidden.yaml"]),
         ("msg-analysis compare ", ["empty/", "runs/"]),
         ("msg-analysis compare ru", ["runs/", "runs/lab_1", "runs/lab_2"]),

@@ -23,7 +23,7 @@ from msg_analysis.api import Experiment
 
 ROOT = Path(__file__).parents[2]
 LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"
-NETWORK = {"run", "doctor", "play", "live", "markers", "agent", "switcher", "recorder"}
+NETWORK = {"run", "demo", "doctor", "play", "live", "markers", "agent", "switcher", "recorder"}
 OVERVIEWS = [(program, option) for program in ("msg-analysis", "msg-agents") for option in ("--help", "--version")]
 NEW = "NEW"  # a name that is not there yet
 WORDS = {  # what each of the others is given
@@ -39,6 +39,8 @@ WORDS = {  # what each of the others is given
     ("msg-analysis", "facts"): ["EXPERIMENT"],
     ("msg-analysis", "schema"): [],
     ("msg-analysis", "sweep"): ["SWEEP", "--workers", "1", "--out", NEW],
+    ("msg-agents", "examples"): [],
+    ("msg-agents", "new"): [NEW, "--agents", "4"],
     ("msg-agents", "check"): ["BAG"],
     ("msg-agents", "prepare"): ["EXPERIMENT"],
     ("msg-agents", "host"): ["RECORD", "HOSTS", "--profile"],

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from pages import EXPERIMENTS, PAGES, ROOT, Shown, blocks, console, experiments, missing, typed
 
 from msg_agents.cli.main import main as agents
+from msg_analysis.api import Experiment
 from msg_analysis.cli.main import main as analysis
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
@@ -95,8 +96,6 @@ def test_files_and_targets_exist(page: Path) -> None:
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A directory with all example experiments, in a wide terminal without colours."""
     shutil.copytree(EXPERIMENTS, tmp_path, dirs_exist_ok=True)
-    (tmp_path / EXPERIMENTS.relative_to(ROOT)).parent.mkdir(parents=True)
-    shutil.copytree(EXPERIMENTS, tmp_path / EXPERIMENTS.relative_to(ROOT))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("NO_COLOR", "1")
@@ -112,8 +111,7 @@ def printed(command: str, exit_code: int = 0) -> str:
 
 def by_the_twin(command: str) -> str:
     """What ``msg-agents run FILE`` prints: its bag equals the twin's to the last bit, which other tests prove."""
-    file = next(word for word in shlex.split(command) if word.endswith(".yaml"))
-    return compared(json.dumps(ValidExperiment.load(file).to_document()))
+    return compared(json.dumps(Experiment.load(shlex.split(command)[2]).to_document()))
 
 
 @functools.cache

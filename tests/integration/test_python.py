@@ -18,7 +18,7 @@ from msg_analysis import Experiment
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
-LINE_RING = ROOT / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml"
+LINE_RING = ROOT / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
 
 
 def test_what_the_page_says(tmp_path: Path) -> None:

@@ -158,7 +158,7 @@ def test_what_the_launch_files_do(network: Any) -> None:
         "processes": "2",
         "namespace": "/lab",
     }
-    launched = LaunchedNetwork(arguments, ROOT / "ros_ws/src/msg_agents_bringup")
+    launched = LaunchedNetwork(arguments)
     ros = ["--ros-args", "-r", "__ns:=/lab"]
     running = {
         plan.name: start(plan.arguments[0], *plan.arguments[1:], *ros, environment=environment())

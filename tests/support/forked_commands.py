@@ -28,13 +28,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from msg_agents.cli.node_server import serve_waiting
+from msg_agents.cli.servers.node_server import serve_waiting
 from msg_agents.processes.fork_server import leave_one_waiting, serve
 from msg_analysis.common.forked_processes import ALL_FORKED, LONGEST, adopt_orphans
 
 MARK = "MSG_AGENTS_TEST"
 LENGTH_OF_MARK = 32
-NODE_SERVER = "msg_agents.cli.node_server"
+NODE_SERVER = "msg_agents.cli.servers.node_server"
 OF_NODE_SERVER = ["-m", NODE_SERVER]
 OF_NODE = ["-P", "-c"]
 PROGRAMS = {

@@ -12,7 +12,7 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-EXPERIMENTS = ROOT / "ros_ws/src/msg_agents_bringup/experiments"
+EXPERIMENTS = ROOT / "analysis/msg_analysis/examples/experiments"
 FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^\n)((?:^ {4,}\S.*\n|^\n(?= {4}))+)", re.MULTILINE)
 STAMP = re.compile(r"_\d{8}_\d{6}")  # of the directory of a run

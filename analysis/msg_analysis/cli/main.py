@@ -51,9 +51,7 @@ def main() -> None:
     """Theory, simulation and statistics of Markov-switching networks of agents."""
 
 
-@main.command(
-    epilog=examples("msg-analysis predict line_ring.yaml", "msg-analysis predict line_ring.yaml --json | jq .emulated")
-)
+@main.command(epilog=examples("msg-analysis predict line_ring", "msg-analysis predict line_ring --json | jq .emulated"))
 @experiment_argument
 @json_option
 def predict(experiment: Path, as_json: bool) -> None:
@@ -70,9 +68,7 @@ def predict(experiment: Path, as_json: bool) -> None:
 
 
 @main.command(
-    epilog=examples(
-        "msg-analysis simulate line_ring.yaml", "msg-analysis simulate line_ring.yaml --seed 8 --out twin_8"
-    )
+    epilog=examples("msg-analysis simulate line_ring", "msg-analysis simulate line_ring --seed 8 --out twin_8")
 )
 @experiment_argument
 @click.option("--out", type=PATH, metavar="BAG", show_default="<name>_twin", help="Bag to write; must not exist.")
@@ -115,8 +111,8 @@ def simulate(
 
 @main.command(
     epilog=examples(
-        "msg-analysis leaders line_ring.yaml --count 2",
-        "msg-analysis leaders line_ring.yaml --count 2 --gain 0.5 --json",
+        "msg-analysis leaders line_ring --count 2",
+        "msg-analysis leaders line_ring --count 2 --gain 0.5 --json",
     )
 )
 @experiment_argument
@@ -233,7 +229,7 @@ def figures(
         print_json({"files": written})
 
 
-@main.command(epilog=examples("msg-analysis info line_ring.yaml", "msg-analysis info line_ring_twin --json"))
+@main.command(epilog=examples("msg-analysis info line_ring", "msg-analysis info runs/line_ring_20250101_120000 --json"))
 @click.argument("source", metavar="EXPERIMENT|BAG", type=SOURCE)
 @json_option
 def info(source: Path, as_json: bool) -> None:

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -74,16 +75,37 @@ def _paths(incomplete: str, wanted: Callable[[Path], bool]) -> list[str]:
     return found + _paths(found[0], wanted) if len(found) == 1 and found[0].endswith("/") else found
 
 
-YAML = InputPath(".yaml", ".yml", ".json")  # experiments, sweeps, hosts
+class ExperimentPath(InputPath):
+    """An experiment file, or the name of an example; where there is a directory of that name, it is given as it is."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path of the file, by the rule of ``bundled.find``; see click.ParamType."""
+        from msg_analysis.examples.bundled import find
+
+        word = os.fsdecode(super().convert(os.fspath(value), param, ctx))
+        return Path(word) if Path(word).is_dir() and self._is_wanted(Path(word)) else find(word)
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        """Complete to files, then to names of examples; see click.ParamType."""
+        from msg_analysis.examples.bundled import names
+
+        files = super().shell_complete(ctx, param, incomplete)
+        if any(item.type == "file" for item in files):
+            return files
+        return files + [CompletionItem(name) for name in names() if name.startswith(incomplete)]
+
+
+YAML = InputPath(".yaml", ".yml", ".json")  # sweeps, hosts
+EXPERIMENT = ExperimentPath(".yaml", ".yml", ".json")
 BAG = InputPath(*BAG_SUFFIXES, holds=("metadata.yaml", "*.mcap", "*.db3"))
-SOURCE = InputPath(".yaml", ".yml", ".json", *BAG_SUFFIXES, holds=("metadata.yaml", "*.mcap", "*.db3"))
+SOURCE = ExperimentPath(".yaml", ".yml", ".json", *BAG_SUFFIXES, holds=("metadata.yaml", "*.mcap", "*.db3"))
 RESULT = InputPath(".json", holds=(RESULT_FILE,))
 RUN_RECORD = InputPath(".json")
 PATH = click.Path(path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-experiment_argument = click.argument("experiment", type=YAML)
+experiment_argument = click.argument("experiment", type=EXPERIMENT)
 seed_option = click.option("--seed", type=int, metavar="N", help="Overrides run.seed.")
 duration_option = click.option(
     "--duration", type=float, metavar="T", help="Overrides run.duration, in units of simulated time."

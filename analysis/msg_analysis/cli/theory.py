@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 @click.command(
     epilog=examples(
-        "msg-analysis transient line_ring.yaml --times 0:10:0.5",
-        "msg-analysis transient line_ring.yaml --times 0,1,10 --law continuous",
+        "msg-analysis transient line_ring --times 0:10:0.5",
+        "msg-analysis transient line_ring --times 0,1,10 --law continuous",
     )
 )
 @experiment_argument
@@ -114,9 +114,7 @@ def _parse_times(text: str) -> FloatArray:
     return np.asarray(start + step * np.arange(count), dtype=float)
 
 
-@click.command(
-    epilog=examples("msg-analysis facts line_ring.yaml", "msg-analysis facts line_ring.yaml --json | jq .bounds")
-)
+@click.command(epilog=examples("msg-analysis facts line_ring", "msg-analysis facts line_ring --json | jq .bounds"))
 @experiment_argument
 @json_option
 def facts(experiment: Path, as_json: bool) -> None:

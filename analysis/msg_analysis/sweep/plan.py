@@ -29,6 +29,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from msg_analysis.examples.bundled import find
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show, translate
 from msg_analysis.model.experiment.yaml_document import read_yaml
@@ -90,8 +91,9 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
     directory = path.parent
     base: Any = spec.experiment
     if isinstance(base, str):
-        directory = (directory / base).parent
-        base = read_yaml(path.parent / base)
+        file = find(base, directory)
+        directory = file.parent
+        base = read_yaml(file)
         if not isinstance(base, Mapping):
             raise ExperimentError(
                 str(path), [problem("experiment", show(base), "expected a file of keys", "correct it")]

@@ -94,7 +94,7 @@ _RangeSchema = dict[Literal["values", "from", "to", "count", "step", "spacing"],
 def _experiment(value: object) -> str | dict[str, Any]:
     if (isinstance(value, str) and value) or (isinstance(value, dict) and value):
         return value
-    raise expected("the name of a file, or the keys of an experiment")
+    raise expected("the name of a file or an example, or the keys of an experiment")
 
 
 class SweepSpec(BaseModel):
@@ -105,7 +105,8 @@ class SweepSpec(BaseModel):
     experiment: Annotated[
         str | dict[str, Any], PlainValidator(_experiment, json_schema_input_type=str | dict[str, Any])
     ] = Field(
-        description="an experiment file, relative to this file, or the experiment itself", examples=["line_ring.yaml"]
+        description="an experiment file, relative to this file, the name of an example, or the experiment itself",
+        examples=["line_ring"],
     )
     kind: JobKind = Field(
         "predict",

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 import click
 
 import msg_agents
-from msg_agents.cli import nodes, replay
+from msg_agents.cli import begin, nodes, replay
 from msg_agents.cli.doctor import doctor
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.web_options import WebCommand, announce, page, web_options
@@ -86,9 +86,9 @@ def _interruption() -> Interruption:
 @main.command(
     cls=WebCommand,
     epilog=examples(
-        "msg-agents run line_ring.yaml",
-        "msg-agents run line_ring.yaml --web",
-        "msg-agents run line_ring.yaml --seed 3 --duration 100 --out runs --json",
+        "msg-agents run line_ring",
+        "msg-agents run line_ring --web",
+        "msg-agents run line_ring --seed 3 --duration 100 --out runs --json",
     ),
 )
 @experiment_argument
@@ -245,7 +245,7 @@ def _newest_bag(directory: Path) -> Path:
     return bags[-1].parent
 
 
-@main.command(epilog=examples("msg-agents prepare line_ring.yaml > run.json"))
+@main.command(epilog=examples("msg-agents prepare line_ring > run.json"))
 @experiment_argument
 def prepare(experiment: Path) -> None:
     """Print the run record of a new run of EXPERIMENT: the file with which single nodes are started."""
@@ -259,7 +259,7 @@ def prepare(experiment: Path) -> None:
 
 @main.command(
     epilog=examples(
-        "msg-agents prepare line_ring.yaml > run.json   # once; copy it to all hosts",
+        "msg-agents prepare line_ring > run.json   # once; copy it to all hosts",
         "msg-agents host run.json hosts.yaml            # on every host",
     )
 )
@@ -363,6 +363,9 @@ def host(
 
 
 for _command in (
+    begin.demo_of(run),
+    begin.examples,
+    begin.new,
     doctor,
     nodes.agent,
     nodes.switcher,

@@ -47,7 +47,7 @@ from msg_analysis.common.forked_processes import (
     start_server,
 )
 
-PROGRAM = [sys.executable, "-m", "msg_agents.cli.node_server"]  # calls ``serve``
+PROGRAM = [sys.executable, "-m", "msg_agents.cli.servers.node_server"]  # calls ``serve``
 EARLY = "--early"  # argument of a server that is there before its run
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
 ADOPTION = 1e-4  # s between two looks whether a forked process has its new parent

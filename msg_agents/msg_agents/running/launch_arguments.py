@@ -26,12 +26,13 @@ from msg_agents.replay.bag_clock import parse_rate
 from msg_agents.running.experiment_overrides import load_with_overrides
 from msg_analysis.bags.format.storage_options import MEGABYTE, SMALLEST_SPLIT, Storage
 from msg_analysis.errors import InputError
+from msg_analysis.examples.bundled import find
 from msg_analysis.model.experiment.experiment import ValidExperiment
 
 TRUE, FALSE = {"true", "1", "yes", "on"}, {"false", "0", "no", "off"}
 SHUTDOWN = ("false", "Whether the end of these processes ends the whole launch, with all that else it has started.")
 NETWORK_ARGUMENTS = {
-    "experiment": ("line_ring", "Experiment file, or the name of one of msg_agents_bringup."),
+    "experiment": ("line_ring", "Experiment file, or the name of an example."),
     "out": ("runs", "Directory in which the bag's directory <name>_<time> is created."),
     "record": ("true", "Whether to record; otherwise there is no bag and no verdict."),
     "analyse": (
@@ -106,23 +107,7 @@ def number(arguments: Mapping[str, str], name: str, *, least: float = 0.0) -> fl
     return value
 
 
-def find_experiment(name: str, share: Path) -> Path:
-    """The experiment file: the path ``name``, or else the example of this name in ``share``.
-
-    ``share`` is the data directory of msg_agents_bringup. A path with a suffix is not checked here; else
-    InputError if there is neither file nor example.
-    """
-    path = Path(name).expanduser()
-    examples = share / "experiments"
-    if path.is_file() or path.suffix:
-        return path
-    if (example := examples / f"{name}.yaml").is_file():
-        return example
-    known = ", ".join(sorted(file.stem for file in examples.glob("*.yaml")))
-    raise InputError(f"experiment:={name}: expected a file, or one of {known}")
-
-
-def load_experiment(arguments: Mapping[str, str], share: Path) -> ValidExperiment:
+def load_experiment(arguments: Mapping[str, str]) -> ValidExperiment:
     """The experiment with the changes of the launch arguments; InputError if it is wrong or cannot be run."""
     changes: dict[str, Any] = {}
     for name, kind in (("seed", int), ("duration", float), ("speed", float)):
@@ -133,7 +118,10 @@ def load_experiment(arguments: Mapping[str, str], share: Path) -> ValidExperimen
                 what = "a whole number" if kind is int else "a number"
                 raise InputError(f"{name}:={text}: expected {what}") from error
     changes |= {name: arguments[name].strip() or None for name in ("pace", "processes")}
-    file = find_experiment(arguments["experiment"], share)
+    try:
+        file = find(str(Path(arguments["experiment"]).expanduser()))
+    except InputError as error:
+        raise InputError(f"experiment:={error}") from error
     experiment = load_with_overrides(file, changes, name=lambda key: f"{key}:={arguments[key].strip()}")
     experiment.require_available()
     if "speed" in changes and experiment.run.pace == "lockstep":

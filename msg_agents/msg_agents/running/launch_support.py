@@ -113,12 +113,12 @@ class LaunchedProcesses:
 class LaunchedNetwork(LaunchedProcesses):
     """A run whose processes ``launch`` starts.
 
-    Takes the arguments of the launch by the names of NETWORK_ARGUMENTS, and the data directory of msg_agents_bringup.
-    InputError: the arguments or the experiment are wrong; no bag has been made.
+    Takes the arguments of the launch by the names of NETWORK_ARGUMENTS. InputError: the arguments or the experiment are
+    wrong; no bag has been made.
     """
 
-    def __init__(self, arguments: Mapping[str, str], share: Path) -> None:
-        experiment = load_experiment(arguments, share)
+    def __init__(self, arguments: Mapping[str, str]) -> None:
+        experiment = load_experiment(arguments)
         storage = bag_storage(arguments)
         record = flag(arguments, "record")
         self._analyse = flag(arguments, "analyse") and record

@@ -18,8 +18,8 @@ pytest.importorskip("rclpy")
 import click
 
 from msg_agents.cli.main import main
-from msg_agents.cli.node_server import MODULES as NODE_MODULES
 from msg_agents.cli.ros_command import RosCommand, split_arguments
+from msg_agents.cli.servers.node_server import MODULES as NODE_MODULES
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.nodes.ros.node_parameters import describe, name_of, options_of
 from msg_analysis.model.experiment.experiment import ValidExperiment

@@ -15,7 +15,6 @@ from msg_agents.running.launch_arguments import (
     REPLAY_ARGUMENTS,
     bag_storage,
     check_names,
-    find_experiment,
     player_options,
 )
 from msg_agents.running.launch_support import LaunchedNetwork
@@ -29,8 +28,12 @@ REPLAY = {name: default for name, (default, _) in REPLAY_ARGUMENTS.items()}
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"experiment": "lin_ring"}, "experiment:=lin_ring: expected a file, or one of discrete, .*line_ring"),
+        (
+            {"experiment": "lin_ring"},
+            "experiment:=lin_ring: no such file, .*: expected a file, or one of discrete, .*line_ring",
+        ),
         ({"experiment": "nowhere.yaml"}, "nowhere.yaml"),
+        ({"experiment": "line_ring.yaml"}, "^experiment:=line_ring.yaml: no such file: .* or give line_ring"),
         ({"record": "perhaps"}, "record:=perhaps: expected true or false"),
         ({"shutdown": "false", "parameter_services": "2"}, "parameter_services:=2: expected true or false"),
         ({"seed": "1.5"}, "seed:=1.5: expected a whole number"),
@@ -49,7 +52,7 @@ REPLAY = {name: default for name, (default, _) in REPLAY_ARGUMENTS.items()}
 )
 def test_of_a_network(tmp_path: Path, changes: dict[str, str], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        LaunchedNetwork(NETWORK | {"out": str(tmp_path / "runs")} | changes, BRINGUP)
+        LaunchedNetwork(NETWORK | {"out": str(tmp_path / "runs")} | changes)
     assert not (tmp_path / "runs").exists()
 
 
@@ -95,11 +98,6 @@ def test_misspelt_arguments() -> None:
         check_names(context("/a.py", ["/a.py"], "seed:=3", "dration:=3"), known)
     with pytest.raises(InputError, match=r"robot:=x: .*: expected one of experiment, out"):
         check_names(context("/a.py", ["/a.py"], "robot:=x"), known)
-
-
-def test_examples_by_name() -> None:
-    assert find_experiment("line_ring", BRINGUP) == BRINGUP / "experiments/line_ring.yaml"
-    assert find_experiment(str(BRINGUP / "package.xml"), BRINGUP) == BRINGUP / "package.xml"
 
 
 def test_they_are_documented() -> None:

@@ -16,12 +16,11 @@ from msg_agents.running.launch_support import ANALYSIS, LaunchedNetwork, Launche
 from msg_agents.running.run_folder import PREFIX
 from msg_analysis.model.run.record import RunRecord
 
-BRINGUP = Path(__file__).parents[3] / "ros_ws/src/msg_agents_bringup"
 DEFAULTS = {name: default for name, (default, _) in NETWORK_ARGUMENTS.items()}
 
 
 def launched(out: Path, **changes: str) -> LaunchedNetwork:
-    return LaunchedNetwork(DEFAULTS | {"out": str(out), "duration": "1"} | changes, BRINGUP)
+    return LaunchedNetwork(DEFAULTS | {"out": str(out), "duration": "1"} | changes)
 
 
 def workshops(network: LaunchedNetwork) -> Path:

@@ -16,7 +16,7 @@ from msg_analysis.cli import progress
 from msg_analysis.paper import examples
 
 ROOT = Path(__file__).parents[3]
-EXPERIMENTS = ROOT / "ros_ws/src/msg_agents_bringup/experiments"
+EXPERIMENTS = ROOT / "analysis/msg_analysis/examples/experiments"
 LINE_RING = EXPERIMENTS / "line_ring.yaml"
 
 

@@ -20,7 +20,7 @@ from msg_analysis.model.experiment.spec import ExperimentSpec
 from msg_analysis.types import FloatArray
 
 ROOT = Path(__file__).parents[3]
-EXPERIMENTS = ROOT / "ros_ws/src/msg_agents_bringup/experiments"
+EXPERIMENTS = ROOT / "analysis/msg_analysis/examples/experiments"
 
 SMALL: dict[str, Any] = {"name": "small", "graphs": {"line": {"path": [1, 2, 3]}}}
 

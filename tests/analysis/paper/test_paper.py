@@ -29,7 +29,7 @@ from msg_analysis.paper import figures
 from msg_analysis.paper.examples import CENTRALITY, NODE, SYSTEM, Curve, Example
 
 ROOT = Path(__file__).parents[3]
-EXPERIMENTS = ROOT / "ros_ws/src/msg_agents_bringup/experiments"
+EXPERIMENTS = ROOT / "analysis/msg_analysis/examples/experiments"
 
 GRAPHS = {
     "line_ring": (["12", "23", "34", "45"], ["12", "23", "34", "45", "15"]),

@@ -82,11 +82,16 @@ def read_yaml(path: Path) -> Any:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: byte {error.start}: not UTF-8 text: expected an experiment file (YAML)") from error
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """The content of a text in YAML (or JSON); errors as of ``read_yaml``, ``source`` in the place of the file."""
     try:
         return load_yaml(text, _StrictLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise InputError(f"{path}: {line}{', '.join(filter(None, (error.context, error.problem)))}") from error
+        raise InputError(f"{source}: {line}{', '.join(filter(None, (error.context, error.problem)))}") from error
     except (yaml.YAMLError, ValueError) as error:
-        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+        raise InputError(f"{source}: not YAML: {' '.join(str(error).split())}") from error

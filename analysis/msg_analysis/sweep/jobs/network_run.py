@@ -40,7 +40,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.job import Job, NetworkOptions, NetworkStoppedError
 
 PROGRAM = "msg-agents"
-RUN_SERVER = "msg_agents.cli.run_server"
+RUN_SERVER = "msg_agents.cli.servers.run_server"
 POLL = 0.1  # s
 # Signals, and the seconds that a run then has to end: it ends its own processes in order.
 ESCALATION = ((signal.SIGINT, 30.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 5.0))

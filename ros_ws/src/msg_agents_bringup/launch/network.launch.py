@@ -19,15 +19,10 @@
 All decisions are made in msg_agents.running.launch_support; msg_agents.nodes.launch_actions passes them to launch.
 """
 
-from pathlib import Path
-
-from ament_index_python.packages import get_package_share_directory
-
 from msg_agents.nodes.launch_actions import describe
 from msg_agents.running.launch_arguments import NETWORK_ARGUMENTS
 from msg_agents.running.launch_support import LaunchedNetwork
 
 
 def generate_launch_description():
-    share = Path(get_package_share_directory("msg_agents_bringup"))
-    return describe(NETWORK_ARGUMENTS, lambda arguments: LaunchedNetwork(arguments, share))
+    return describe(NETWORK_ARGUMENTS, LaunchedNetwork)

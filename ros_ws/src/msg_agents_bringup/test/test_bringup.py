@@ -21,14 +21,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-
 PACKAGE = Path(__file__).parents[1]
-
-
-@pytest.mark.parametrize("file", sorted((PACKAGE / "experiments").glob("*.yaml")), ids=lambda file: file.stem)
-def test_experiment(file: Path) -> None:
-    ValidExperiment.load(file).require_available()
 
 
 @pytest.mark.parametrize("file", sorted((PACKAGE / "launch").glob("*.launch.py")), ids=lambda file: file.stem)

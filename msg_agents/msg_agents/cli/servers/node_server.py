@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""``python -m msg_agents.cli.node_server [--early] SOCKET``: imports all that nodes need and forks their processes.
+"""``python -m msg_agents.cli.servers.node_server [--early] SOCKET``: imports what nodes need, and forks them.
 
 With ``--early`` it is told of its run later: see ``fork_server.early_server``.
 """

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""``python -m msg_agents.cli.run_server SOCKET``: imports all that a run and its nodes need, and forks runs.
+"""``python -m msg_agents.cli.servers.run_server SOCKET``: imports all that a run and its nodes need, and forks runs.
 
 A worker of a sweep starts it (``msg_analysis.sweep.jobs.network_run``): a network is then running in a fraction of the
 time.
@@ -37,7 +37,7 @@ MODULES = (
 
 def main() -> None:
     """Import all, and serve."""
-    from msg_agents.cli.node_server import prepare
+    from msg_agents.cli.servers.node_server import prepare
     from msg_agents.processes.fork_server import serve
 
     prepare()
@@ -48,7 +48,7 @@ def main() -> None:
 
 def _run(request: dict[str, Any], descriptors: list[int]) -> None:
     """In a forked process: run the command."""
-    from msg_agents.cli.node_server import run_command, serve_waiting
+    from msg_agents.cli.servers.node_server import run_command, serve_waiting
     from msg_agents.processes.fork_server import await_adoption, leave_one_waiting
     from msg_analysis.sweep.jobs.end_with_parent import end_with_parent
 
