@@ -25,7 +25,7 @@ LOCAL := --no-index --no-deps --no-build-isolation
 # Some container images set it. Every process of a network, and every worker of the tests, would compile all modules.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-fast test-ros stress fuzz lint lint-container format bench calibrate docs colcon colcon-test container lock clean
+.PHONY: help setup demo wheels wheels-test test test-fast test-ros stress fuzz lint lint-container format bench calibrate docs colcon colcon-test container lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -57,7 +57,16 @@ $(VENV)/.compiled: $(VENV)/.locked
 	@touch $@
 
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
-	$(BIN)/msg-agents run line_ring --out $(RUNS)
+	$(BIN)/msg-agents demo --out $(RUNS)
+
+# Without a compiler, and from anywhere, these can be installed by pip.
+DIST := dist$(SUFFIX)
+
+wheels: setup ## Build all packages as wheels, into dist/
+	$(BIN)/python requirements/wheels.py $(ROS_DISTRO) $(DIST)
+
+wheels-test: wheels ## Install the wheels where there is no compiler, run the demo network, and say how long it took
+	$(PYTHON) requirements/try_wheels.py $(DIST)
 
 # Networks wait a good part of their time, for discovery for example: more at once than cores, each in a domain of its
 # own. Each worker gets neighbours in the list, so that most fixtures of a module are made once.
@@ -167,5 +176,5 @@ lock: setup ## Pin the newest versions, for all distributions
 	  (cd requirements/$$each && $(COMPILE) --upgrade --constraint lock.txt --output-file interfaces.txt interfaces.in); done
 
 clean: ## Remove all that was made, runs excepted
-	rm -rf .venv .venv-* build site .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-* build dist dist-* site .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} + ; rm -rf */*.egg-info
