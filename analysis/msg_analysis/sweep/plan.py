@@ -32,7 +32,7 @@ from pydantic import ValidationError
 from msg_analysis.examples.bundled import find
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show, translate
-from msg_analysis.model.experiment.yaml_document import read_yaml
+from msg_analysis.model.experiment.yaml_document import other_kind, read_yaml
 from msg_analysis.sweep.dotted_keys import KeyProblemError, put
 from msg_analysis.sweep.jobs.job import Job, JobKind
 from msg_analysis.sweep.sweep_file import MOST_POINTS, SweepSpec
@@ -83,6 +83,8 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
     if not isinstance(mapping, Mapping):
         lines = [problem("sweep", show(mapping), "expected keys with values", "start with `experiment:`")]
         raise ExperimentError(str(path), lines)
+    if instead := other_kind(mapping, "sweep"):
+        raise ExperimentError(str(path), [f"is {instead}"])
     try:
         spec = SweepSpec.model_validate(dict(mapping))
     except ValidationError as error:

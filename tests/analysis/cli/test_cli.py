@@ -53,6 +53,31 @@ def test_help_and_version() -> None:
     assert call("--version").stdout.startswith("msg-analysis, version ")
 
 
+@pytest.mark.parametrize(
+    ("command", "file", "words"),
+    [
+        ("compare", LINE_RING, f"is an experiment file: expected a bag: `msg-agents run {LINE_RING}` and"),
+        ("predict", "", "is a bag: expected a YAML file: give the experiment file from which it was recorded"),
+        ("predict", "twin_0.mcap", "is a bag: expected a YAML file"),
+        ("predict", "metadata.yaml", "is the metadata of a bag: expected a YAML file"),
+        ("compare", "metadata.yaml", "is the metadata of a bag: expected a bag: give its directory, "),
+        ("sweep", "", "is a bag: expected a YAML file"),
+        ("sweep", LINE_RING, "is an experiment file: expected a sweep file"),
+        ("predict", "sweep.yaml", "is a sweep file: expected an experiment file"),
+        ("compare", "sweep.yaml", "is a sweep file: expected a bag"),
+    ],
+)
+def test_a_file_of_another_kind(command: str, file: str, words: str, bag: Path, tmp_path: Path) -> None:
+    """One line says what it is and what to do."""
+    path = tmp_path / file if file == "sweep.yaml" else bag / file
+    if file == "sweep.yaml":
+        path.write_text("experiment: line_ring.yaml\nover: {run.seed: [1, 2]}\n")
+    result = call(command, path)
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {path}: {words}".removesuffix("/"))
+    assert result.stderr.count("\n") == 1
+
+
 def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys\nfrom msg_analysis.cli.main import main\nmain(['--help'], standalone_mode=False)\n"
@@ -267,7 +292,13 @@ def test_salvage_of_nothing(bag: Path, tmp_path: Path) -> None:
     (mcap,) = bag.glob("*.mcap")
     head = tmp_path / "head.mcap"
     head.write_bytes(mcap.read_bytes()[:3000])
-    for path, reason in ((head, "no whole message"), (tmp_path / "nope", "not found"), (LINE_RING, "not an MCAP file")):
+    (tmp_path / "text").write_text("no bag")
+    for path, reason in (
+        (head, "no whole message"),
+        (tmp_path / "nope", "not found"),
+        (tmp_path / "text", "not an MCAP file"),
+        (LINE_RING, "is an experiment file"),
+    ):
         result = call("salvage", path, tmp_path / "out")
         assert (result.exit_code, result.stdout) == (2, "")
         assert reason in result.stderr

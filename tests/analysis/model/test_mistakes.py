@@ -75,6 +75,26 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ({"run.speed": 0}, ["run.speed: 0: expected a number > 0"]),
     ({"run.processes": 0}, ["run.processes: 0: expected 'auto', 'one_per_agent' or a whole number >= 1"]),
     ({"graphs": {1: {"path": [1, 2]}}, "switching": ...}, ["graphs: key 1: expected a text"]),
+    # what other programs call it, or in another section
+    (
+        {"graphs.ring": {"edges": [[1, 2]], "directed": True}},
+        ["graphs.ring.directed: unknown key", "for a directed graph give `arcs: [[1, 2]]`: agent 2 listens to agent 1"],
+    ),
+    (
+        {"graphs.ring": {"edges": [[1, 2]], "directed": False}},
+        ["graphs.ring.directed: unknown key", "remove it: `edges`"],
+    ),
+    (
+        {"graphs.ring": {"edges": [[1, 2]], "weight": 0.5}},
+        ["graphs.ring.weight: unknown key", "as the third entry of a link, for example `edges: [[1, 2, 0.5]]`"],
+    ),
+    ({"graphs.ring": {"links": [[1, 2]]}}, ["graphs.ring.links: unknown key", "did you mean `edges`, or `arcs`"]),
+    ({"graphs.ring": {"nodes": 3}}, ["graphs.ring.nodes: unknown key", "as `agents`, beside `graphs`"]),
+    ({"seed": 3}, ["seed: unknown key", "did you mean `run.seed`?"]),
+    ({"run.process": 3}, ["run.process: unknown key", "did you mean `noise.process`?"]),
+    ({"run.noise": {}}, ["run.noise: unknown key", "did you mean `noise`, without `run`?"]),
+    ({"experiment": "a.yaml", "over": {}, "graphs": ...}, ["is a sweep file: expected an experiment file"]),
+    ({"rosbag2_bagfile_information": {}}, ["is the metadata of a bag: expected a YAML file"]),
     # graphs
     ({"graphs": {}}, ["graphs: {}: expected at least 1"]),
     ({"graphs.ring": {}}, ["graphs.ring: nothing: expected one of path, cycle, edges"]),

@@ -26,6 +26,7 @@ from msg_analysis.bags.format.sqlite_file import SqliteFile
 from msg_analysis.bags.format.storage_options import BAG_SUFFIXES, SQLITE_SUFFIX
 from msg_analysis.bags.format.stored_file import StoredFile
 from msg_analysis.errors import BagError
+from msg_analysis.model.experiment.yaml_document import no_bag_but
 
 _STORAGES = ("mcap", "sqlite3")
 
@@ -38,6 +39,8 @@ def stored_file(path: Path) -> StoredFile:
 def bag_files(path: Path) -> list[Path]:
     """The files of a bag in their order; BagError: there are none, one is missing, or another storage."""
     if path.is_file():
+        if instead := no_bag_but(path):
+            raise BagError(f"{path}: {instead}")
         return [path]
     if not path.is_dir():
         raise BagError(f"{path}: not found: expected the directory of a bag, or an .mcap or .db3 file")

@@ -38,7 +38,7 @@ from msg_analysis.model.experiment.spec import (
     RunSpec,
     SwitchingSpec,
 )
-from msg_analysis.model.experiment.yaml_document import read_yaml
+from msg_analysis.model.experiment.yaml_document import other_kind, read_yaml
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.model.network.markov_chain import MarkovChain, Time
 from msg_analysis.protocol import Network
@@ -156,6 +156,8 @@ class ValidExperiment:
                 source,
                 [problem("experiment", show(mapping), "expected keys with values", "start with `name:`")],
             )
+        if instead := other_kind(mapping, "experiment"):
+            raise ExperimentError(source, [f"is {instead}"])
         sections = Sections(mapping, recorded)
         sections.resolve(directory or Path())
         if sections.problems:

@@ -26,7 +26,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.spec import ExperimentSpec
+from msg_analysis.model.experiment.spec import ExperimentSpec, GraphSpec
 
 _LONGEST_VALUE = 60
 _MOST_LINES = 100  # problems shown; a file with more mostly repeats one of them
@@ -124,16 +124,48 @@ def translate(error: ErrorDetails, root: type[BaseModel] = ExperimentSpec, secti
         return problem(key, "missing", f"expected {_description(location, root)}", example)
     if kind == "extra_forbidden":
         known = list(model.model_fields)
+        meant = _meant(location, model, root, value)
         return problem(
             key,
             "unknown key",
             f"expected one of {', '.join(known)}" if known else "expected none",
-            _did_you_mean(location[-1], known) or "remove it",
+            meant or _did_you_mean(location[-1], known) or "remove it",
         )
     wanted = _EXPECTED.get(kind)
     text = wanted.format(**{k: _plain(v) for k, v in error.get("ctx", {}).items()}) if wanted else error["msg"]
     options = re.findall(r"'(\w+)'", text) if kind == "literal_error" else []
     return problem(key, show(value), text, _did_you_mean(value, options) or example)
+
+
+def _meant(location: Sequence[int | str], model: type[BaseModel], root: type[BaseModel], value: object) -> str | None:
+    """What to write instead of a key that other programs have, or that belongs to another section."""
+    key = str(location[-1])
+    if model is GraphSpec and key in _OF_GRAPHS:
+        return _OF_GRAPHS[key] if value is not False else "remove it: `edges` have no direction"
+    if root is not ExperimentSpec:
+        return None
+    places = [
+        section
+        for section, field in ExperimentSpec.model_fields.items()
+        if section not in ("graphs", "protocol") and key in getattr(_model_in(field.annotation), "model_fields", {})
+    ]
+    if key in ExperimentSpec.model_fields and len(location) > 1:
+        places.append("")
+    if len(places) != 1:
+        return None
+    return f"did you mean `{places[0]}.{key}`?" if places[0] else f"did you mean `{key}`, without `{location[0]}`?"
+
+
+_LISTENS = "`arcs: [[1, 2]]`: agent 2 listens to agent 1"
+_WEIGHT = "give it as the third entry of a link, for example `edges: [[1, 2, 0.5]]`"
+_OF_GRAPHS = {
+    **dict.fromkeys(("directed", "digraph", "is_directed"), f"for a directed graph give {_LISTENS}"),
+    "undirected": "remove it: `edges` have no direction",
+    **dict.fromkeys(("weight", "weights"), _WEIGHT),
+    **dict.fromkeys(("links", "edge_list"), "did you mean `edges`, or `arcs` for a directed graph?"),
+    **dict.fromkeys(("nodes", "vertices", "agents"), "give the number of agents as `agents`, beside `graphs`"),
+    "matrix": "did you mean `adjacency`?",
+}
 
 
 def _did_you_mean(value: object, options: Sequence[str]) -> str | None:

@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Reading YAML strictly: YAML 1.2 scalars, no duplicate keys, no objects."""
+"""Reading YAML strictly: YAML 1.2 scalars, no duplicate keys, no objects; and telling its kinds of files from bags."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,58 @@ def _construct_int(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
 
 _StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
 
+_BAG_FILES = ("metadata.yaml", "*.mcap", "*.mcap.zstd", "*.db3", "*.db3.zstd")
+_BAG_STARTS = (b"\x89MCAP0\r\n", b"SQLite format 3\x00")
+_BAG_KEY = "rosbag2_bagfile_information"  # of its metadata.yaml
+_NOT_A_BAG = (
+    "expected a YAML file: give the experiment file from which it was recorded; `msg-analysis info`, `compare` and "
+    "`export` read bags"
+)
+_HEAD = 65_536  # bytes of a file that are looked at
+
+
+def is_bag(path: Path) -> bool:
+    """Whether it is a bag, or a file of one, by its name or its beginning; it may be damaged."""
+    if path.is_dir():
+        return any(next(path.glob(pattern), None) for pattern in _BAG_FILES)
+    return _head(path).startswith(_BAG_STARTS)
+
+
+def no_bag_but(path: Path) -> str | None:
+    """What a file is instead of one of a bag, and what to do, in words; None where that cannot be told."""
+    text = _head(path).decode("utf-8", "ignore")
+    if re.search(rf"^{_BAG_KEY}\s*:", text, re.MULTILINE):
+        return f"is the metadata of a bag: expected a bag: give its directory, {path.parent}"
+    keys = set(re.findall(r"""^[ {]*["']?(\w+)["']?\s*:""", text, re.MULTILINE))
+    if "graphs" in keys:
+        wanted = f"expected a bag: `msg-agents run {path}` and `msg-analysis simulate {path}` make one"
+        return f"is an experiment file: {wanted}"
+    if {"experiment", "over"} <= keys:
+        return f"is a sweep file: expected a bag: `msg-analysis sweep {path}` runs it"
+    return None
+
+
+def _head(path: Path) -> bytes:
+    """The beginning of a regular file; nothing of others, whose reader says what is wrong."""
+    if not path.is_file():
+        return b""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(_HEAD)
+    except OSError:
+        return b""
+
+
+def other_kind(mapping: Mapping[Any, Any], wanted: str) -> str | None:
+    """What a document is instead of what is ``wanted``, "experiment" or "sweep", and what to do; None: no other kind."""
+    if _BAG_KEY in mapping:
+        return f"the metadata of a bag: {_NOT_A_BAG}"
+    if wanted == "experiment" and {"experiment", "over"} <= mapping.keys() and "graphs" not in mapping:
+        return "a sweep file: expected an experiment file: `msg-analysis sweep` runs sweeps"
+    if wanted == "sweep" and "graphs" in mapping and not {"experiment", "over"} & mapping.keys():
+        return "an experiment file: expected a sweep file: name it there as `experiment:`, and its values as `over:`"
+    return None
+
 
 def read_yaml(path: Path) -> Any:
     """The content of a YAML (or JSON) file in UTF-8.
@@ -72,6 +124,8 @@ def read_yaml(path: Path) -> Any:
     InputError, with file and (if known) line: the file cannot be read, is not YAML in UTF-8, is too large or too deep,
     or has a key twice.
     """
+    if is_bag(path):
+        raise InputError(f"{path}: is a bag: {_NOT_A_BAG}")
     try:
         text = read_text(path)
     except FileNotFoundError as error:
