@@ -108,7 +108,7 @@ def _head(path: Path) -> bytes:
 
 
 def other_kind(mapping: Mapping[Any, Any], wanted: str) -> str | None:
-    """What a document is instead of what is ``wanted``, "experiment" or "sweep", and what to do; None: no other kind."""
+    """What a document is instead of the ``wanted`` kind (experiment, sweep), and what to do; None: not another kind."""
     if _BAG_KEY in mapping:
         return f"the metadata of a bag: {_NOT_A_BAG}"
     if wanted == "experiment" and {"experiment", "over"} <= mapping.keys() and "graphs" not in mapping:
