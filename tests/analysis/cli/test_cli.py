@@ -292,7 +292,7 @@ def test_salvage_of_nothing(bag: Path, tmp_path: Path) -> None:
     (mcap,) = bag.glob("*.mcap")
     head = tmp_path / "head.mcap"
     head.write_bytes(mcap.read_bytes()[:3000])
-    (tmp_path / "text").write_text("not a bag of any kind")
+    (tmp_path / "text").write_text("not a bag of any kind\n" * 1000)
     for path, reason in (
         (head, "no whole message"),
         (tmp_path / "nope", "not found"),

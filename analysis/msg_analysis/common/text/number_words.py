@@ -57,3 +57,9 @@ def percent(share: float) -> str:
 def counted(number: int, thing: str) -> str:
     """A number and a noun whose plural ends with s: ``1 step``, ``2 steps``."""
     return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
+def listed(values: Sequence[object], longest: int = 12) -> str:
+    """The values, separated by commas; of more than ``longest``, how many are left out."""
+    more = f", and {len(values) - longest} more" if len(values) > longest else ""
+    return ", ".join(str(value) for value in values[:longest]) + more

@@ -24,7 +24,7 @@ from typing import Any
 from msg_analysis.model.experiment.experiment import ValidExperiment
 
 # Keys of an experiment that do not change its law
-MAY_DIFFER = {"name", "run.seed", "run.duration", "run.processes", "run.speed"}
+MAY_DIFFER = {"name", "names", "run.seed", "run.duration", "run.processes", "run.speed"}
 
 
 def law_keys(experiment: ValidExperiment) -> dict[str, Any]:

@@ -284,6 +284,11 @@ class ValidExperiment:
         return self.graph_list[0].agents
 
     @property
+    def names(self) -> list[str] | None:
+        """Names of the agents, in the order of their numbers; None where they have only numbers."""
+        return self.spec.names
+
+    @property
     def switching(self) -> SwitchingSpec:
         """Section ``switching``."""
         return self.spec.switching

@@ -23,8 +23,10 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from msg_analysis.model.experiment import memory, protocol_binding, topology, validation
-from msg_analysis.model.experiment.problems import problem, translate
+from msg_analysis.common.text.number_words import listed
+from msg_analysis.model.experiment import graph_sources, memory, protocol_binding, topology, validation
+from msg_analysis.model.experiment.graph_sources import ForeignGraph, GraphError, is_networkx
+from msg_analysis.model.experiment.problems import problem, show, translate
 from msg_analysis.model.experiment.protocol_binding import ChosenProtocol, ProtocolInfo
 from msg_analysis.model.experiment.spec import ExperimentSpec, GraphSpec, RunSpec
 from msg_analysis.model.network.graphs import Graph
@@ -46,6 +48,17 @@ def _section(key: str, mapping: Mapping[Any, Any]) -> Any:
     return ExperimentSpec.model_fields[key].get_default(call_default_factory=True, validated_data={})
 
 
+def _graphs_of_networkx(mapping: Mapping[Any, Any]) -> tuple[dict[str, Any], Mapping[Any, Any]]:
+    """The graphs of networkx in a document, by name, and the document with empty graphs in their places."""
+    graphs = mapping.get("graphs")
+    if not isinstance(graphs, Mapping):
+        return {}, mapping
+    found = {name: graph for name, graph in graphs.items() if is_networkx(graph)}
+    if not found:
+        return {}, mapping
+    return found, {**mapping, "graphs": {**graphs, **{name: {"edges": []} for name in found}}}
+
+
 class Sections:
     """A document that is being checked: a section is None as long as it is not known to be valid.
 
@@ -54,6 +67,10 @@ class Sections:
 
     def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
         self.problems: list[str] = []
+        self._networkx, mapping = _graphs_of_networkx(mapping)
+        self._foreign: dict[str, ForeignGraph] = {}  # read, but not numbered yet
+        self._named_by_files = False
+        self.keys: dict[str, str] = {}  # of the graphs, for messages
         bad: set[str] = set()
         try:
             spec = ExperimentSpec.model_validate(dict(mapping))
@@ -75,9 +92,11 @@ class Sections:
 
     def resolve(self, directory: Path) -> None:
         """Check what several keys say together; paths in the document are relative to ``directory``."""
-        time, run, leaders = self.values["time"], self.values["run"], self.values["leaders"]
+        time, run = self.values["time"], self.values["run"]
         self._find_protocol()
         self._count_agents(directory)
+        self._name_leaders()
+        leaders = self.values["leaders"]
         leaders_good = self.values["problem"] is not None and "leaders" in self.known
         if leaders_good:
             found = validation.leader_problems(self.values["problem"], leaders, self.agents)
@@ -100,7 +119,7 @@ class Sections:
         self._build_graphs()
         if not self.graphs or not leaders_good:
             return
-        self.problems += validation.connection_problems(self.graphs, leaders)
+        self.problems += validation.connection_problems(self.graphs, leaders, self.values["names"])
         built_in = "protocol" in self.known and self.values["protocol"] is None
         if time == "continuous" and run and built_in:
             gains = validation.leader_gains(leaders, self.agents)
@@ -122,14 +141,12 @@ class Sections:
             self.values["protocol"] = type(spec).model_validate({"name": spec.name, **parameters})
 
     def _count_agents(self, directory: Path) -> None:
-        """The number of agents, if every graph is valid; GraphML files are read here."""
+        """The number of agents and their names, if every graph is valid; files with graphs are read here."""
         graphs: dict[str, GraphSpec] | None = self.values["graphs"]
-        if graphs is None or "agents" not in self.known:
+        if graphs is None or not {"agents", "names"} <= self.known:
             return
-        declared = self.values["agents"]
-        largest = 0
         before = len(self.problems)
-        for name, spec in list(graphs.items()):
+        for name, spec in graphs.items():
             if name == "stationary":
                 wanted = "expected another name, since switching.initial uses this one"
                 self.problems.append(problem("graphs", "'stationary'", wanted, "rename the graph"))
@@ -137,21 +154,79 @@ class Sections:
                 given = " and ".join(spec.kinds) or "nothing"
                 wanted = f"expected one of {', '.join(GraphSpec.model_fields)}"
                 self.problems.append(problem(f"graphs.{name}", given, wanted, "give exactly one"))
-            elif spec.graphml is not None:
-                resolved, count, found = topology.read_graphml(name, directory / spec.graphml)
-                graphs[name] = resolved
-                largest = max(largest, count)
-                self.problems += found
-            else:
-                largest = max(largest, topology.largest_label(spec))
-        if len(self.problems) > before:
+                continue
+            self.keys[name] = key = f"graphs.{name}" if name in self._networkx else f"graphs.{name}.{spec.kinds[0]}"
+            try:
+                self._read(name, key, spec, directory)
+            except GraphError as error:
+                self.problems.append(str(error))
+        if len(self.problems) > before or not self._number_nodes(graphs):
             return
+        declared, names = self.values["agents"], self.values["names"]
+        largest = max(map(topology.largest_label, graphs.values()))
         untold = all(spec.complete or spec.star for spec in graphs.values())
-        if declared is None and (untold or largest < 2):
+        if declared is None and names is None and (untold or largest < 2):
             wanted = "expected the number of agents, since the graphs do not give it"
             self.problems.append(problem("agents", "missing", wanted, "for example agents: 5"))
+        elif names is not None and len(names) != (declared or max(largest, len(names))):
+            shown = f"{len(names)} names" if len(names) > 1 else "1 name"
+            whose = " from the files of the graphs" if self._named_by_files else ""
+            wanted = f"expected one for each of the {declared or largest} agents"
+            self.problems.append(problem("names", shown + whose, wanted, "name the others, or correct `agents`"))
         else:
-            self.agents = declared or largest
+            self.agents = declared or (len(names) if names else largest)
+
+    def _read(self, name: str, key: str, spec: GraphSpec, directory: Path) -> None:
+        """Read a graph that is not given by numbers of agents. GraphError: its mistake."""
+        if name in self._networkx:
+            self._foreign[name] = graph_sources.from_networkx(key, self._networkx[name])
+        elif spec.graphml is not None:
+            self._foreign[name] = graph_sources.read_graphml(key, directory / spec.graphml)
+        elif spec.csv is not None:
+            self._foreign[name] = graph_sources.read_csv(key, directory / spec.csv)
+        elif spec.adjacency is not None:
+            self.values["graphs"][name] = graph_sources.from_adjacency(key, spec.adjacency)
+
+    def _number_nodes(self, graphs: dict[str, GraphSpec]) -> bool:
+        """Numbers instead of nodes in ``graphs``, and the names of the agents; False where these have mistakes."""
+        given: list[str] | None = self.values["names"]
+        twice = sorted({name for name in given or [] if (given or []).count(name) > 1})
+        if twice:
+            self.problems.append(problem("names", show(twice[0]), "expected different names", "rename one"))
+            return False
+        if not self._foreign:
+            return True
+        try:
+            numbers, names = graph_sources.numbered(self._foreign.values(), given)
+        except KeyError as error:
+            wanted = f"expected one of the names {listed(given or [])}"
+            place = next(self.keys[name] for name, graph in self._foreign.items() if error.args[0] in graph.nodes)
+            self.problems.append(
+                problem(place, f"node {show(error.args[0])}", wanted, "correct it, or add it to `names`")
+            )
+            return False
+        graphs |= {name: graph_sources.as_spec(graph, numbers) for name, graph in self._foreign.items()}
+        self._named_by_files = given is None
+        self.values["names"] = names
+        return True
+
+    def _name_leaders(self) -> None:
+        """Numbers instead of names in ``leaders``; what is not a name of an agent is a mistake."""
+        leaders = self.values["leaders"]
+        if leaders is None or not any(isinstance(agent, str) for agent in leaders.agents):
+            return
+        names: list[str] = self.values["names"] or []
+        numbers = [names.index(agent) + 1 if agent in names else agent for agent in leaders.agents]
+        unknown = [agent for agent in numbers if isinstance(agent, str)]
+        if unknown and self.agents is not None:
+            wanted = (
+                f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
+            )
+            self.problems += [problem("leaders.agents", show(agent), wanted, "correct it") for agent in unknown]
+        known = [agent for agent in numbers if not isinstance(agent, str)]
+        self.values["leaders"] = leaders.model_copy(update={"agents": known})
+        if unknown:
+            self.known.discard("leaders")
 
     def _fits(self, run: RunSpec | None) -> bool:
         assert self.agents is not None
@@ -167,7 +242,12 @@ class Sections:
     def _build_graphs(self) -> None:
         assert self.agents is not None
         graphs: dict[str, GraphSpec] = self.values["graphs"]
-        found = [line for name, spec in graphs.items() for line in topology.link_problems(name, spec, self.agents)]
+        names: list[str] | None = self.values["names"]
+        found = [
+            line
+            for name, spec in graphs.items()
+            for line in topology.link_problems(self.keys[name], spec, self.agents, names)
+        ]
         self.problems += found
         if not found:
             self.graphs = tuple(topology.build_graph(name, spec, self.agents) for name, spec in graphs.items())

@@ -20,9 +20,19 @@ Only what one value can tell by itself is checked here; what needs several keys 
 from __future__ import annotations
 
 import math
+import re
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, PlainValidator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 from pydantic_core import PydanticCustomError
 
 LARGEST_NUMBER = 1e100  # so that no sum or product of two numbers overflows
@@ -32,7 +42,9 @@ NonNegative = Annotated[Number, Field(ge=0)]
 LARGEST_COUNT = 2**32 - 1  # messages carry agents as uint32
 Count = Annotated[int, Field(strict=True, ge=1, le=LARGEST_COUNT)]
 Label = Count
-GraphName = Annotated[str, Field(pattern=r"^\S(.{0,62}\S)?$")]
+NAME_PATTERN = r"^\S(.{0,62}\S)?$"
+GraphName = Annotated[str, Field(pattern=NAME_PATTERN)]
+AgentName = Annotated[str, Field(pattern=NAME_PATTERN)]
 Link = tuple[int, int, float]
 Matrix = list[list[Number]]
 NoiseGain = float | list[float] | list[list[float]]
@@ -120,6 +132,15 @@ def _gain(value: object) -> float:
     raise expected("a number > 0, or inf for leaders held at the reference")
 
 
+def _rows(value: object) -> object:
+    return value.tolist() if hasattr(value, "tolist") else value  # an array of numpy
+
+
+def _leader(value: object, number: ValidatorFunctionWrapHandler) -> Any:
+    """A number, or the name of an agent, which becomes its number once the names are known."""
+    return value if isinstance(value, str) and re.match(NAME_PATTERN, value) else number(value)
+
+
 def _grid(value: object) -> object:
     sizes = value if isinstance(value, list | tuple) else ()
     if len(sizes) != 2 or not all(_is_count(size) for size in sizes):
@@ -170,10 +191,22 @@ class GraphSpec(_Section):
     graphml: str | None = Field(
         None,
         min_length=1,
-        description="a GraphML file, relative to the experiment file; node ids that are whole numbers from 1 "
-        "are the agents' numbers, else nodes are numbered in the order of the file; edge attribute 'weight', "
-        "default 1",
+        description="a GraphML file, relative to the experiment file; node ids that are whole numbers are the agents' "
+        "numbers, others their names; edge attribute 'weight', default 1",
         examples=["network.graphml"],
+    )
+    csv: str | None = Field(
+        None,
+        min_length=1,
+        description="a CSV file, relative to the experiment file, with the header source,target[,weight][,type]; "
+        "target listens to source; nodes as with graphml; type directed (default) or undirected",
+        examples=["edges.csv"],
+    )
+    adjacency: Annotated[list[list[NonNegative]], BeforeValidator(_rows)] | None = Field(
+        None,
+        min_length=2,
+        description="square matrix: row i has the weights with which agent i listens to the others, 0: not at all",
+        examples=[[[0, 1], [1, 0]]],
     )
 
     @property
@@ -242,7 +275,9 @@ class NoiseSpec(_Section):
 class LeadersSpec(_Section):
     """The agents that know the reference (tracking only)."""
 
-    agents: list[Label] = Field(min_length=1, description="the leaders", examples=[[3]])
+    agents: list[Annotated[Label, WrapValidator(_leader, json_schema_input_type=Label | AgentName)]] = Field(
+        min_length=1, description="the leaders, by number or name", examples=[[3]]
+    )
     gain: Annotated[
         float,
         PlainValidator(_gain, json_schema_input_type=Positive | Literal["inf"]),
@@ -311,6 +346,13 @@ class ExperimentSpec(_Section):
     )
     agents: Annotated[int, Field(strict=True, ge=2)] | None = Field(
         None, description="number of agents; by default the largest number in any graph", examples=[5]
+    )
+    names: list[AgentName] | None = Field(
+        None,
+        min_length=2,
+        description="names of the agents in the order of their numbers, shown instead of these; by default those of "
+        "the nodes in graph files",
+        examples=[["north", "south"]],
     )
     graphs: dict[GraphName, GraphSpec] = Field(
         min_length=1,

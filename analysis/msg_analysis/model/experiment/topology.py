@@ -16,16 +16,14 @@
 
 from __future__ import annotations
 
-import io
+from collections.abc import Sequence
 from itertools import combinations, pairwise
-from pathlib import Path
-from xml.etree.ElementTree import ParseError
 
 import numpy as np
 
-from msg_analysis.common.bounded_input import read_bytes
+from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.model.experiment.problems import problem, show
-from msg_analysis.model.experiment.spec import GraphSpec, Link, is_number
+from msg_analysis.model.experiment.spec import GraphSpec, Link
 from msg_analysis.model.network.graphs import Graph
 
 
@@ -41,7 +39,7 @@ def largest_label(spec: GraphSpec) -> int:
 
 
 def links(spec: GraphSpec, agents: int) -> list[Link]:
-    """(i, j, weight), agents from 1, of every edge (``arcs``: arc i -> j). Not for GraphML: see ``read_graphml``."""
+    """(i, j, weight), agents from 1, of every edge (``arcs``: arc i -> j). Not for files: see ``graph_sources``."""
     if spec.edges is not None or spec.arcs is not None:
         return list(spec.edges or spec.arcs or [])
     pairs: list[tuple[int, int]]
@@ -61,10 +59,9 @@ def links(spec: GraphSpec, agents: int) -> list[Link]:
     return [(i, j, 1.0) for i, j in pairs]
 
 
-def link_problems(name: str, spec: GraphSpec, agents: int) -> list[str]:
-    """Self-loops, duplicate links and agents that do not exist."""
+def link_problems(key: str, spec: GraphSpec, agents: int, names: Sequence[str] | None = None) -> list[str]:
+    """Self-loops, duplicate links and agents that do not exist; ``key`` and ``names`` of the agents are for them."""
     kind = spec.kinds[0]
-    key = f"graphs.{name}.{kind}"
     largest = largest_label(spec)
     if largest > agents:
         return [
@@ -74,11 +71,13 @@ def link_problems(name: str, spec: GraphSpec, agents: int) -> list[str]:
     seen: set[tuple[int, int]] = set()
     for i, j, _ in links(spec, agents):
         pair = (i, j) if kind == "arcs" else (min(i, j), max(i, j))
+        ends = show([i, j] if names is None else [names[i - 1], names[j - 1]])
         if i == j:
-            found.append(problem(key, show([i, j]), f"agent {i} is linked with itself", "remove the self-loop"))
+            who = agent_text(i, names)
+            found.append(problem(key, ends, f"{who} is linked with itself", "remove the self-loop"))
         elif pair in seen:
             text = "arc" if kind == "arcs" else "edge (edges have no direction)"
-            found.append(problem(key, show([i, j]), f"expected every {text} once", "remove the duplicate"))
+            found.append(problem(key, ends, f"expected every {text} once", "remove the duplicate"))
         seen.add(pair)
     return found
 
@@ -91,50 +90,3 @@ def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
         if spec.arcs is None:
             adjacency[i - 1, j - 1] = weight
     return Graph(name, adjacency)
-
-
-def read_graphml(name: str, file: Path) -> tuple[GraphSpec, int, list[str]]:
-    """A GraphML file as edges (arcs if directed), its number of agents, and problems (then the rest is meaningless).
-
-    ``name`` of the graph is for messages.
-    """
-    import networkx as nx  # here, since every process of a run would wait for it
-
-    key = f"graphs.{name}.graphml"
-    empty = GraphSpec(edges=[])
-    try:
-        graph = nx.read_graphml(io.BytesIO(read_bytes(file)))
-    except FileNotFoundError:
-        return (
-            empty,
-            0,
-            [problem(key, str(file), "no such file", "the path is relative to the experiment file")],
-        )
-    except OSError as error:
-        return empty, 0, [problem(key, str(file), "cannot be read", str(error.strerror))]
-    except (
-        ParseError,
-        nx.NetworkXError,
-        ValueError,
-        KeyError,
-        StopIteration,
-        AttributeError,
-        TypeError,
-    ) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        return empty, 0, [problem(key, str(file), f"expected a GraphML file ({reason})", "export it again")]
-    nodes = list(graph.nodes)
-    if not nodes:
-        return empty, 0, [problem(key, str(file), "expected a graph with nodes", "export it again")]
-    if all(str(node).isascii() and str(node).isdigit() and int(node) >= 1 for node in nodes):
-        labels = {node: int(node) for node in nodes}
-    else:
-        labels = {node: number for number, node in enumerate(nodes, start=1)}
-    found: list[Link] = []
-    for source, target, weight in graph.edges(data="weight", default=1.0):
-        if not is_number(weight) or weight <= 0:
-            place = f"weight {show(weight)} of {source} - {target}"
-            return empty, 0, [problem(key, place, "expected a weight > 0", "correct it in the file")]
-        found.append((labels[source], labels[target], float(weight)))
-    kind = "arcs" if graph.is_directed() else "edges"
-    return GraphSpec.model_validate({kind: found}), max(labels.values(), default=0), []

@@ -21,6 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.model.experiment.problems import problem, show
 from msg_analysis.model.experiment.spec import LeadersSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
 from msg_analysis.model.network.graphs import Graph, hops
@@ -160,7 +161,9 @@ def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> l
     return [problem(key, text, "expected an ergodic chain", "give some graph a probability > 0 to stay")]
 
 
-def connection_problems(graphs: Sequence[Graph], leaders: LeadersSpec | None) -> list[str]:
+def connection_problems(
+    graphs: Sequence[Graph], leaders: LeadersSpec | None, names: Sequence[str] | None = None
+) -> list[str]:
     """Agents that are not connected in the union of all graphs; ``leaders`` is None in consensus.
 
     Mean-square stability of the disagreement (tracking: of the deviation from the reference) needs a union in which
@@ -171,8 +174,8 @@ def connection_problems(graphs: Sequence[Graph], leaders: LeadersSpec | None) ->
     lost = np.flatnonzero(hops(union, sources) < 0).tolist()
     if not lost:
         return []
-    start = "a leader" if leaders is not None else f"agent{_list(sources)}"
-    text = f"agent{_list(lost)} cannot be reached from {start} in the union of all graphs"
+    start = "a leader" if leaders is not None else f"agent{_list(sources, names)}"
+    text = f"agent{_list(lost, names)} cannot be reached from {start} in the union of all graphs"
     return [problem("graphs", text, "expected a union that connects all agents", "add an edge, or lower `agents`")]
 
 
@@ -192,9 +195,9 @@ def _widest_reaching(leads: BoolArray) -> list[int]:
     return np.flatnonzero(reached & (hops(leads.T, [widest]) >= 0)).tolist()
 
 
-def _list(agents: Sequence[int], longest: int = 8) -> str:
-    """`` 3`` or ``s 1, 2, 3``: agents (from 0) as texts count them, after the word "agent"."""
-    shown = ", ".join(str(agent + 1) for agent in agents[:longest])
+def _list(agents: Sequence[int], names: Sequence[str] | None, longest: int = 8) -> str:
+    """`` 3`` or ``s 1, 2, 3``: agents (from 0) as texts count or name them, after the word "agent"."""
+    shown = ", ".join(agent_name(agent + 1, names) for agent in agents[:longest])
     more = f" and {len(agents) - longest} more" if len(agents) > longest else ""
     return ("s " if len(agents) > 1 else " ") + shown + more
 

@@ -22,9 +22,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.common.text.number_words import number_text
+from msg_analysis.common.text.number_words import listed, number_text
 from msg_analysis.model.experiment.memory import amount
-from msg_analysis.report.terminal.tables import ROWS, fact_table, listed, number_table
+from msg_analysis.report.terminal.tables import ROWS, fact_table, number_table
 
 
 def print_experiment(document: dict[str, Any], console: Console) -> None:

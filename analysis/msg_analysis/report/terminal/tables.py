@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from rich import box
 from rich.cells import cell_len
@@ -84,12 +84,6 @@ def fact_table(console: Console, title: str) -> Table:
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
     return table
-
-
-def listed(values: Sequence[Any], longest: int = 12) -> str:
-    """The values, separated by commas; of more than ``longest``, how many are left out."""
-    more = f", and {len(values) - longest} more" if len(values) > longest else ""
-    return ", ".join(str(value) for value in values[:longest]) + more
 
 
 def first_rows(table: Table, rows: Iterable[Row], what: str, where: str = "--json") -> list[Row]:

@@ -21,8 +21,8 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.common.text.number_words import number_text
-from msg_analysis.report.terminal.tables import fact_table, first_rows, listed, number_table, print_table
+from msg_analysis.common.text.number_words import listed, number_text
+from msg_analysis.report.terminal.tables import fact_table, first_rows, number_table, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _METHODS = {
