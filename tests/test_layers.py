@@ -48,6 +48,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "sweep/jobs",
         "sweep",
         "report/documents",
+        "runs",
         "report/figures",
         "report/terminal",
         "report/html",

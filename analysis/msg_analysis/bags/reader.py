@@ -79,19 +79,23 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory
     return _trajectory(contents, _choose(contents))
 
 
-def read_record(path: str | Path) -> RunRecord:
+def read_record(path: str | Path, *, most: int | None = None) -> RunRecord:
     """The run record of a bag, as ``read_bag`` finds it, without the states; at once where it comes first.
 
-    BagError or InputError: no bag, or no valid run record.
+    BagError or InputError: no bag, or no valid run record in the first ``most`` bytes of messages (None: in all).
     """
     path = Path(path)
     contents = _Contents(path)
     unreadable: list[BagError] = []
     files = bag_files(path)
+    seen = 0
     for name in files:
         file = stored_file(name)
         try:
             for batch, kind in contents.network_topics(file, file.batches()):
+                seen += len(batch.data)
+                if most is not None and seen > most:
+                    return _choose(contents)
                 contents.learn(batch, np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]))
                 contents.keep_metadata(file)
                 known = contents.first_record()

@@ -85,8 +85,9 @@ def tabulate(results: tuple[Path, ...], form: str, level: float, as_json: bool) 
     A RESULT may also be the directory of a run. The runs are assumed to be independent (different seeds).
     """
     from msg_analysis.report.terminal import saved_results as saved
+    from msg_analysis.runs.saved_result import read_result
 
-    rows = [saved.read_result(path) for path in results]
+    rows = [read_result(path) for path in results]
     if as_json or form == "json":
         print_json(saved.to_json(rows, level))
     elif form == "csv":

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from msg_analysis.cli import compare, sweep, theory
+from msg_analysis.cli import compare, runs, sweep, theory
 from msg_analysis.cli.console import CommandGroup, examples, print_json, result_console
 from msg_analysis.cli.options import (
     BAG,
@@ -271,6 +271,7 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
 
 main.add_command(compare.compare)
 main.add_command(compare.tabulate)
+main.add_command(runs.runs)
 main.add_command(theory.transient)
 main.add_command(theory.facts)
 main.add_command(sweep.sweep)

@@ -106,7 +106,7 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 experiment_argument = click.argument("experiment", type=EXPERIMENT)
-seed_option = click.option("--seed", type=int, metavar="N", help="Overrides run.seed.")
+seed_option = click.option("--seed", type=int, metavar="N", help="Seed of the run (run.seed).")
 duration_option = click.option(
     "--duration", type=float, metavar="T", help="Overrides run.duration, in units of simulated time."
 )

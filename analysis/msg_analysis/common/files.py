@@ -23,6 +23,7 @@ from pathlib import Path
 from msg_analysis.errors import InputError
 
 RESULT_FILE = "result.json"  # of a run, next to its bag
+REPORT_FILE = "report.html"  # the same
 
 
 def require_place(file: Path | None) -> None:

@@ -47,6 +47,7 @@ from msg_analysis.cli.options import (
     seed_option,
     suggest,
 )
+from msg_analysis.cli.runs import runs
 from msg_analysis.cli.storage_options import storage, storage_options
 from msg_analysis.common.exit_codes import ExitCode
 
@@ -366,6 +367,7 @@ for _command in (
     begin.demo_of(run),
     begin.examples,
     begin.new,
+    runs,
     doctor,
     nodes.agent,
     nodes.switcher,

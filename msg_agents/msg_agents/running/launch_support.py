@@ -30,10 +30,10 @@ from pathlib import Path
 from msg_agents.processes.process_plan import RECORDER, ProcessPlan, plan_network
 from msg_agents.running.launch_arguments import bag_storage, flag, load_experiment, player_options
 from msg_agents.running.run_folder import make_bag_directory, workshop
-from msg_agents.running.run_result import REPORT_FILE
 from msg_agents.running.supervisor import failure_of
 from msg_analysis.common.blas_threads import SINGLE_THREAD
 from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.common.files import REPORT_FILE
 from msg_analysis.twin.simulate import new_record
 
 ANALYSIS = "msg-analysis"

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from msg_analysis.common.files import REPORT_FILE
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from msg_analysis.inference.verdict.comparison import Comparison
 
 ReportWhen = Literal["always", "on-failure", "never"]
-REPORT_FILE = "report.html"
 
 
 @dataclass(slots=True)

@@ -64,6 +64,12 @@ def bag_files(path: Path) -> list[Path]:
     return files
 
 
+def first_file(path: Path) -> Path | None:
+    """The first file of a bag by the names alone; None where there is none."""
+    files = [file for suffix in BAG_SUFFIXES for file in path.glob(f"*{suffix}")]
+    return min(files, key=_file_number, default=None)
+
+
 def _refuse_unknown(path: Path, information: dict[str, Any]) -> None:
     storage = information.get("storage_identifier")
     if storage not in _STORAGES:

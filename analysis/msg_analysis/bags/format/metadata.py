@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +33,8 @@ METADATA_FILE = "metadata.yaml"
 _ROOT = "rosbag2_bagfile_information"
 # That in C, where PyYAML has them: metadata of 1000 agents has 30,000 lines.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+_HEAD = 4096  # bytes in which rosbag2 has the start of a bag
+_STARTED = re.compile(rb"^  starting_time:\n +nanoseconds_since_epoch: (\d{1,19})\n", re.MULTILINE)
 _NEVER = 2**63 - 1  # what rosbag2 writes as the start of a bag without messages
 
 
@@ -149,3 +152,13 @@ def read_metadata(directory: Path) -> dict[str, Any] | None:
     if not isinstance(information, dict):
         raise BagError(f"{file}: no {_ROOT} in it: expected the metadata of a ROS 2 bag")
     return information
+
+
+def starting_time(directory: Path) -> int | None:
+    """Log time of the first message of a bag [ns], by the head of metadata.yaml alone; None where it is not there."""
+    try:
+        with (directory / METADATA_FILE).open("rb") as stream:
+            found = _STARTED.search(stream.read(_HEAD))
+    except OSError:
+        return None
+    return int(found[1]) if found and int(found[1]) != _NEVER else None

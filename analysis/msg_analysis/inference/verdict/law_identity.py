@@ -29,7 +29,7 @@ MAY_DIFFER = {"name", "names", "run.seed", "run.duration", "run.processes", "run
 
 def law_keys(experiment: ValidExperiment) -> dict[str, Any]:
     """Every key (nested ones with dots) that defines the law of a run, and its value."""
-    found = _flat(experiment.to_document())
+    found = flat(experiment.to_document())
     # The order of the graphs is that of the modes.
     found["graphs"] = [graph.name for graph in experiment.graph_list]
     if experiment.protocol:
@@ -52,11 +52,12 @@ def first_difference(one: ValidExperiment, other: ValidExperiment) -> tuple[str,
     return None
 
 
-def _flat(document: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(document: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Every key of nested mappings, joined by dots, and its value."""
     found: dict[str, Any] = {}
     for key, value in document.items():
         if isinstance(value, Mapping):
-            found |= _flat(value, f"{prefix}{key}.")
+            found |= flat(value, f"{prefix}{key}.")
         else:
             found[f"{prefix}{key}"] = value
     return found

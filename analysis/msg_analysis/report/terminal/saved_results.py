@@ -18,8 +18,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -29,93 +27,15 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.common.bounded_input import read_text
 from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import half_width_text, measured_text, number_text, p_text, z_text
-from msg_analysis.errors import InputError
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.errors.ranking import Ranking, rank_estimates
 from msg_analysis.inference.statistics.distributions import two_sided
 from msg_analysis.report.documents.comparison_words import order_statements
 from msg_analysis.report.terminal.tables import number_table, print_table, room_for_names
-
-
-@dataclass(frozen=True, slots=True)
-class Result:
-    """A row: one saved comparison; None where it has no such number."""
-
-    file: str
-    experiment: str
-    seeds: str  # of all runs: "1 2"
-    bags: int  # number of runs
-    leaders: str  # numbers from 1: "3" or "1 4"; empty without
-    verdict: str
-    simulated_time: float  # of all runs [units of simulated time]
-    measured: float | None  # system error, like the next five
-    standard_error: float | None
-    low: float | None  # to high: the 95 % interval
-    high: float | None
-    predicted: float | None
-    z: float | None
-    least_p: float | None  # least adjusted p of the tests
-    blame: str  # causes, separated by "; "; empty where nothing is wrong
-    identity: str | None  # equal for runs of the same law
-
-
-def read_result(path: Path) -> Result:
-    """Read a saved result, from a file or the directory of a run; InputError if it is not there or not a result."""
-    file = path / RESULT_FILE if path.is_dir() else path
-    wanted = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
-    try:
-        document = json.loads(read_text(file))
-    except OSError as error:
-        raise InputError(f"{file}: {error.strerror}: {wanted}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{file}: not JSON ({error}): {wanted}") from error
-    if not isinstance(document, dict):
-        raise InputError(f"{file}: not a JSON object: {wanted}")
-    total = _part(document, "system_error", dict, file)
-    interval = total.get("interval")
-    if not isinstance(interval, list) or len(interval) != 2:
-        raise InputError(f"{file}: system_error.interval: {interval!r}: {wanted}")
-    seeds = [run.get("seed") for run in document.get("bags") or [document] if isinstance(run, dict)]
-    tests = [_number(test, "p_adjusted", file) for test in document.get("tests") or []]
-    blame = [str(cause.get("words")) for cause in document.get("blame") or []]
-    return Result(
-        file=str(path),
-        experiment=_part(document, "experiment", str, file),
-        seeds=" ".join(str(seed) for seed in seeds if seed is not None),
-        bags=len(document.get("bags") or [None]),
-        leaders=" ".join(str(leader) for leader in document.get("leaders") or []),
-        verdict=_part(document, "verdict", str, file),
-        simulated_time=_number(document, "simulated_time", file) or 0.0,
-        measured=_number(total, "measured", file),
-        standard_error=_number(total, "standard_error", file),
-        low=_number({"interval": interval[0]}, "interval", file),
-        high=_number({"interval": interval[1]}, "interval", file),
-        predicted=_number(total, "predicted", file),
-        z=_number(total, "z", file),
-        least_p=min((p for p in tests if p is not None), default=None),
-        blame="; ".join(blame),
-        identity=document.get("experiment_identity"),
-    )
-
-
-def _part(document: dict[str, Any], key: str, kind: type, file: Path) -> Any:
-    value = document.get(key)
-    if not isinstance(value, kind):
-        raise InputError(f"{file}: {key}: {value!r}: expected that of a result of `msg-analysis compare --json`")
-    return value
-
-
-def _number(document: Any, key: str, file: Path) -> float | None:
-    value = document.get(key) if isinstance(document, dict) else document
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{file}: {key}: {value!r}: expected a number")
-    return float(value)
+from msg_analysis.runs.saved_result import Result
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,93 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Commands about saved runs: ``runs``, which is also one of ``msg-agents``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from msg_analysis.cli.console import examples, print_json, result_console
+from msg_analysis.cli.options import PATH, json_option, seed_option
+
+if TYPE_CHECKING:
+    from msg_analysis.runs.run_filter import SortKey
+
+
+@click.command(
+    epilog=examples(
+        "msg-agents runs",
+        "msg-agents runs --name 'line_*' --verdict disagrees --since 7d",
+        "msg-agents runs --last 20 --sort error --json | jq '.runs[].folder'",
+        "msg-analysis runs elsewhere",
+    )
+)
+@click.argument("folder", type=PATH, default=Path("runs"))
+@click.option("--name", metavar="NAME", help="Only runs of this experiment; a pattern such as 'line_*' may be given.")
+@click.option(
+    "--verdict",
+    "verdicts",
+    type=click.Choice(["agrees", "disagrees", "incomplete", "unpredicted", "none"]),
+    multiple=True,
+    help="Only runs with this verdict; none: without one. Repeatable.",
+)
+@click.option("--since", metavar="WHEN", help="Only runs from then on: 2026-11-25, 2026-11-25T14:30, or 7d for 7 days.")
+@click.option("--until", metavar="WHEN", help="Only runs up to then; a date is included.")
+@seed_option
+@click.option("--last", type=click.IntRange(1), metavar="N", help="Only the newest N of these.")
+@click.option(
+    "--sort", type=click.Choice(["date", "name", "seed", "verdict", "error"]), default="date", help="Order of the list."
+)
+@json_option
+def runs(
+    folder: Path,
+    *,
+    name: str | None,
+    verdicts: tuple[str, ...],
+    since: str | None,
+    until: str | None,
+    seed: int | None,
+    last: int | None,
+    sort: SortKey,
+    as_json: bool,
+) -> None:
+    """List the runs in FOLDER.
+
+    Saved results are read, and run records where there is no result, but no states.
+    """
+    from datetime import datetime
+
+    from msg_analysis.runs.run_filter import RunFilter, moment
+    from msg_analysis.runs.run_list import list_runs
+
+    now = datetime.now().astimezone()
+    wanted = RunFilter(
+        name=name,
+        verdicts=verdicts,
+        since=moment(since, "--since", now) if since is not None else None,
+        until=moment(until, "--until", now, end=True) if until is not None else None,
+        seed=seed,
+        last=last,
+    )
+    found = list_runs(folder)
+    chosen = wanted.choose(found, sort)
+    if as_json:
+        print_json({"folder": str(folder), "total": len(found), "runs": [run.to_json() for run in chosen]})
+    else:
+        from msg_analysis.report.terminal.runs_text import print_runs
+
+        print_runs(chosen, folder, len(found), result_console())
