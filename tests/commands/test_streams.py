@@ -29,6 +29,8 @@ NEW = "NEW"  # a name that is not there yet
 WORDS = {  # what each of the others is given
     ("msg-analysis", "predict"): ["EXPERIMENT"],
     ("msg-analysis", "simulate"): ["EXPERIMENT", "--duration", "5", "--out", NEW],
+    ("msg-analysis", "diff"): ["BAG", "BAG"],
+    ("msg-analysis", "runs"): ["FOLDER"],
     ("msg-analysis", "leaders"): ["EXPERIMENT", "--count", "1"],
     ("msg-analysis", "figures"): ["1", "--out", NEW, "--format", "svg"],
     ("msg-analysis", "info"): ["EXPERIMENT"],
@@ -41,6 +43,7 @@ WORDS = {  # what each of the others is given
     ("msg-analysis", "sweep"): ["SWEEP", "--workers", "1", "--out", NEW],
     ("msg-agents", "examples"): [],
     ("msg-agents", "new"): [NEW, "--agents", "4"],
+    ("msg-agents", "runs"): ["FOLDER"],
     ("msg-agents", "check"): ["BAG"],
     ("msg-agents", "prepare"): ["EXPERIMENT"],
     ("msg-agents", "host"): ["RECORD", "HOSTS", "--profile"],
@@ -66,7 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def outcomes(folder: Path, *jobs: tuple[tuple[str, str], str]) -> Iterator[tuple[tuple[str, str], str, int, str, str]]:
     """Command, kind, exit code, stdout, stderr; a kind is "plain", "json", or what stdout is (many_commands)."""
     places = {"EXPERIMENT": LINE_RING, "BAG": "bag", "RESULT": "result.json", "RECORD": "run.json"}
-    places |= {"HOSTS": "hosts.yaml", "SWEEP": "sweep.yaml"}
+    places |= {"HOSTS": "hosts.yaml", "SWEEP": "sweep.yaml", "FOLDER": "."}
     lines = []
     for (program, name), kind in jobs:
         words = [str(places.get(word, word)) for word in WORDS.get((program, name), [])]

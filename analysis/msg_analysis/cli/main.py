@@ -33,6 +33,7 @@ from msg_analysis.cli.options import (
     SOURCE,
     duration_option,
     experiment_argument,
+    is_bag,
     json_option,
     seed_option,
 )
@@ -238,7 +239,7 @@ def info(source: Path, as_json: bool) -> None:
     from msg_analysis.report.documents.info import describe_bag, describe_experiment
     from msg_analysis.report.terminal import bag_text, experiment_text
 
-    if source.is_dir() or {".mcap", ".db3"} & set(source.suffixes):
+    if is_bag(source):
         document, show = describe_bag(source), bag_text.print_bag
     else:
         document, show = describe_experiment(ValidExperiment.load(source)), experiment_text.print_experiment
@@ -272,6 +273,7 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
 main.add_command(compare.compare)
 main.add_command(compare.tabulate)
 main.add_command(runs.runs)
+main.add_command(runs.diff)
 main.add_command(theory.transient)
 main.add_command(theory.facts)
 main.add_command(sweep.sweep)

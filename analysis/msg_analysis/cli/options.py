@@ -104,6 +104,12 @@ RUN_RECORD = InputPath(".json")
 PATH = click.Path(path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 
+
+def is_bag(source: Path) -> bool:
+    """Whether a ``SOURCE`` is a bag, and not an experiment file."""
+    return source.is_dir() or bool({".mcap", ".db3"} & set(source.suffixes))
+
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 experiment_argument = click.argument("experiment", type=EXPERIMENT)
 seed_option = click.option("--seed", type=int, metavar="N", help="Seed of the run (run.seed).")

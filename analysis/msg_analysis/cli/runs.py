@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Commands about saved runs: ``runs``, which is also one of ``msg-agents``."""
+"""Commands about saved runs: ``runs``, which is also one of ``msg-agents``, and ``diff``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import click
 
 from msg_analysis.cli.console import examples, print_json, result_console
-from msg_analysis.cli.options import PATH, json_option, seed_option
+from msg_analysis.cli.options import PATH, SOURCE, is_bag, json_option, seed_option
 
 if TYPE_CHECKING:
     from msg_analysis.runs.run_filter import SortKey
@@ -91,3 +91,48 @@ def runs(
         from msg_analysis.report.terminal.runs_text import print_runs
 
         print_runs(chosen, folder, len(found), result_console())
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis diff runs/line_ring_20250101_120000 line_ring_twin",
+        "msg-analysis diff line_ring.yaml fast_switching.yaml",
+        "msg-analysis diff line_ring.yaml fast_switching.yaml --json | jq .keys",
+    )
+)
+@click.argument("a", type=SOURCE)
+@click.argument("b", type=SOURCE)
+@json_option
+def diff(a: Path, b: Path, *, as_json: bool) -> None:
+    """Say what differs between A and B: two bags, or two experiment files.
+
+    Of bags: experiment, versions, states to the last bit, graphs, verdicts and measured errors. Of experiments: keys,
+    predictions, decay rates and leaders. The exit code is 0 whether they differ or not.
+    """
+    from msg_analysis.errors import InputError
+
+    bags = [is_bag(path) for path in (a, b)]
+    if bags[0] != bags[1]:
+        bag, experiment = (a, b) if bags[0] else (b, a)
+        raise InputError(f"{bag} is a bag, {experiment} an experiment: expected two bags or two experiment files")
+    if bags[0]:
+        from msg_analysis.cli.progress import WorkProgress
+        from msg_analysis.common.long_work import watched
+        from msg_analysis.report.terminal.difference_text import print_bag_difference as show
+        from msg_analysis.runs.bag_difference import bag_difference
+
+        with WorkProgress() as work, watched(work):
+            document = bag_difference(a, b)
+    else:
+        from msg_analysis.cli.progress import SolveProgress
+        from msg_analysis.model.experiment.experiment import ValidExperiment
+        from msg_analysis.report.terminal.difference_text import print_experiment_difference as show
+        from msg_analysis.runs.experiment_difference import experiment_difference
+
+        one, other = (ValidExperiment.load(path) for path in (a, b))
+        with SolveProgress("leaders") as search:
+            document = experiment_difference(one, other, search)
+    if as_json:
+        print_json(document)
+    else:
+        show(document, result_console())

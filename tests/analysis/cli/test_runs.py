@@ -1,0 +1,102 @@
+"""The commands ``runs`` and ``diff``: what they print, and their exit codes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+
+from msg_agents.cli.main import main as agents
+from msg_analysis import Experiment
+from msg_analysis.cli.main import main
+from msg_analysis.common.text.json_numbers import json_text
+
+DOCUMENT = {
+    "name": "pair",
+    "graphs": {"line": {"path": [1, 2, 3]}},
+    "run": {"dt": 0.1, "duration": 20, "seed": 7, "start": "zero"},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs, one of them compared, a folder of strangers, and two experiments."""
+    place = tmp_path_factory.mktemp("place")
+    for seed in (7, 8):
+        run = Experiment.parse(DOCUMENT).simulate(seed=seed)
+        run.save(place / "runs" / f"pair_2026112{seed}_120000")
+    result = run.compare().to_json()
+    (place / "runs" / "pair_20261128_120000" / "result.json").write_text(json_text(result))
+    (place / "runs" / "photos").mkdir()
+    (place / "runs" / "photos" / "a.jpg").write_text("")
+    (place / "a.yaml").write_text(yaml.safe_dump(DOCUMENT))
+    (place / "b.yaml").write_text(yaml.safe_dump(DOCUMENT | {"noise": {"process": 2.0}}))
+    return place
+
+
+@pytest.fixture(autouse=True)
+def _there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+
+
+def invoke(*words: str, code: int = 0) -> Result:
+    result = CliRunner().invoke(main, words, prog_name="msg-analysis", env={"COLUMNS": "120"})
+    assert (result.exit_code, result.exception if code == 0 else None) == (code, None), result.output
+    return result
+
+
+def test_both_programs_have_one_command() -> None:
+    assert agents.commands["runs"] is main.commands["runs"]
+
+
+def test_runs() -> None:
+    text = invoke("runs").stdout
+    assert "3 runs: " in text
+    for word in ("photos", "foreign", "not compared", "agrees", "2026-11-27 12:00"):
+        assert word in text
+    text = invoke("runs", "--name", "pair").stdout
+    assert "2 runs of 3" in text
+    assert "2026-11-27 12:00" not in text  # the names of the folders have it
+    assert "none of 3 runs" in invoke("runs", "--seed", "9").stdout
+    document = json.loads(invoke("runs", "--verdict", "agrees", "--json").stdout)
+    assert (document["folder"], document["total"]) == ("runs", 3)
+    assert [run["seed"] for run in document["runs"]] == [8]
+
+
+def test_diff_of_bags() -> None:
+    bags = [f"runs/pair_2026112{seed}_120000" for seed in (7, 8)]
+    text = invoke("diff", *bags).stdout
+    for words in ("run.seed", "A: 7", "first difference at step 1", "in standard errors", "Versions: no difference"):
+        assert words in text
+    assert json.loads(invoke("diff", *bags, "--json").stdout)["kind"] == "bags"
+    same = invoke("diff", bags[0], bags[0]).stdout
+    assert "equal to the last bit, x(0) to x(200)" in same
+    assert "same seed" in same
+
+
+def test_diff_of_experiments() -> None:
+    text = invoke("diff", "a.yaml", "b.yaml").stdout
+    for words in ("noise.process", "+300 %", "Decay rates", "best of A"):
+        assert words in text
+    assert json.loads(invoke("diff", "a.yaml", "b.yaml", "--json").stdout)["kind"] == "experiments"
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (("diff", "a.yaml", "runs/pair_20261127_120000"), "expected two bags or two experiment files"),
+        (("diff", "runs/pair_20261127_120000", "a.yaml"), "expected two bags or two experiment files"),
+        (("diff", "runs/photos", "runs/photos"), "not a bag"),
+        (("diff", "a.yaml", "none.yaml"), "none.yaml"),
+        (("runs", "none"), "expected a folder with the folders of runs"),
+        (("runs", "--since", "soon"), "--since soon: expected a date"),
+    ],
+)
+def test_mistakes(words: tuple[str, ...], error: str) -> None:
+    result = invoke(*words, code=2)
+    assert error in result.stderr
+    assert result.stderr.count("error:") == 1
+    assert result.stdout == ""
