@@ -374,8 +374,9 @@ def write_report(comparison: Comparison, file: str | Path, **options: Any) -> Pa
     file
         path of the page; replaced if it exists
     **options
-        what the network reported, if known: ``restarts``, a line per process that was restarted, and ``strangers``, a
-        mapping with ``node``, ``topic``, ``reason`` and ``count`` per kind of refused message
+        what the network reported, if known: ``restarts``, a line per process that was restarted; ``strangers``, a
+        mapping with ``node``, ``topic``, ``reason`` and ``count`` per kind of refused message; ``wall_time``, the
+        seconds that the run took
 
     Returns
     -------

@@ -129,6 +129,13 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
         from msg_analysis.report.html.report_page import write_report
 
         file = result.bag / REPORT_FILE
-        write_report(comparison, result.trajectory, file, restarts=result.restarts, strangers=result.strangers)
+        write_report(
+            comparison,
+            result.trajectory,
+            file,
+            restarts=result.restarts,
+            strangers=result.strangers,
+            wall_time=result.wall_time,
+        )
         result.report = file
     result.comparison = comparison

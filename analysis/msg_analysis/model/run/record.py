@@ -20,6 +20,7 @@ and so what any bag of the network holds, whoever recorded it.
 
 from __future__ import annotations
 
+import datetime
 import json
 import platform
 import uuid
@@ -64,6 +65,10 @@ def software_versions() -> dict[str, str]:
     }
 
 
+def _now() -> datetime.datetime:
+    return datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+
+
 @dataclass(frozen=True, eq=False)
 class RunRecord:
     """One run of an experiment.
@@ -86,6 +91,8 @@ class RunRecord:
     key
         with which the nodes sign what steers the run: see ``wire.signatures``; None where it is not known, in bags for
         example, or not used
+    started
+        when the record was made; None in records of the first edition
     """
 
     run: uuid.UUID
@@ -94,6 +101,7 @@ class RunRecord:
     versions: dict[str, str] = field(default_factory=software_versions)
     matrices: StepMatrices | None = None
     key: bytes | None = field(default=None, repr=False)
+    started: datetime.datetime | None = field(default_factory=_now)
 
     @cached_property
     def model(self) -> Wiring:
@@ -120,6 +128,8 @@ class RunRecord:
             "start": self.start.tolist(),
             "versions": self.versions,
         }
+        if self.started:
+            document["started"] = self.started.isoformat()
         if self.experiment.protocol:
             document["protocol"] = self.experiment.protocol.info.to_json()
         if self.matrices:
@@ -159,7 +169,7 @@ class RunRecord:
             matrices = _without_matrices(experiment) if step is None else _matrices(step, experiment, source)
             run, versions = uuid.UUID(document["run"]), dict(document["versions"])
             key = bytes.fromhex(document["key"]) if "key" in document else None
-            record = cls(run, experiment, start, versions, matrices, key)
+            record = cls(run, experiment, start, versions, matrices, key, _started(document))
         except InputError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
@@ -168,6 +178,13 @@ class RunRecord:
         if start.shape != expected or not np.isfinite(start).all():
             raise InputError(f"{source}: start has shape {start.shape}, expected finite numbers of shape {expected}")
         return record
+
+
+def _started(document: dict[str, Any]) -> datetime.datetime | None:
+    if "started" not in document:
+        return None
+    found = datetime.datetime.fromisoformat(document["started"])
+    return (found if found.tzinfo else found.replace(tzinfo=datetime.UTC)).astimezone(datetime.UTC)
 
 
 def _entries(matrix: FloatArray) -> list[list[float]]:

@@ -53,7 +53,7 @@ from msg_analysis.report.documents.comparison_words import (
 )
 from msg_analysis.report.documents.explanation import explain, graph_facts
 from msg_analysis.report.figures.palette import LINE_COLOURS
-from msg_analysis.report.html import error_plots, network_drawings, switching_plots
+from msg_analysis.report.html import error_plots, network_drawings, run_heading, switching_plots
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
@@ -69,10 +69,11 @@ def write_report(
     *,
     restarts: Sequence[str] = (),
     strangers: Sequence[Mapping[str, Any]] = (),
+    wall_time: float | None = None,
 ) -> None:
     """Write the report of a comparison, whole or not at all; InputError if that fails. Arguments as in ``render``."""
     path = Path(path)
-    html = render(comparison, trajectory, restarts=restarts, strangers=strangers)
+    html = render(comparison, trajectory, restarts=restarts, strangers=strangers, wall_time=wall_time)
     try:
         write_whole(path, html.encode())
     except OSError as error:
@@ -85,6 +86,7 @@ def render(
     *,
     restarts: Sequence[str] = (),  # one line per process that was restarted
     strangers: Sequence[Mapping[str, Any]] = (),  # refused messages: node, topic, reason, count
+    wall_time: float | None = None,  # [s] that the run took, if known
 ) -> str:
     """The report as HTML text."""
     document = comparison.to_json()
@@ -107,6 +109,9 @@ def render(
     timing = document["timing"]
     return environment.get_template("report.html.j2").render(
         document=document,
+        title=run_heading.page_title(comparison),
+        run_facts=run_heading.run_facts(comparison, wall_time),
+        symbol=run_heading.SYMBOLS[document["verdict"]],
         restarts=restarts,
         strangers=strangers,
         headline=verdict_line(document),

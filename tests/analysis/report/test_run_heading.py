@@ -1,0 +1,71 @@
+"""The head of the report: what tells runs apart."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+
+import pytest
+
+from msg_analysis.errors import InputError
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.inference.verdict.pool import compare_pooled
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.report.html.run_heading import page_title, run_facts
+from msg_analysis.twin.simulate import new_record, simulate
+
+DOCUMENT = {
+    "name": "pair",
+    "graphs": {"pair": {"path": [1, 2]}},
+    "run": {"dt": 0.05, "duration": 20, "seed": 3, "start": "zero"},
+}
+NOON = datetime.datetime(2026, 11, 25, 12, 0, 59, tzinfo=datetime.UTC)
+
+
+def run(started: datetime.datetime | None = NOON, **changes: object) -> Trajectory:
+    experiment = ValidExperiment.parse(DOCUMENT | {"run": DOCUMENT["run"] | changes})  # type: ignore[operator]
+    found = simulate(experiment)
+    return dataclasses.replace(found, record=dataclasses.replace(found.record, started=started))
+
+
+def test_one_run() -> None:
+    comparison = compare(run())
+    assert page_title(comparison) == f"✓ pair, seed 3, 2026-11-25 12:00: {comparison.verdict}"
+    assert run_facts(comparison, 12.34) == [
+        ("seed", "3"),
+        ("date", "2026-11-25 12:00 UTC"),
+        ("duration", "20 units of time, 400 steps of 0.05, in 12.3 s"),
+        ("pace", "lockstep"),
+    ]
+
+
+def test_real_time_of_unknown_date() -> None:
+    comparison = compare(run(None, pace="realtime", speed=5))
+    assert page_title(comparison).startswith("✓ pair, seed 3: ")
+    assert [name for name, _ in run_facts(comparison, None)] == ["seed", "duration", "pace"]
+    assert run_facts(comparison, None)[-1] == ("pace", "real time, 5 units of time per second")
+
+
+def test_several_runs() -> None:
+    later = NOON + datetime.timedelta(days=1)
+    comparison = compare_pooled([("a", run(later)), ("b", run(seed=4))])
+    assert page_title(comparison).startswith("✓ pair, 2 runs, seeds 3, 4, 2026-11-25 12:00: ")
+    facts = dict(run_facts(comparison, None))
+    assert facts["seeds"] == "3, 4"
+    assert facts["date"] == "2026-11-25 12:00 to 2026-11-26 12:00 UTC"
+    assert facts["duration"] == "20 units of time, 400 steps of 0.05 each"
+
+
+def test_the_record_keeps_its_date() -> None:
+    record = new_record(ValidExperiment.parse(DOCUMENT))
+    assert record.started is not None
+    again = RunRecord.from_json(record.to_json(), "here")
+    assert again.started == record.started
+    assert again.to_json() == record.to_json()
+    assert RunRecord.from_json(record.to_json().replace('"started"', '"other"'), "here").started is None
+    local = record.to_json().replace(record.started.isoformat(), "2026-11-25T13:00:59+01:00")
+    assert RunRecord.from_json(local, "here").started == NOON
+    with pytest.raises(InputError, match="not a run record"):
+        RunRecord.from_json(record.to_json().replace(record.started.isoformat(), "yesterday"), "here")
