@@ -153,7 +153,7 @@ def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agents: int) ->
     assert "z = −1.31" in page.text
     for i in range(agents):
         assert f"{0.3 + i / 100:#.4g}" in page.text
-    assert _plots(page) == 6
+    assert _plots(page) == 9
     assert page.tags.count("svg") == 3  # two graphs and the chain
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
 
@@ -247,7 +247,7 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         "predicted, logged pattern",
     ):
         assert text in page.text
-    assert _plots(page) == 9
+    assert _plots(page) == 12
     without_figures(monkeypatch)
     on_time = in_real_time(0)
     write_report(on_time, on_time.trajectory, tmp_path / "report.html")

@@ -118,6 +118,67 @@ def test_small_and_large(browser: Any, tmp_path: Path, agents: int) -> None:
     page.close()
 
 
+def test_trajectories(browser: Any, tmp_path: Path) -> None:
+    """Agents are switched on and off, and every part of the run can be seen, with the keyboard alone."""
+    trajectory = _trajectory(5, duration=200)
+    path = tmp_path / "report.html"
+    write_report(compare(trajectory), trajectory, path)
+    page, log = _open(browser, path)
+
+    def drawn(name: str, column: str) -> Any:
+        return page.evaluate(f"Bokeh.documents[0].get_model_by_name('{name}').data['{column}']")
+
+    def settled(condition: str) -> None:  # not by wait_for_function, which the page does not allow
+        page.evaluate(
+            f"""() => new Promise((done) => {{
+                const model = (name) => Bokeh.documents[0].get_model_by_name(name);
+                const look = () => ({condition} ? done() : requestAnimationFrame(look));
+                look();
+            }})"""
+        )
+
+    assert drawn("states", "agent") == [f"agent {i}" for i in range(1, 6)]
+    page.focus("#agent-buttons button:nth-child(2)")
+    page.keyboard.press("Space")
+    settled("model('states').data.agent.length == 4")
+    assert page.input_value("#shown-agents") == "1, 3-5"
+    assert page.get_attribute("#agent-buttons button:nth-child(2)", "aria-pressed") == "false"
+    page.fill("#shown-agents", "2-3")
+    settled("model('states').data.agent.join() == 'agent 2,agent 3'")
+
+    # Between steps 2000 and 2100 every value is drawn, and is that of the run.
+    page.fill("#from", "100")
+    page.fill("#to", "105")
+    page.keyboard.press("Tab")
+    settled("model('time').end == 105 && model('states').data.xs[0].at(-1) < 106")
+    xs, ys = np.array(drawn("states", "xs")[0]), np.array(drawn("states", "ys")[0])
+    steps = np.rint(xs / 0.05).astype(int)
+    assert set(range(2000, 2101)) <= set(steps.tolist())
+    assert np.allclose(ys, trajectory.values[steps, 1, 0], atol=1e-5)
+    lanes = {key: np.array(drawn("lanes", key)) for key in ("left", "right", "graph")}
+    for left, right, graph in zip(*lanes.values(), strict=True):
+        assert (trajectory.modes[round(left / 0.05) : round(right / 0.05)] == graph).all()
+
+    # The whole run is drawn with a few points per pixel, none of which is beyond the run's.
+    page.focus("#whole")
+    page.keyboard.press("Enter")
+    settled("model('time').end == 200 && model('states').data.xs[0][0] < 1")
+    ys = np.array(drawn("states", "ys")[0])
+    assert len(ys) < 2500
+    assert np.isclose(ys.max(), trajectory.values[:, 1, 0].max(), atol=1e-5)
+    page.focus("#deviation")
+    page.keyboard.press("Space")
+    settled("model('centre').data.y.join() == '0,0'")
+    apart = trajectory.values[:, 1, 0] - trajectory.values[:, :, 0].mean(axis=1)
+    settled(f"Math.abs(Math.max(...model('states').data.ys[0]) - {apart.max()}) < 1e-4")
+    page.click("#earlier")
+    page.click("#closer")
+    page.click("#show-none")
+    settled("model('states').data.agent.length == 0")
+    assert log.complaints == []
+    page.close()
+
+
 def _in_real_time() -> tuple[Any, Trajectory]:
     trajectory = _trajectory(3, pace="realtime", speed=5.0)
     assert trajectory.made is not None

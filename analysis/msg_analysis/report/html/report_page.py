@@ -53,12 +53,12 @@ from msg_analysis.report.documents.comparison_words import (
 )
 from msg_analysis.report.documents.explanation import explain, graph_facts
 from msg_analysis.report.figures.palette import LINE_COLOURS
-from msg_analysis.report.html import error_plots, network_drawings, run_heading, switching_plots
+from msg_analysis.report.html import error_plots, network_drawings, run_heading, switching_plots, trajectory_plots
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
 _SMALL_CHAIN = 8  # most graphs whose transitions are listed
-_FIRST_LINES = 5
+_FIRST_LINES, _FIRST_TRAJECTORIES = 5, 8
 _NODE_TEST = "error of agent "  # beginning of the names of the tests of the nodes
 
 
@@ -101,6 +101,7 @@ def render(
     environment.filters |= {"number": _number, "p": _p, "z": _z}
     names = [graph.name for graph in experiment.graph_list]
     models, sojourns = _models(document, comparison, trajectory)
+    accused: list[int] = []
     figures = Document()
     with figures.models.freeze():  # otherwise every figure is gone through again for each one added
         for model in models.values():
@@ -135,7 +136,9 @@ def render(
         most_lines=error_plots.MOST_LINES,
         sojourns=sojourns[1],
         shown_sojourns=sojourns[0],
-        at_once=switching_plots.FIRST_SOJOURNS,
+        shown=shown_agents(experiment.agents, accused),
+        accused=accused,
+        replica=trajectory_plots.REPLICA + 1,
         explained=explain(experiment),
         drawings=network_drawings.graph_drawings(experiment),
         graph_facts=graph_facts(experiment),
@@ -164,11 +167,11 @@ def _models(
     }
     if len(comparison.running["time"]) > 1:
         models["running"] = error_plots.convergence(comparison.running, document["system_error"]["predicted"])
-    known, sojourns = trajectory.modes[:steps], (0, 0)
+    drawn, sojourns = trajectory_plots.trajectory_plots(trajectory, document["system_error"]["predicted"])
+    models |= drawn
+    known = trajectory.modes[:steps]
     if len(known):
         names = [graph.name for graph in experiment.graph_list]
-        models["modes"], *counts = switching_plots.active_graph(known, names, experiment.step_length)
-        sojourns = counts[0], counts[1]
         models["occupancy"] = switching_plots.occupancy(known, names, experiment.chain.stationary)
         if not document["unpredicted"]:
             reference = None if experiment.problem == "consensus" else experiment.reference
@@ -183,6 +186,12 @@ def _models(
         models["lateness"] = error_plots.lateness(document["timing"])
         models["staleness"] = error_plots.staleness(document["timing"])
     return {name: model for name, model in models.items() if model is not None}, sojourns
+
+
+def shown_agents(agents: int, accused: Sequence[int]) -> list[int]:
+    """The agents (from 1) whose trajectories are drawn at first: the accused, and the first ones."""
+    others = [agent for agent in range(1, agents + 1) if agent not in accused]
+    return sorted([*accused[:_FIRST_TRAJECTORIES], *others[: max(_FIRST_TRAJECTORIES - len(accused), 0)]])
 
 
 def _first_agents(document: dict[str, Any]) -> list[int]:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Figures of the report about the graphs: which was active when, and for what share of the time."""
+"""Figure of the report about the graphs: for what share of the time each was active."""
 
 from __future__ import annotations
 
@@ -38,49 +38,9 @@ from msg_analysis.report.figures.palette import (
 from msg_analysis.report.html.plot_style import SANS, new_figure
 from msg_analysis.types import FloatArray, IntArray
 
-FIRST_SOJOURNS, _MOST_SOJOURNS = 120, 4000  # visible at first; in the figure at most
-
-
-def active_graph(
-    modes: IntArray,  # (steps,) from 0; -1 where not known
-    names: Sequence[str],
-    dt: float,  # [units of simulated time]
-) -> tuple[UIElement, int, int]:
-    """Which graph was active when; with the figure, the number of sojourns in it and in the run."""
-    starts = np.flatnonzero(np.diff(modes, prepend=-2))
-    ends = np.append(starts[1:], len(modes))
-    kept = min(len(starts), _MOST_SOJOURNS)
-    mode = modes[starts[:kept]]
-    known = mode >= 0
-    data = {
-        "left": starts[:kept][known] * dt,
-        "right": ends[:kept][known] * dt,
-        "mode": mode[known],
-        "name": [names[g] for g in mode[known].tolist()],
-        "colour": [mode_colour(g) for g in mode[known].tolist()],
-        "held": (ends - starts)[:kept][known] * dt,
-    }
-    first = ends[min(kept, FIRST_SOJOURNS) - 1] * dt
-    path = new_figure(
-        _height(names),
-        "xpan,xbox_zoom,xwheel_zoom,reset,save",
-        title="active graph",
-        x_range=Range1d(0.0, float(first), bounds=(0.0, float(ends[kept - 1] * dt))),
-        y_range=Range1d(len(names) - 0.4, -0.6),
-        x_axis_label="simulated time",
-        min_border_right=12,
-    )
-    bars = path.hbar("mode", left="left", right="right", height=0.72, color="colour", line_alpha=0, source=data)
-    rows = [("graph", "@name"), ("from", "@left{0.[00]} to @right{0.[00]}"), ("duration", "@held{0.[00]}")]
-    path.add_tools(HoverTool(renderers=[bars], tooltips=rows))
-    _name_graphs(path, names)
-    # As plain text: for mathematics, the page would load a library from the network.
-    path.yaxis.major_label_overrides = {g: PlainText(text=shorten(name)) for g, name in enumerate(names)}
-    return path, kept, len(starts)
-
 
 def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> UIElement:
-    """Share of the time of every graph next to the stationary law (n,), in the order of ``active_graph``."""
+    """Share of the time of every graph next to the stationary law (n,)."""
     present = modes[modes >= 0]
     share = np.bincount(present, minlength=len(names)) / max(len(present), 1)
     places = np.arange(len(names))
@@ -115,7 +75,8 @@ def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> 
         )
     )
     _name_graphs(shares, names)
-    shares.yaxis.major_label_text_font_size = "0px"
+    # As plain text: for mathematics, the page would load a library from the network.
+    shares.yaxis.major_label_overrides = {g: PlainText(text=shorten(name)) for g, name in enumerate(names)}
     return shares
 
 

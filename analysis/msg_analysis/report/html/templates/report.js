@@ -11,16 +11,16 @@
   let model = () => null;
   let busy = false;
 
-  function parse(text) {
+  window.parseAgents = (text, agents) => {
     const chosen = new Set();
     for (const part of text.split(/[\s,;]+/).filter(Boolean)) {
       const found = /^(\d+)(?:[-–](\d+))?$/.exec(part);
       const from = found ? Number(found[1]) : 0, to = found ? Number(found[2] || found[1]) : 0;
-      if (!found || from < 1 || to > rows.length || from > to) return { wrong: part };
+      if (!found || from < 1 || to > agents || from > to) return { wrong: part };
       for (let agent = from; agent <= to; agent += 1) chosen.add(agent);
     }
     return { agents: [...chosen].sort((a, b) => a - b) };
-  }
+  };
 
   function draw(agents) {
     const lines = model("lines"), bands = model("bands"), all = model("all_agents");
@@ -73,13 +73,15 @@
       choose(agents);
     });
     choose([]);
+    document.body.dataset.started = "yes";
+    if (document.getElementById("trajectories")) return;  // its script says when it has drawn
     const drawn = () => { document.body.dataset.ready = "yes"; };
     if (shown.is_idle) drawn();
     else shown.idle.connect(drawn);
   }
 
   field.addEventListener("input", () => {
-    const { agents, wrong } = parse(field.value);
+    const { agents, wrong } = window.parseAgents(field.value, rows.length);
     if (wrong === undefined) choose(agents);
     else said.textContent = `${wrong}: expected numbers from 1 to ${rows.length}, such as 3, 10-14`;
   });

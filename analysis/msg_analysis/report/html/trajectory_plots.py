@@ -1,0 +1,177 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""States, active graph and error of one replica on one time axis; the page's script fills in what is visible."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, PlainText, Range1d, RangeTool, UIElement
+
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.report.figures.palette import BLACK, BLUE, GREY, SKY, mode_colour, shorten
+from msg_analysis.report.html.plot_style import new_figure
+from msg_analysis.report.html.thinned_run import Thinned, envelope, thin
+from msg_analysis.types import FloatArray, IntArray
+
+REPLICA = 0  # which is drawn, from 0
+MOST_SOJOURNS = 20_000  # of a run, that are drawn
+_WHOLE, _FIRST_SOJOURNS = 1500, 30  # steps of a run that is seen whole at first; sojourns visible at first of others
+_OVERVIEW = 400  # bins
+_LEFT, _RIGHT = 76, 14  # pixels beside every figure: equal, so that they have one time axis
+_TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
+
+
+def trajectory_plots(trajectory: Trajectory, predicted: float | None) -> tuple[dict[str, UIElement], tuple[int, int]]:
+    """The figures by name, empty for a run without states; with them, how many sojourns are drawn and are known."""
+    experiment = trajectory.record.experiment
+    states, modes, dt = trajectory.values, trajectory.modes, experiment.step_length
+    if len(states) < 2 or not len(modes):
+        return {}, (0, 0)
+    reference = None if experiment.problem == "consensus" else experiment.reference
+    thinned = thin(states, REPLICA, reference)
+    names = [graph.name for graph in experiment.graph_list]
+    starts = np.flatnonzero(np.diff(modes, prepend=-2))
+    time = Range1d(0.0, _first_view(starts, len(modes), dt), bounds=(0.0, float(len(modes) * dt)), name="time")
+    shown = min(len(starts), MOST_SOJOURNS)
+    end = int(starts[shown]) if shown < len(starts) else len(modes)
+    data = _data(thinned, experiment.agents, dt)
+    data.append(
+        _source("sojourns", start=np.append(starts[:shown], end) * dt, graph=np.append(modes[starts[:shown]], -1))
+    )
+    data.append(_source("graphs", name=names, colour=[mode_colour(mode) for mode in range(len(names))]))
+    figures = {
+        "trajectories": _states(time, data),
+        "path": _active_graph(time, names),
+        "errors": _error(time, predicted),
+        "overview": _overview(time, thinned, float(len(modes) * dt)),
+    }
+    return figures, (shown, len(starts))
+
+
+def _first_view(starts: IntArray, steps: int, dt: float) -> float:
+    """End of what is visible at first: so much that single sojourns can be seen."""
+    if steps <= _WHOLE:
+        return float(steps * dt)
+    sojourns = int(starts[_FIRST_SOJOURNS]) if len(starts) > _FIRST_SOJOURNS else steps
+    return float(min(max(sojourns, _WHOLE // 3), steps) * dt)
+
+
+def _source(label: str, **columns: object) -> ColumnDataSource:
+    return ColumnDataSource(dict(columns), name=label)
+
+
+def _data(thinned: Thinned, agents: int, dt: float) -> list[ColumnDataSource]:
+    """What the script draws from: agent by agent, and bin by bin."""
+    (low, high), (below, above) = thinned.values, thinned.deviations
+    columns = {"low": low, "deviation_low": below}
+    if thinned.width > 1:
+        columns |= {"high": high, "deviation_high": above}
+    band, spread = envelope(thinned.values), envelope(thinned.deviations)
+    return [
+        _source("thinned_agents", **{key: array.T.ravel() for key, array in columns.items()}),
+        _source(
+            "thinned_bins",
+            centre_low=thinned.centre[0][:, 0],
+            centre_high=thinned.centre[1][:, 0],
+            error_low=thinned.error[0][:, 0],
+            error_high=thinned.error[1][:, 0],
+            band_low=band[0],
+            band_high=band[1],
+            spread_low=spread[0],
+            spread_high=spread[1],
+        ),
+        _source("thinned_scale", width=[thinned.width], dt=[dt], agents=[agents]),
+    ]
+
+
+def _states(time: Range1d, data: list[ColumnDataSource]) -> UIElement:
+    plot = new_figure(
+        330, _TOOLS, x_range=time, y_range=Range1d(-1.0, 1.0, name="states_range"), y_axis_label="state",
+        toolbar_location="above", min_border_left=_LEFT, min_border_right=_RIGHT,
+    )  # fmt: skip
+    plot.xaxis.visible = False
+    plot.vstrip("left", "right", source=_source("strips", left=[], right=[], colour=[]), color="colour", alpha=0.16)
+    plot.varea("x", "low", "high", source=_source("band", x=[], low=[], high=[]), color=GREY, alpha=0.25)
+    lines = plot.multi_line(
+        "xs", "ys", color="colour", line_dash="dash", line_width="width",
+        source=_source("states", xs=[], ys=[], agent=[], colour=[], dash=[], width=[]),
+    )  # fmt: skip
+    plot.line("x", "y", source=_source("centre", x=[], y=[]), color=BLACK, line_width=1.5, line_dash="dashed")
+    rows = [("", "@agent"), ("time", "$data_x{0.[000]}"), ("state", "$data_y{0.000}")]
+    plot.add_tools(HoverTool(renderers=[lines], tooltips=rows, line_policy="nearest"))
+    plot.tags = data  # sources that no glyph uses
+    return plot
+
+
+def _active_graph(time: Range1d, names: Sequence[str]) -> UIElement:
+    plot = new_figure(
+        int(min(26 + 22 * len(names), 420)), _TOOLS, x_range=time, y_range=Range1d(len(names) - 0.4, -0.6),
+        y_axis_label="graph", toolbar_location=None, min_border_left=_LEFT, min_border_right=_RIGHT,
+    )  # fmt: skip
+    plot.xaxis.visible = False
+    lanes = _source("lanes", graph=[], left=[], right=[], colour=[], name=[])
+    bars = plot.hbar("graph", left="left", right="right", height=0.76, color="colour", line_alpha=0, source=lanes)
+    rows = [("graph", "@name"), ("from", "@left{0.[00]} to @right{0.[00]}")]
+    plot.add_tools(HoverTool(renderers=[bars], tooltips=rows))
+    plot.ygrid.grid_line_color = None
+    plot.yaxis.ticker = FixedTicker(ticks=list(range(len(names))))
+    # As plain text: for mathematics, the page would load a library from the network.
+    plot.yaxis.major_label_overrides = {g: PlainText(text=shorten(name, 7)) for g, name in enumerate(names)}
+    return plot
+
+
+def _error(time: Range1d, predicted: float | None) -> UIElement:
+    plot = new_figure(
+        170, _TOOLS, x_range=time, y_range=Range1d(0.0, 1.0, name="error_range"),
+        x_axis_label="simulated time", y_axis_label="error", toolbar_location=None, min_border_left=_LEFT, min_border_right=_RIGHT,
+    )  # fmt: skip
+    plot.vstrip(
+        "left", "right", source=_source("error_strips", left=[], right=[], colour=[]), color="colour", alpha=0.16
+    )
+    line = plot.line("x", "y", source=_source("error", x=[], y=[]), color=BLUE, line_width=1.3)
+    plot.add_tools(
+        HoverTool(renderers=[line], tooltips=[("time", "@x{0.[000]}"), ("error", "@y{0.0000}")], mode="vline")
+    )
+    if predicted is not None:
+        ends = [time.bounds[0], time.bounds[1]]
+        plot.line(ends, [predicted] * 2, color=BLACK, line_width=1.5, line_dash="dashed", name="predicted")
+    return plot
+
+
+def _overview(time: Range1d, thinned: Thinned, end: float) -> UIElement:
+    """The whole run, small, with the visible part as a frame that can be moved."""
+    low, high = (_fewer(part, least) for part, least in zip(envelope(thinned.values), (True, False), strict=True))
+    x = np.linspace(0.0, end, len(low))
+    plot = new_figure(
+        64, "", x_range=Range1d(0.0, end), toolbar_location=None, min_border_left=_LEFT, min_border_right=_RIGHT
+    )
+    plot.varea(x, low, high, color=SKY, alpha=0.8)
+    plot.line(x, low, color=BLUE, line_width=0.7)
+    plot.line(x, high, color=BLUE, line_width=0.7)
+    plot.yaxis.visible = False
+    plot.ygrid.grid_line_color = None
+    tool = RangeTool(x_range=time)
+    tool.overlay.fill_color, tool.overlay.fill_alpha = GREY, 0.2
+    tool.overlay.line_color, tool.overlay.line_width = BLUE, 2
+    plot.add_tools(tool)
+    return plot
+
+
+def _fewer(values: FloatArray, lowest: bool) -> FloatArray:
+    """At most ``_OVERVIEW`` numbers."""
+    starts = np.unique(np.linspace(0, len(values), min(len(values), _OVERVIEW), endpoint=False).astype(np.int64))
+    return np.asarray((np.fmin if lowest else np.fmax).reduceat(values, starts))
