@@ -51,6 +51,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "runs",
         "report/figures",
         "report/terminal",
+        "report/html/plots",
         "report/html",
         "api",
         "__init__",

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from msg_analysis.common import large_arrays
-from msg_analysis.report.html import thinned_run
-from msg_analysis.report.html.thinned_run import envelope, thin
+from msg_analysis.report.html.plots import thinned_run
+from msg_analysis.report.html.plots.thinned_run import envelope, thin
 
 
 @pytest.fixture

@@ -25,7 +25,8 @@ from markupsafe import Markup, escape
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.report.figures.agent_places import LABELLED, line_width, places
-from msg_analysis.report.figures.palette import GREY, INK, mode_colour, shorten
+from msg_analysis.report.figures.palette import shorten
+from msg_analysis.report.html.plots.colours import graph_variable
 from msg_analysis.types import FloatArray
 
 MOST_GRAPHS = 8
@@ -41,7 +42,7 @@ def graph_drawings(experiment: ValidExperiment) -> list[Markup]:
     where = _scaled(places(experiment.graph_list), experiment.agents)
     leaders = set(experiment.leaders.agents) if experiment.leaders else set()
     return [
-        _graph(graph, where, mode_colour(mode), leaders)
+        _graph(graph, where, graph_variable(mode), leaders)
         for mode, graph in enumerate(experiment.graph_list[:MOST_GRAPHS])
     ]
 
@@ -74,13 +75,14 @@ def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int]) -> M
         hears: list[int] = (np.flatnonzero(graph.adjacency[agent - 1]) + 1).tolist()
         heard = ", ".join(map(str, hears[:20])) + (", …" if len(hears) > 20 else "") if hears else "no agent"
         parts.append(
-            f'<g>{shape} fill="#fff" stroke="{colour}" stroke-width="1.5"/><title>{kind} {agent} hears {heard}</title>'
+            f'<g>{shape} fill="var(--page)" stroke="{colour}" stroke-width="1.5"/>'
+            f"<title>{kind} {agent} hears {heard}</title>"
         )
         if graph.agents <= LABELLED:
             size = radius if agent < 100 else 0.8 * radius
             parts.append(
                 f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="middle" dominant-baseline="central" '
-                f'pointer-events="none">{agent}</text>'
+                f'fill="var(--ink)" pointer-events="none">{agent}</text>'
             )
         parts.append("</g>")
     return Markup("".join([*parts, "</svg>"]))
@@ -145,14 +147,14 @@ def chain_drawing(experiment: ValidExperiment) -> Markup | None:
         stay = [f"stays: {chain.matrix[mode, mode]:.3g}"] if chain.time == "discrete" else []
         lines = [shorten(names[mode], 14), share, *stay]
         parts.append(
-            f'<g><circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="#fff" stroke="{mode_colour(mode)}" '
+            f'<g><circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="var(--page)" stroke="{graph_variable(mode)}" '
             f'stroke-width="3"/><title>{escape(names[mode])}</title>'
         )
         for row, line in enumerate(lines):
             size, weight = (13, "600") if row == 0 else (11, "400")
             down = y + 15 * (row - (len(lines) - 1) / 2)
             parts.append(
-                f'<text x="{x:.1f}" y="{down:.1f}" font-size="{size}" font-weight="{weight}" fill="{INK}" '
+                f'<text x="{x:.1f}" y="{down:.1f}" font-size="{size}" font-weight="{weight}" fill="var(--ink)" '
                 f'text-anchor="middle" dominant-baseline="central">{escape(line)}</text>'
             )
         parts.append("</g>")
@@ -172,10 +174,12 @@ def _jump(a: FloatArray, b: FloatArray, radius: float, label: str, title: str) -
     middle = 0.25 * start + 0.5 * bend + 0.25 * end
     return (
         f"<g><title>{escape(title)}</title>"
-        f'<path d="M{_at(start)}Q{_at(bend)} {_at(end - 8 * way)}" fill="none" stroke="{GREY}" stroke-width="1.5"/>'
-        f'<path d="M{_at(end)}L{_at(left)}L{_at(right)}Z" fill="{GREY}"/>'
-        f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="13" fill="{INK}" text-anchor="middle" '
-        f'stroke="#fff" stroke-width="5" paint-order="stroke" dominant-baseline="central">{escape(label)}</text></g>'
+        f'<path d="M{_at(start)}Q{_at(bend)} {_at(end - 8 * way)}" fill="none" stroke="var(--soft)" '
+        'stroke-width="1.5"/>'
+        f'<path d="M{_at(end)}L{_at(left)}L{_at(right)}Z" fill="var(--soft)"/>'
+        f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="13" fill="var(--ink)" text-anchor="middle" '
+        'stroke="var(--page)" stroke-width="5" paint-order="stroke" dominant-baseline="central">'
+        f"{escape(label)}</text></g>"
     )
 
 

@@ -52,8 +52,8 @@ from msg_analysis.report.documents.comparison_words import (
     verdict_line,
 )
 from msg_analysis.report.documents.explanation import explain, graph_facts
-from msg_analysis.report.figures.palette import LINE_COLOURS
-from msg_analysis.report.html import error_plots, network_drawings, run_heading, switching_plots, trajectory_plots
+from msg_analysis.report.html import network_drawings, run_heading
+from msg_analysis.report.html.plots import colours, error_plots, switching_plots, trajectory_plots
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
@@ -132,7 +132,9 @@ def render(
         script=Markup(script),
         library=Markup(Resources(mode="inline", components=["bokeh"]).js_raw[0]),
         first_agents=_first_agents(document),
-        line_colours=LINE_COLOURS,
+        line_colours=colours.LINES,
+        graph_colours=colours.GRAPHS,
+        dark=colours.DARK,
         most_lines=error_plots.MOST_LINES,
         sojourns=sojourns[1],
         shown_sojourns=sojourns[0],

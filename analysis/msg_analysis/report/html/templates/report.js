@@ -22,6 +22,8 @@
     return { agents: [...chosen].sort((a, b) => a - b) };
   };
 
+  const colour = (agent) => window.shade(COLOURS[(agent - 1) % COLOURS.length]);
+
   function draw(agents) {
     const lines = model("lines"), bands = model("bands"), all = model("all_agents");
     if (!lines || !all) return;
@@ -33,8 +35,8 @@
       xs: known.map(() => x),
       ys: known.map((agent) => Array.from(parts.slice((agent - 1) * points, agent * points))),
       agent: known.map((agent) => `agent ${agent}`),
-      colour: known.map((_, place) => COLOURS[place % COLOURS.length]),
-      dash: known.map((_, place) => DASHES[place % DASHES.length]),
+      colour: known.map(colour),
+      dash: known.map((agent) => DASHES[Math.floor((agent - 1) / COLOURS.length) % DASHES.length]),
     };
     const banded = known.filter((agent) => known.length <= MOST_BANDS && Number.isFinite(widths[agent - 1]));
     bands.data = {
@@ -43,7 +45,7 @@
         const half = x.map((time) => widths[agent - 1] * Math.sqrt(last / time));
         return half.map((value) => 1 + value).concat(half.map((value) => 1 - value).reverse());
       }),
-      colour: banded.map((agent) => COLOURS[known.indexOf(agent) % COLOURS.length]),
+      colour: banded.map(colour),
     };
   }
 
@@ -64,6 +66,7 @@
   function start() {
     const shown = window.Bokeh && window.Bokeh.documents[0];
     if (!shown) return setTimeout(start, 20);
+    window.paintPreferred();
     model = (name) => shown.get_model_by_name(name);
     const nodes = model("nodes");
     if (nodes) nodes.selected.properties.indices.change.connect(() => {
@@ -93,6 +96,7 @@
     closed = [...document.querySelectorAll("details:not([open])")];
     closed.forEach((one) => { one.open = true; });
     if (!window.Bokeh) return;
+    window.paintPaper();
     for (const view of window.Bokeh.index.roots) {
       const place = view.el.closest(".plot") || view.el.getRootNode().host?.closest(".plot");
       if (!place) continue;
@@ -112,6 +116,7 @@
       place.classList.remove("pictured");
     }
     pictures = [];
+    window.paintPreferred();
   });
   start();
 })();

@@ -137,7 +137,7 @@
     return low;
   }
 
-  const colour = (agent) => COLOURS[(agent - 1) % COLOURS.length];
+  const colour = (agent) => window.shade(COLOURS[(agent - 1) % COLOURS.length]);
   const dash = (agent) => DASHES[Math.floor((agent - 1) / COLOURS.length) % DASHES.length];
 
   function draw() {
@@ -188,7 +188,7 @@
       button.type = "button";
       button.dataset.agent = agent;
       button.setAttribute("aria-label", `agent ${agent}${ACCUSED.has(agent) ? ", accused" : ""}`);
-      mark.style.borderTopColor = colour(agent);
+      mark.style.borderTopColor = `var(--line-${(agent - 1) % COLOURS.length})`;
       mark.style.borderTopStyle = { dotdash: "dashed" }[dash(agent)] || dash(agent);
       button.append(mark, ACCUSED.has(agent) ? `${agent} ✗` : `${agent}`);
       button.addEventListener("click", () => {

@@ -22,9 +22,10 @@ import numpy as np
 from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, PlainText, Range1d, RangeTool, UIElement
 
 from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.report.figures.palette import BLACK, BLUE, GREY, SKY, mode_colour, shorten
-from msg_analysis.report.html.plot_style import new_figure
-from msg_analysis.report.html.thinned_run import Thinned, envelope, thin
+from msg_analysis.report.figures.palette import shorten
+from msg_analysis.report.html.plots.colours import BLACK, BLUE, GREY, SKY, graph_colour
+from msg_analysis.report.html.plots.plot_style import new_figure
+from msg_analysis.report.html.plots.thinned_run import Thinned, envelope, thin
 from msg_analysis.types import FloatArray, IntArray
 
 REPLICA = 0  # which is drawn, from 0
@@ -32,6 +33,7 @@ MOST_SOJOURNS = 20_000  # of a run, that are drawn
 _WHOLE, _FIRST_SOJOURNS = 1500, 30  # steps of a run that is seen whole at first; sojourns visible at first of others
 _OVERVIEW = 400  # bins
 _LEFT, _RIGHT = 76, 14  # pixels beside every figure: equal, so that they have one time axis
+_SIDES = {"min_border_left": _LEFT, "min_border_right": _RIGHT}
 _TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
 
 
@@ -52,7 +54,7 @@ def trajectory_plots(trajectory: Trajectory, predicted: float | None) -> tuple[d
     data.append(
         _source("sojourns", start=np.append(starts[:shown], end) * dt, graph=np.append(modes[starts[:shown]], -1))
     )
-    data.append(_source("graphs", name=names, colour=[mode_colour(mode) for mode in range(len(names))]))
+    data.append(_source("graphs", name=names, colour=[graph_colour(mode) for mode in range(len(names))]))
     figures = {
         "trajectories": _states(time, data),
         "path": _active_graph(time, names),
@@ -101,7 +103,7 @@ def _data(thinned: Thinned, agents: int, dt: float) -> list[ColumnDataSource]:
 def _states(time: Range1d, data: list[ColumnDataSource]) -> UIElement:
     plot = new_figure(
         330, _TOOLS, x_range=time, y_range=Range1d(-1.0, 1.0, name="states_range"), y_axis_label="state",
-        toolbar_location="above", min_border_left=_LEFT, min_border_right=_RIGHT,
+        toolbar_location="above", **_SIDES,
     )  # fmt: skip
     plot.xaxis.visible = False
     plot.vstrip("left", "right", source=_source("strips", left=[], right=[], colour=[]), color="colour", alpha=0.16)
@@ -120,7 +122,7 @@ def _states(time: Range1d, data: list[ColumnDataSource]) -> UIElement:
 def _active_graph(time: Range1d, names: Sequence[str]) -> UIElement:
     plot = new_figure(
         int(min(26 + 22 * len(names), 420)), _TOOLS, x_range=time, y_range=Range1d(len(names) - 0.4, -0.6),
-        y_axis_label="graph", toolbar_location=None, min_border_left=_LEFT, min_border_right=_RIGHT,
+        y_axis_label="graph", toolbar_location=None, **_SIDES,
     )  # fmt: skip
     plot.xaxis.visible = False
     lanes = _source("lanes", graph=[], left=[], right=[], colour=[], name=[])
@@ -137,7 +139,7 @@ def _active_graph(time: Range1d, names: Sequence[str]) -> UIElement:
 def _error(time: Range1d, predicted: float | None) -> UIElement:
     plot = new_figure(
         170, _TOOLS, x_range=time, y_range=Range1d(0.0, 1.0, name="error_range"),
-        x_axis_label="simulated time", y_axis_label="error", toolbar_location=None, min_border_left=_LEFT, min_border_right=_RIGHT,
+        x_axis_label="simulated time", y_axis_label="error", toolbar_location=None, **_SIDES,
     )  # fmt: skip
     plot.vstrip(
         "left", "right", source=_source("error_strips", left=[], right=[], colour=[]), color="colour", alpha=0.16
@@ -156,9 +158,7 @@ def _overview(time: Range1d, thinned: Thinned, end: float) -> UIElement:
     """The whole run, small, with the visible part as a frame that can be moved."""
     low, high = (_fewer(part, least) for part, least in zip(envelope(thinned.values), (True, False), strict=True))
     x = np.linspace(0.0, end, len(low))
-    plot = new_figure(
-        64, "", x_range=Range1d(0.0, end), toolbar_location=None, min_border_left=_LEFT, min_border_right=_RIGHT
-    )
+    plot = new_figure(64, "", x_range=Range1d(0.0, end), toolbar_location=None, **_SIDES)
     plot.varea(x, low, high, color=SKY, alpha=0.8)
     plot.line(x, low, color=BLUE, line_width=0.7)
     plot.line(x, high, color=BLUE, line_width=0.7)

@@ -20,11 +20,7 @@ from typing import Any
 
 from bokeh.plotting import figure
 
-from msg_analysis.report.figures.palette import (
-    GREY,
-    INK,
-    PALE,
-)
+from msg_analysis.report.html.plots.colours import GREY, INK, PALE
 
 SANS = "system-ui, -apple-system, 'Segoe UI', 'Noto Sans', 'DejaVu Sans', sans-serif"
 
@@ -37,13 +33,14 @@ def new_figure(height: int, tools: str = "box_zoom,pan,wheel_zoom,reset,save", *
     plot.toolbar.autohide = True
     plot.outline_line_color = None
     plot.grid.grid_line_color = PALE
-    plot.background_fill_color = plot.border_fill_color = "white"
+    plot.background_fill_color = plot.border_fill_color = None  # that of the page
     for axis in plot.axis:
         axis.axis_label_text_font = axis.major_label_text_font = SANS
         axis.axis_label_text_font_style = "normal"
-        axis.axis_label_text_color = INK
+        axis.axis_label_text_color = axis.major_label_text_color = INK
         axis.axis_line_color = axis.major_tick_line_color = GREY
         axis.minor_tick_line_color = None
+    plot.title.text_font, plot.title.text_color = SANS, INK
     return plot
 
 

@@ -35,20 +35,13 @@ from bokeh.models import (
     UIElement,
     Whisker,
 )
-from bokeh.palettes import PuOr, interp_palette
+from bokeh.palettes import interp_palette
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.common.large_arrays import BLOCK_NUMBERS, release
 from msg_analysis.report.documents.comparison_words import TIMES
-from msg_analysis.report.figures.palette import (
-    BLACK,
-    BLUE,
-    GREY,
-    INK,
-    SKY,
-    VERMILLION,
-)
-from msg_analysis.report.html.plot_style import SANS, new_figure, place_legend, plain_legend
+from msg_analysis.report.html.plots.colours import BLACK, BLUE, DARK_HEAT, GREY, HEAT, INK, PAGE, SKY, VERMILLION
+from msg_analysis.report.html.plots.plot_style import SANS, new_figure, place_legend, plain_legend
 from msg_analysis.types import FloatArray
 
 MOST_LINES = 8  # agents whose convergence is drawn at once
@@ -205,7 +198,8 @@ def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> UI
         return None
     agents = len(next(iter(known.values())))
     limit = max(float(np.abs(matrix).max()) for matrix in known.values()) or 1.0
-    mapper = LinearColorMapper(palette=interp_palette(PuOr[11], 255), low=-limit, high=limit)
+    light, dark = (interp_palette(HEAT, 255), interp_palette(DARK_HEAT, 255))
+    mapper = LinearColorMapper(palette=light, low=-limit, high=limit, tags=[dark])
     source = ColumnDataSource({key: [matrix] for key, matrix in known.items()})
     titles = {"measured": "measured", "predicted": "predicted", "difference": "measured − predicted"}
     rows = [("agents", "$y{0}, $x{0}"), *((titles[key], f"@{key}{{0.0000}}") for key in known)]
@@ -222,7 +216,6 @@ def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> UI
             min_border_right=8,
         )
         panel.grid.grid_line_color = None
-        panel.title.text_font, panel.title.text_color = SANS, INK
         panel.axis.ticker = BasicTicker(desired_num_ticks=8, min_interval=1, num_minor_ticks=0)
         image = panel.image(key, x=0.5, y=0.5, dw=agents, dh=agents, color_mapper=mapper, source=source)
         panel.add_tools(HoverTool(renderers=[image], tooltips=rows))
@@ -231,7 +224,7 @@ def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> UI
         panels.append(panel)
     panels[0].yaxis.axis_label = "agent"
     bar = ColorBar(color_mapper=mapper, width=10, label_standoff=6, border_line_color=None, padding=4)
-    bar.major_label_text_font = SANS
+    bar.major_label_text_font, bar.major_label_text_color, bar.background_fill_color = SANS, INK, None
     panels[-1].add_layout(bar, "right")
     return gridplot([panels], sizing_mode="stretch_width", toolbar_options={"logo": None, "autohide": True})
 
@@ -243,7 +236,7 @@ def _write_numbers(panel: Any, matrix: FloatArray, limit: float) -> None:
         x=(j + 1).ravel(),
         y=(i + 1).ravel(),
         text=[f"{value:.{digits}f}" for value in matrix.ravel()],
-        text_color=np.where(np.abs(matrix.ravel()) > 0.6 * limit, "white", BLACK).tolist(),
+        text_color=np.where(np.abs(matrix.ravel()) > 0.6 * limit, PAGE, BLACK).tolist(),
         text_align="center",
         text_baseline="middle",
         text_font={"value": SANS},
@@ -309,7 +302,7 @@ def _histogram(
         "height": np.log10(count + 1.0),
         "colour": np.where(beyond, VERMILLION, BLUE),
     }
-    bars = plot.quad("left", "right", "height", 0, source=data, color="colour", line_color="white", line_width=0.5)
+    bars = plot.quad("left", "right", "height", 0, source=data, color="colour", line_color=PAGE, line_width=0.5)
     plot.add_tools(HoverTool(renderers=[bars], tooltips=[("ms", "@left{0.00} to @right{0.00}"), (what, "@count")]))
     most = max(int(count.max(initial=0)), 1)
     ticks = [0, *(10**power for power in range(len(str(most))))]

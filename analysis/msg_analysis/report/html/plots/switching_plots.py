@@ -29,13 +29,9 @@ from bokeh.models import (
     UIElement,
 )
 
-from msg_analysis.report.figures.palette import (
-    BLACK,
-    INK,
-    mode_colour,
-    shorten,
-)
-from msg_analysis.report.html.plot_style import SANS, new_figure
+from msg_analysis.report.figures.palette import shorten
+from msg_analysis.report.html.plots.colours import BLACK, graph_colour
+from msg_analysis.report.html.plots.plot_style import new_figure
 from msg_analysis.types import FloatArray, IntArray
 
 
@@ -59,7 +55,7 @@ def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> 
         "share": share,
         "predicted": stationary,
         "name": list(names),
-        "colour": [mode_colour(g) for g in range(len(names))],
+        "colour": [graph_colour(g) for g in range(len(names))],
         "low": places - 0.45,
         "high": places + 0.45,
     }
@@ -85,6 +81,5 @@ def _height(names: Sequence[str]) -> int:
 
 
 def _name_graphs(plot: Any, names: Sequence[str]) -> None:
-    plot.title.text_font, plot.title.text_color = SANS, INK
     plot.ygrid.grid_line_color = None
     plot.yaxis.ticker = FixedTicker(ticks=list(range(len(names))))
