@@ -37,6 +37,11 @@ class Recent:
     modes: IntArray  # (b,) graph k -> k+1 from 0; in real time that of the first agent, or 0 where it is not known
     states: FloatArray  # (b, m) first replica
 
+    def newest(self) -> Recent:
+        """The last ``WINDOW`` of any steps, in order, as a copy."""
+        order = np.argsort(self.steps, kind="stable")[-WINDOW:]
+        return Recent(self.steps[order], self.modes[order], self.states[order])
+
 
 class RecentSteps:
     """Keeps the last ``WINDOW`` whole steps."""
@@ -46,20 +51,18 @@ class RecentSteps:
 
     def add(self, steps: IntArray, modes: IntArray, states: FloatArray) -> None:
         """Add whole steps k (b,): graphs from 0 (b,), x(k) (b, m, width)."""
-        new = Recent(steps[-WINDOW:], modes[-WINDOW:], states[-WINDOW:, :, 0].copy())
+        new = Recent(steps, modes, states[:, :, 0]).newest()
         if self._kept is not None:
-            parts = zip(self._columns(self._kept), self._columns(new), strict=True)
-            new = Recent(*(np.concatenate(pair) for pair in parts))
-        order = np.argsort(new.steps, kind="stable")[-WINDOW:]
-        self._kept = Recent(*(column[order] for column in self._columns(new)))
+            new = Recent(
+                np.concatenate([self._kept.steps, new.steps]),
+                np.concatenate([self._kept.modes, new.modes]),
+                np.concatenate([self._kept.states, new.states]),
+            ).newest()
+        self._kept = new
 
     def newest(self) -> Recent | None:
         """What is kept; None before the first step."""
         return self._kept
-
-    @staticmethod
-    def _columns(recent: Recent) -> tuple[IntArray, IntArray, FloatArray]:
-        return recent.steps, recent.modes, recent.states
 
 
 class Lateness:

@@ -22,9 +22,9 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.common.text.number_words import counted, measured_text, number_text, percent, z_text
+from msg_analysis.common.text.number_words import counted, listed, measured_text, number_text, percent, z_text
 from msg_analysis.model.experiment.problems import show
-from msg_analysis.report.terminal.tables import fact_table, first_rows, listed, number_table, print_table
+from msg_analysis.report.terminal.tables import fact_table, first_rows, number_table, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _MOST_PERCENT = 5.0  # larger changes are factors

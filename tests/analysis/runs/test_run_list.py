@@ -1,0 +1,171 @@
+"""Lists of runs: what each folder is called, in which order, and that one of strangers ends nothing."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msg_analysis import Experiment, InputError
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.runs.run_list import RunEntry, list_runs
+
+PAIR = {
+    "name": "pair",
+    "graphs": {"apart": {"path": [1, 2, 3]}},
+    "run": {"dt": 0.1, "duration": 5, "seed": 7, "start": "zero"},
+}
+RESULT: dict[str, Any] = {  # by hand: what a list takes from a result
+    "verdict": "disagrees",
+    "run": "8c6d",
+    "experiment": "pair",
+    "seed": 8,
+    "simulated_time": 5.0,
+    "system_error": {
+        "measured": 1.5,
+        "predicted": 1.0,
+        "standard_error": 0.25,
+        "z": 2.0,
+        "p": 0.0455,
+        "p_holm": None,
+        "interval": [1.0100, 1.9900],
+    },
+}
+SHORT = {"measured": None, "predicted": None, "standard_error": None, "z": None, "interval": [None, None]}
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Experiment.parse(PAIR).simulate().save(tmp_path_factory.mktemp("bag") / "pair_20261125_120000")
+
+
+def result(folder: Path, **changes: Any) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "result.json").write_text(json.dumps(RESULT | changes))
+    return folder
+
+
+def only(folder: Path) -> RunEntry:
+    (entry,) = list_runs(folder)
+    return entry
+
+
+def test_a_run_with_a_result(tmp_path: Path, bag: Path) -> None:
+    """Of the bag beside it, nothing is read."""
+    folder = result(tmp_path / "pair_20261125_130501_2")
+    (folder / "pair_0.mcap").write_bytes(b"not read")
+    (folder / "report.html").write_text("")
+    entry = only(tmp_path)
+    assert entry.date == datetime(2026, 11, 25, 13, 5, 1).astimezone()
+    assert entry.to_json() == {
+        "folder": str(folder),
+        "status": "compared",
+        "date": entry.date.isoformat(),
+        "problem": None,
+        "name": "pair",
+        "seed": 8,
+        "run": "8c6d",
+        "verdict": "disagrees",
+        "simulated_time": 5.0,
+        "measured": 1.5,
+        "standard_error": 0.25,
+        "predicted": 1.0,
+        "z": 2.0,
+        "given_path": False,
+        "low": pytest.approx(1.01, abs=1e-4),
+        "high": pytest.approx(1.99, abs=1e-4),
+        "report": str(folder / "report.html"),
+    }
+
+
+def test_a_short_run_has_the_error_given_the_path(tmp_path: Path) -> None:
+    given = {"measured": 1.4, "predicted": 1.0, "standard_error": 0.1, "z": 4.0}
+    total = SHORT | {"measured": 1.5, "predicted": 1.0}
+    result(tmp_path / "a", system_error=total, given_path={"system_error": given})
+    entry = only(tmp_path)
+    assert (entry.measured, entry.standard_error, entry.given_path) == (1.4, 0.1, True)
+    assert entry.z == pytest.approx(4.0)
+
+
+def test_runs_without_a_result(tmp_path: Path, bag: Path) -> None:
+    """Whole, torn, being recorded; the date is that of the name."""
+    shutil.copytree(bag, tmp_path / bag.name)
+    entry = only(tmp_path)
+    assert (entry.status, entry.name, entry.seed, entry.verdict) == ("not compared", "pair", 7, None)
+    assert entry.run == str(read_bag(bag).record.run)
+    assert entry.date == datetime(2026, 11, 25, 12).astimezone()
+    (file,) = (tmp_path / bag.name).glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:-500])
+    (tmp_path / bag.name / "metadata.yaml").unlink()
+    entry = only(tmp_path)
+    assert (entry.status, entry.name) == ("torn", "pair")
+    with (tmp_path / bag.name / ".recording").open("w") as marker:
+        json.dump({"pid": os.getpid()}, marker)
+        marker.flush()
+        fcntl.flock(marker, fcntl.LOCK_EX)
+        assert only(tmp_path).status == "recording"
+    file.write_bytes(file.read_bytes()[:30])
+    assert only(tmp_path).status == "foreign"  # nobody knows which run that was
+
+
+def test_a_record_that_only_a_topic_has(tmp_path: Path, bag: Path) -> None:
+    """As in bags of ros2 bag: here the head of our own is made unknown."""
+    shutil.copytree(bag, tmp_path / "other")
+    (file,) = (tmp_path / "other").glob("*.mcap")
+    data = file.read_bytes()
+    length = b"\x0a\x00\x00\x00"
+    assert length + b"msg_agents" in data
+    file.write_bytes(data.replace(length + b"msg_agents", length + b"other_tool", 1))
+    entry = only(tmp_path)
+    assert (entry.status, entry.name, entry.seed) == ("not compared", "pair", 7)
+
+
+def test_other_folders_are_listed_with_a_word(tmp_path: Path) -> None:
+    (tmp_path / "empty" / "log").mkdir(parents=True)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_text("")
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "bag_0.mcap").write_text("text")
+    (tmp_path / ".hidden").mkdir()
+    (tmp_path / "index.html").write_text("")
+    for name, text in {"a": "{", "b": "[]", "c": json.dumps(RESULT | {"tests": 5}), "d": "{}"}.items():
+        result(tmp_path / f"result_{name}")
+        (tmp_path / f"result_{name}" / "result.json").write_text(text)
+    found = {Path(entry.folder).name: entry for entry in list_runs(tmp_path)}
+    assert {name: entry.status for name, entry in found.items()} == {
+        "empty": "empty",
+        "photos": "foreign",
+        "bag": "foreign",
+        **{f"result_{name}": "damaged" for name in "abcd"},
+    }
+    assert "tests: expected a list of objects" in (found["result_c"].problem or "")
+
+
+def test_dates_without_a_name(tmp_path: Path, bag: Path) -> None:
+    """By the bag, unless that has the simulated time of the twin; else by the file."""
+    recorded = tmp_path / "a"
+    shutil.copytree(bag, recorded)
+    text = (recorded / "metadata.yaml").read_text()
+    (recorded / "metadata.yaml").write_text(text.replace("epoch: 0\n", "epoch: 1795000000000000000\n", 1))
+    twin = tmp_path / "pair_20269999_120000"  # not a date
+    shutil.copytree(bag, twin)
+    (file,) = twin.glob("*.mcap")
+    os.utime(file, (1_790_000_000, 1_790_000_000))
+    assert [(Path(entry.folder).name, entry.date.timestamp()) for entry in list_runs(tmp_path)] == [
+        (twin.name, 1_790_000_000),
+        ("a", 1_795_000_000),
+    ]
+
+
+def test_what_is_not_a_folder_of_runs(tmp_path: Path, bag: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path, words in ((tmp_path / "none", "No such file"), (tmp_path / "file", "a file"), (bag, "a bag: give the")):
+        with pytest.raises(InputError, match=words):
+            list_runs(path)
+    assert list_runs(tmp_path) == []
