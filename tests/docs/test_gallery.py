@@ -37,6 +37,7 @@ def test_what_the_page_begins_with(elsewhere: Path) -> None:
     """A reader copies it."""
     (elsewhere / "line_ring.yaml").write_text(LINE_RING.read_text())
     page = (DOCS / "python.md").read_text(encoding="utf-8")
-    first, network = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    first, network, *others = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     compile(network, "docs/python.md", "exec")  # tests/integration/test_python.py runs it
-    exec(compile(first, "docs/python.md", "exec"), {})
+    for block in (first, *others):
+        exec(compile(block, "docs/python.md", "exec"), {})

@@ -95,7 +95,7 @@ def runs(
 
 @click.command(
     epilog=examples(
-        "msg-analysis diff runs/line_ring_20250101_120000 line_ring_twin",
+        "msg-analysis diff runs/line_ring_20250101_120000 runs/line_ring_20250101_130000",
         "msg-analysis diff line_ring.yaml fast_switching.yaml",
         "msg-analysis diff line_ring.yaml fast_switching.yaml --json | jq .keys",
     )

@@ -154,8 +154,8 @@ def new(file: Path, *, as_json: bool, **given: Any) -> None:
         return
     word = shlex.quote(str(file))
     print_text(str(file))
-    print_text(f"Next: msg-analysis predict {word}   what the theory predicts")
-    print_text(f"      msg-agents run {word}         a network of processes, compared with the prediction")
+    print_text(f"Next: msg-analysis predict {word}")
+    print_text(f"      msg-agents run {word}")
 
 
 def _write(file: Path, chosen: Choices) -> str:

@@ -75,8 +75,8 @@ def test_new_without_a_terminal(here: Path) -> None:
     assert (done.exit_code, done.stderr) == (0, "")
     assert done.stdout.splitlines() == [
         "network.yaml",
-        "Next: msg-analysis predict network.yaml   what the theory predicts",
-        "      msg-agents run network.yaml         a network of processes, compared with the prediction",
+        "Next: msg-analysis predict network.yaml",
+        "      msg-agents run network.yaml",
     ]
     before = (here / "network.yaml").read_bytes()
     again = call("new", "--agents", "7")
