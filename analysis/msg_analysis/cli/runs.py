@@ -95,9 +95,9 @@ def runs(
 
 @click.command(
     epilog=examples(
-        "msg-analysis diff runs/line_ring_20250101_120000 runs/line_ring_20250101_130000",
-        "msg-analysis diff line_ring.yaml fast_switching.yaml",
-        "msg-analysis diff line_ring.yaml fast_switching.yaml --json | jq .keys",
+        "msg-analysis diff runs/ring_20250101_120000 runs/ring_20250101_130000",
+        "msg-analysis diff line_ring fast_switching",
+        "msg-analysis diff line_ring fast_switching --json | jq .keys",
     )
 )
 @click.argument("a", type=SOURCE)
