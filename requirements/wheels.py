@@ -8,10 +8,12 @@ lock. All wheels require each other in this version. msg_agents_bringup is not a
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tempfile
 import zipfile
 from collections.abc import Iterator
@@ -23,6 +25,15 @@ SOURCES = ROOT / "ros_ws" / "src"
 MESSAGES = "msg_agents_interfaces"
 PACKAGES = (MESSAGES, "msg_analysis", "msg_agents", "msg_agents_example_protocols")
 KERNEL = re.compile(r"msg_analysis/model/arithmetic/_kernel\.[\w.-]+\.so")
+NOT_FOR_RUNS = (
+    "include",
+    f"share/{MESSAGES}/cmake",
+    f"share/{MESSAGES}/environment",
+    f"share/{MESSAGES}/local_setup.*",
+    f"share/{MESSAGES}/package.dsv",
+    "share/ament_index/resource_index/parent_prefix_path",
+)
+"""What only builds against the messages and shells that source them need: paths of this machine are in it."""
 NOT_SOURCES = shutil.ignore_patterns("build", "*.egg-info", "__pycache__", "*.so", "test")
 BUILD = ["--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--disable-pip-version-check"]
 
@@ -37,12 +48,15 @@ def main(distribution: str, folder: str) -> None:
             shutil.copytree(SOURCES / package, place / package, ignore=NOT_SOURCES)
         plain = place / "plain"
         sources = [str(place / package) for package in PACKAGES]
-        subprocess.run([sys.executable, "-m", "pip", "wheel", *BUILD, "--wheel-dir", str(plain), *sources], check=True)
+        command = [sys.executable, "-m", "pip", "wheel", *BUILD, "--wheel-dir", str(plain), *sources]
+        subprocess.run(command, env=os.environ | without_paths(), check=True)
         require_kernel(next(plain.glob("msg_analysis-*.whl")))
         finished = place / "finished"
         finished.mkdir()
         for wheel in sorted(plain.glob("*.whl")):
             complete(wheel, distribution, finished)
+        for wheel in finished.glob("*.whl"):
+            require_no_paths(wheel, place)
         shutil.copytree(finished, made)
     for wheel in sorted(made.glob("*.whl")):
         print(wheel.relative_to(Path.cwd()) if wheel.is_relative_to(Path.cwd()) else wheel)
@@ -57,6 +71,22 @@ def require_kernel(wheel: Path) -> None:
             )
 
 
+def without_paths() -> dict[str, str]:
+    """Variables by which compiled code names no folders: without symbols for debuggers and places of libraries."""
+    words = str(sysconfig.get_config_var("LDSHARED")).split()
+    link = [word for word in words if not word.startswith(("-L", "-Wl,-rpath"))]
+    return {"CFLAGS": "-g0", "LDSHARED": " ".join(link)}
+
+
+def require_no_paths(wheel: Path, place: Path) -> None:
+    """Exit with an error if a file in the wheel names a folder of this machine, or the one in which it was built."""
+    folders = [os.fsencode(folder) for folder in (ROOT, sys.prefix, place, tempfile.gettempdir() + "/tmp")]
+    with zipfile.ZipFile(wheel) as archive:
+        for name in archive.namelist():
+            if any(folder in archive.read(name) for folder in folders):
+                sys.exit(f"error: {wheel.name}: {name} has a path of this machine in it: see NOT_FOR_RUNS")
+
+
 def complete(wheel: Path, distribution: str, made: Path) -> None:
     """Put the wheel with its whole metadata into the folder."""
     command = [sys.executable, "-m", "wheel"]
@@ -69,6 +99,9 @@ def complete(wheel: Path, distribution: str, made: Path) -> None:
         text = with_requirements(metadata.read_text(encoding="utf-8"), package, version, distribution)
         metadata.write_text(text, encoding="utf-8")
         if package == MESSAGES:
+            data = unpacked / f"{package}-{version}.data" / "data"
+            for each in [path for pattern in NOT_FOR_RUNS for path in data.glob(pattern)]:
+                shutil.rmtree(each) if each.is_dir() else each.unlink()
             for each in list(unpacked.glob(f"{package}-{version}.*")):
                 each.rename(each.with_name(each.name.replace(version, f"{version}+{distribution}", 1)))
         subprocess.run(

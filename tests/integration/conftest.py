@@ -78,7 +78,7 @@ class Process:
     def kind(self) -> str:
         """Command of msg-agents that it runs: agent, switcher, recorder, run, ..., or node_server, run_server."""
         for server in ("node_server", "run_server"):
-            if f"msg_agents.cli.{server}" in self.command:
+            if f"msg_agents.cli.servers.{server}" in self.command:
                 return server
         for program in ("msg_agents", "msg-agents", str(PROGRAM)):
             if program in self.command:

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from pages import EXPERIMENTS, ROOT, blocks, console, experiments, missing
+from pages import ROOT, blocks, console, experiments, missing
 
 DOCS = ROOT / "docs"
 
@@ -51,7 +51,7 @@ def test_tutorial(network, domain: int) -> None:
 
 @pytest.mark.parametrize("name", ["discrete", "tracking"])
 def test_example(name: str, network) -> None:
-    (shown,) = [shown for shown in console(DOCS / "examples.md") if shown.command == f"msg-agents run {name}.yaml"]
-    result = shell(f"msg-agents run {EXPERIMENTS / name}.yaml", network.directory)
+    (shown,) = [shown for shown in console(DOCS / "examples.md") if shown.command == f"msg-agents run {name}"]
+    result = shell(shown.command, network.directory)
     assert result.returncode == 0, result.stderr
     assert missing(shown.lines, result.stdout) == []

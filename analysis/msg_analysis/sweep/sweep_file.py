@@ -94,7 +94,7 @@ _RangeSchema = dict[Literal["values", "from", "to", "count", "step", "spacing"],
 def _experiment(value: object) -> str | dict[str, Any]:
     if (isinstance(value, str) and value) or (isinstance(value, dict) and value):
         return value
-    raise expected("the name of a file or an example, or the keys of an experiment")
+    raise expected("the name of a file, or the keys of an experiment")
 
 
 class SweepSpec(BaseModel):
