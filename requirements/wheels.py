@@ -75,7 +75,8 @@ def without_paths() -> dict[str, str]:
     """Variables by which compiled code names no folders: without symbols for debuggers and places of libraries."""
     words = str(sysconfig.get_config_var("LDSHARED")).split()
     link = [word for word in words if not word.startswith(("-L", "-Wl,-rpath"))]
-    return {"CFLAGS": "-g0", "LDSHARED": " ".join(link)}
+    flags = f"{sysconfig.get_config_var('CFLAGS')} -g0"  # what is given replaces those of Python, NDEBUG for example
+    return {"CFLAGS": flags, "LDSHARED": " ".join(link)}
 
 
 def require_no_paths(wheel: Path, place: Path) -> None:
