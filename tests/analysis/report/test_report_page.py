@@ -149,11 +149,11 @@ def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agents: int) ->
     page = _page(comparison, tmp_path / "report.html")
     assert "The run agrees with the prediction." in page.text
     assert str(comparison.trajectory.record.run) in page.text
-    assert "1.235" in page.text
+    assert "1.235 ± 0.098 (95 %)" in page.text
     assert "z = −1.31" in page.text
     for i in range(agents):
         assert f"{0.3 + i / 100:#.4g}" in page.text
-    assert _plots(page) == 9
+    assert _plots(page) == 11
     assert page.tags.count("svg") == 3  # two graphs and the chain
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
 
@@ -247,7 +247,7 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         "predicted, logged pattern",
     ):
         assert text in page.text
-    assert _plots(page) == 12
+    assert _plots(page) == 14
     without_figures(monkeypatch)
     on_time = in_real_time(0)
     write_report(on_time, on_time.trajectory, tmp_path / "report.html")

@@ -26,6 +26,7 @@ from msg_analysis.inference.errors.time_means import TimeMeans
 from msg_analysis.inference.statistics.distributions import chi2_tail, two_sided
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.inference.statistics.known_covariance import quadratic_form
+from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
@@ -82,6 +83,7 @@ class CovarianceTest:
     dof: int | None = None  # of ``chi2``
     p: float | None = None
     note: str | None = None  # why there is no test
+    z: FloatArray | None = None  # (m, m) entries of the difference in standard errors; NaN where these are rounding
 
 
 def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:
@@ -140,4 +142,16 @@ def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
     if not means.joint:
         return CovarianceTest(measured, predicted, note="too many agents for a joint test of a run of this length")
     chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
-    return CovarianceTest(measured, predicted, chi2, dof, float(chi2_tail(chi2, dof)) if dof else None)
+    p = float(chi2_tail(chi2, dof)) if dof else None
+    return CovarianceTest(measured, predicted, chi2, dof, p, z=_standardised(means, system))
+
+
+def _standardised(means: TimeMeans, system: JumpSystem) -> FloatArray:
+    """(m, m) entries of the difference of the second moments of the agents, each in its standard errors."""
+    d = system.dimension
+    variances, directions = np.linalg.eigh(means.covariance)
+    spread = system.lifted(packed_symmetric.unpack(directions.T * np.sqrt(variances.clip(0.0))[:, None], d))
+    errors = np.sqrt(np.square(spread).sum(axis=0))
+    difference = system.lifted(packed_symmetric.unpack(means.measured - means.predicted, d))
+    scale = float(np.abs(means.predicted).max(initial=0.0))
+    return np.where(errors > 1e-12 * scale, difference / np.where(errors > 0.0, errors, 1.0), np.nan)

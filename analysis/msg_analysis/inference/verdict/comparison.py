@@ -252,6 +252,7 @@ class Comparison:
                 "dof": covariance.dof,
                 "p": covariance.p,
                 "note": covariance.note,
+                "z": covariance.z,
             },
             "innovations": asdict(self.innovations),
             "switching": {

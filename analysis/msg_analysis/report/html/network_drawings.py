@@ -24,8 +24,9 @@ from markupsafe import Markup, escape
 
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.network.graphs import Graph
-from msg_analysis.report.figures.agent_places import LABELLED, line_width, places
+from msg_analysis.report.figures.agent_places import LABELLED, places
 from msg_analysis.report.figures.palette import shorten
+from msg_analysis.report.html.plots.accused import NOBODY, Accused
 from msg_analysis.report.html.plots.colours import graph_variable
 from msg_analysis.types import FloatArray
 
@@ -33,16 +34,17 @@ MOST_GRAPHS = 8
 """Most graphs that are drawn."""
 MOST_MODES = 6
 """Most graphs whose chain is drawn; with more, the report has a table of the rates."""
+MARK = ' class="accused"'
 _SIDE = 200.0
 _WEIGHTS = 5  # different line widths
 
 
-def graph_drawings(experiment: ValidExperiment) -> list[Markup]:
+def graph_drawings(experiment: ValidExperiment, accused: Accused = NOBODY) -> list[Markup]:
     """The first ``MOST_GRAPHS`` graphs, each agent at the same place in all of them; leaders are squares."""
     where = _scaled(places(experiment.graph_list), experiment.agents)
     leaders = set(experiment.leaders.agents) if experiment.leaders else set()
     return [
-        _graph(graph, where, graph_variable(mode), leaders)
+        _graph(graph, where, graph_variable(mode), leaders, accused)
         for mode, graph in enumerate(experiment.graph_list[:MOST_GRAPHS])
     ]
 
@@ -57,13 +59,14 @@ def _scaled(where: Mapping[int, FloatArray], agents: int) -> FloatArray:
     return np.asarray(points + _SIDE / 2)
 
 
-def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int]) -> Markup:
+def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int], accused: Accused) -> Markup:
     radius = 11.0 if graph.agents <= 12 else 8.0 if graph.agents <= LABELLED else 3.0
     links = graph.edges if graph.symmetric else graph.arcs
     parts = [
         f'<svg viewBox="0 0 {_SIDE:g} {_SIDE:g}" role="img" aria-label="{escape(graph.name)}: {len(links)} links" '
         'xmlns="http://www.w3.org/2000/svg">',
         *_links(links, where, colour, radius, directed=not graph.symmetric),
+        *_marked_links(accused.links_of(graph.name), links, where),
     ]
     for agent, (x, y) in enumerate(where, start=1):
         kind = "leader, agent" if agent in leaders else "agent"
@@ -75,8 +78,8 @@ def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int]) -> M
         hears: list[int] = (np.flatnonzero(graph.adjacency[agent - 1]) + 1).tolist()
         heard = ", ".join(map(str, hears[:20])) + (", …" if len(hears) > 20 else "") if hears else "no agent"
         parts.append(
-            f'<g>{shape} fill="var(--page)" stroke="{colour}" stroke-width="1.5"/>'
-            f"<title>{kind} {agent} hears {heard}</title>"
+            f'<g>{shape} fill="var(--page)" stroke="{colour}" stroke-width="1.5"'
+            f"{MARK if agent in accused.agents else ''}/><title>{kind} {agent} hears {heard}</title>"
         )
         if graph.agents <= LABELLED:
             size = radius if agent < 100 else 0.8 * radius
@@ -107,17 +110,33 @@ def _links(
     thin = 0.4 if len(links) > 400 else 1.0
     drawn = [
         f'<path d="{"".join(paths)}" fill="none" stroke="{colour}" stroke-opacity=".8" '
-        f'stroke-width="{thin * line_width(width / _WEIGHTS):.2f}"/>'
+        f'stroke-width="{thin * _line_width(width / _WEIGHTS):.2f}"/>'
         for width, paths in sorted(lines.items())
     ]
     return drawn + ([f'<path d="{"".join(heads)}" fill="{colour}"/>'] if heads else [])
+
+
+def _marked_links(marked: set[tuple[int, int]], links: list[tuple[int, int, float]], where: FloatArray) -> list[str]:
+    """The links that the verdict names, on top of the others."""
+    there = {(source, target) for source, target, _ in links}
+    return [
+        f'<path class="accused" d="M{_at(where[first - 1])}L{_at(where[second - 1])}" fill="none">'
+        f"<title>named by the verdict: {first}-{second}</title></path>"
+        for first, second in sorted(marked)
+        if {(first, second), (second, first)} & there
+    ]
+
+
+def _line_width(share: float) -> float:
+    """Width of a link whose weight is this share of the heaviest one."""
+    return 0.6 + 2.6 * share
 
 
 def _at(point: FloatArray) -> str:
     return f"{point[0]:.1f} {point[1]:.1f}"
 
 
-def chain_drawing(experiment: ValidExperiment) -> Markup | None:
+def chain_drawing(experiment: ValidExperiment, accused: Accused = NOBODY) -> Markup | None:
     """The chain: a circle per graph, an arrow per rate (or probability) from one to another.
 
     None for a single graph, and for more than ``MOST_MODES``.
@@ -141,7 +160,8 @@ def chain_drawing(experiment: ValidExperiment) -> Markup | None:
         for j in range(modes):
             if i != j and chain.matrix[i, j] > 0:
                 title = f"{unit} from {names[i]} to {names[j]}: {chain.matrix[i, j]:g}"
-                parts.append(_jump(centres[i], centres[j], radius, f"{chain.matrix[i, j]:.4g}", title))
+                mark = MARK if accused.jump(names[i], names[j]) else ""
+                parts.append(_jump(centres[i], centres[j], radius, f"{chain.matrix[i, j]:.4g}", title, mark))
     for mode, (x, y) in enumerate(centres):
         share = f"{100 * chain.stationary[mode]:.3g} %"
         stay = [f"stays: {chain.matrix[mode, mode]:.3g}"] if chain.time == "discrete" else []
@@ -161,7 +181,7 @@ def chain_drawing(experiment: ValidExperiment) -> Markup | None:
     return Markup("".join([*parts, "</svg>"]))
 
 
-def _jump(a: FloatArray, b: FloatArray, radius: float, label: str, title: str) -> str:
+def _jump(a: FloatArray, b: FloatArray, radius: float, label: str, title: str, mark: str) -> str:
     """A bent arrow from one circle to another, on the left of the straight line."""
     step = (b - a) / float(np.hypot(*(b - a)))
     across = np.array([step[1], -step[0]])
@@ -175,7 +195,7 @@ def _jump(a: FloatArray, b: FloatArray, radius: float, label: str, title: str) -
     return (
         f"<g><title>{escape(title)}</title>"
         f'<path d="M{_at(start)}Q{_at(bend)} {_at(end - 8 * way)}" fill="none" stroke="var(--soft)" '
-        'stroke-width="1.5"/>'
+        f'stroke-width="1.5"{mark}/>'
         f'<path d="M{_at(end)}L{_at(left)}L{_at(right)}Z" fill="var(--soft)"/>'
         f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="13" fill="var(--ink)" text-anchor="middle" '
         'stroke="var(--page)" stroke-width="5" paint-order="stroke" dominant-baseline="central">'

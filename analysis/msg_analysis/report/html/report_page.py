@@ -34,7 +34,7 @@ from bokeh.resources import Resources
 from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
-from msg_analysis.common.text.number_words import p_text, z_text
+from msg_analysis.common.text.number_words import p_text
 from msg_analysis.errors import InputError
 from msg_analysis.inference.observed.observation import bounded
 from msg_analysis.inference.realtime.laws import SUPPORT
@@ -53,7 +53,10 @@ from msg_analysis.report.documents.comparison_words import (
 )
 from msg_analysis.report.documents.explanation import explain, graph_facts
 from msg_analysis.report.html import network_drawings, run_heading
+from msg_analysis.report.html.interval_bars import interval_bars, plus_minus
 from msg_analysis.report.html.plots import colours, error_plots, switching_plots, trajectory_plots
+from msg_analysis.report.html.plots.accused import Accused
+from msg_analysis.report.html.plots.covariance_plots import covariances
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
@@ -98,10 +101,10 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": _number, "p": _p, "z": _z}
+    environment.filters |= {"number": _number, "p": _p}
     names = [graph.name for graph in experiment.graph_list]
-    models, sojourns = _models(document, comparison, trajectory)
-    accused: list[int] = []
+    accused = Accused.of(document["blame"])
+    models, sojourns = _models(document, comparison, trajectory, accused)
     figures = Document()
     with figures.models.freeze():  # otherwise every figure is gone through again for each one added
         for model in models.values():
@@ -120,10 +123,15 @@ def render(
         times=TIMES,
         quantiles=QUANTILES,
         laws=REAL_TIME_LAWS,
+        law_bars=interval_bars([document["laws"][law]["system_error"] for law in REAL_TIME_LAWS] if timing else []),
         law_name=LAW_NAMES["emulated" if document["law"] == "synchronous" else document["law"]],
         support=SUPPORT,
         explanation=_explanation(document),
         blame=[sentence(cause["words"]) for cause in document["blame"]],
+        cause_known=bool(document["blame"]) and document["blame"][0]["kind"] != "unknown",
+        plus_minus=plus_minus,
+        interval_bars=interval_bars,
+        heat_maps=[name for name in models if name.startswith("covariance_")],
         order=agent_order(document),
         agents=agent_errors(document),
         experiment=experiment,
@@ -131,20 +139,20 @@ def render(
         plots={name: Markup(div) for name, div in divs.items()},
         script=Markup(script),
         library=Markup(Resources(mode="inline", components=["bokeh"]).js_raw[0]),
-        first_agents=_first_agents(document),
+        first_agents=_first_agents(document, accused.involved),
         line_colours=colours.LINES,
         graph_colours=colours.GRAPHS,
         dark=colours.DARK,
         most_lines=error_plots.MOST_LINES,
         sojourns=sojourns[1],
         shown_sojourns=sojourns[0],
-        shown=shown_agents(experiment.agents, accused),
+        shown=_shown_agents(experiment.agents, accused.involved),
         accused=accused,
         replica=trajectory_plots.REPLICA + 1,
         explained=explain(experiment),
-        drawings=network_drawings.graph_drawings(experiment),
+        drawings=network_drawings.graph_drawings(experiment, accused),
         graph_facts=graph_facts(experiment),
-        chain=network_drawings.chain_drawing(experiment),
+        chain=network_drawings.chain_drawing(experiment, accused),
         yaml=yaml.safe_dump(experiment.to_document(), sort_keys=False, allow_unicode=True, default_flow_style=None),
         host=platform.node() or "unnamed host",
         tests=[test for test in document["tests"] if not test["name"].startswith(_NODE_TEST)],
@@ -158,14 +166,16 @@ def render(
 
 
 def _models(
-    document: dict[str, Any], comparison: Comparison, trajectory: Trajectory
+    document: dict[str, Any], comparison: Comparison, trajectory: Trajectory, accused: Accused
 ) -> tuple[dict[str, UIElement], tuple[int, int]]:
     """The figures that exist, by name; sojourns in the figure of the active graph, and in the run."""
     experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
     models: dict[str, UIElement | None] = {
-        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"]),
-        "covariance": error_plots.covariances(_matrix(covariance["measured"]), _matrix(covariance["predicted"])),
+        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"], accused),
+        **covariances(
+            _matrix(covariance["measured"]), _matrix(covariance["predicted"]), _matrix(covariance["z"]), accused
+        ),
     }
     if len(comparison.running["time"]) > 1:
         models["running"] = error_plots.convergence(comparison.running, document["system_error"]["predicted"])
@@ -183,22 +193,23 @@ def _models(
             )
     if ratios is not None and any(ratio is not None for ratio in ratios):
         sizes = np.array(ratios, dtype=float)  # None: nan
-        models["innovations"] = error_plots.innovation_sizes(sizes, document["innovations"]["samples"])
+        models["innovations"] = error_plots.innovation_sizes(sizes, document["innovations"]["samples"], accused)
     if document["timing"]:
         models["lateness"] = error_plots.lateness(document["timing"])
         models["staleness"] = error_plots.staleness(document["timing"])
     return {name: model for name, model in models.items() if model is not None}, sojourns
 
 
-def shown_agents(agents: int, accused: Sequence[int]) -> list[int]:
+def _shown_agents(agents: int, accused: Sequence[int]) -> list[int]:
     """The agents (from 1) whose trajectories are drawn at first: the accused, and the first ones."""
     others = [agent for agent in range(1, agents + 1) if agent not in accused]
     return sorted([*accused[:_FIRST_TRAJECTORIES], *others[: max(_FIRST_TRAJECTORIES - len(accused), 0)]])
 
 
-def _first_agents(document: dict[str, Any]) -> list[int]:
-    """The agents (from 1, ascending) whose convergence is drawn at first: those with the largest abs(z)."""
-    return sorted(agent + 1 for agent in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES))
+def _first_agents(document: dict[str, Any], accused: Sequence[int]) -> list[int]:
+    """The agents (from 1) whose convergence is drawn at first: the accused, then those with the largest abs(z)."""
+    known = [agent + 1 for agent in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES)]
+    return sorted(list(dict.fromkeys([*accused, *known]))[:_FIRST_LINES])
 
 
 def _explanation(document: dict[str, Any]) -> str:
@@ -239,10 +250,6 @@ def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
 
 def _number(value: float | None, digits: int = 4) -> str:
     return "–" if value is None else _typeset(f"{value:#.{digits}g}".rstrip("."))
-
-
-def _z(z: float | None) -> str:
-    return _typeset(z_text(z))
 
 
 def _p(p: float | None) -> str:

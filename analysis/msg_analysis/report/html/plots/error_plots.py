@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Interactive figures of the report: Bokeh models. Hover shows values; drag zooms; the page's script chooses agents."""
+"""Plots of errors and timing: Bokeh models. Hover shows values; drag zooms; the page's script chooses agents."""
 
 from __future__ import annotations
 
@@ -20,32 +20,28 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from bokeh.layouts import gridplot
 from bokeh.models import (
     BasicTicker,
-    ColorBar,
     ColumnDataSource,
     FixedTicker,
     HoverTool,
     Legend,
     LegendItem,
-    LinearColorMapper,
     Range1d,
     Span,
     UIElement,
     Whisker,
 )
-from bokeh.palettes import interp_palette
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.common.large_arrays import BLOCK_NUMBERS, release
 from msg_analysis.report.documents.comparison_words import TIMES
-from msg_analysis.report.html.plots.colours import BLACK, BLUE, DARK_HEAT, GREY, HEAT, INK, PAGE, SKY, VERMILLION
-from msg_analysis.report.html.plots.plot_style import SANS, new_figure, place_legend, plain_legend
+from msg_analysis.report.html.plots.accused import NOBODY, Accused
+from msg_analysis.report.html.plots.colours import BLACK, BLUE, GREY, PAGE, SKY, VERMILLION
+from msg_analysis.report.html.plots.plot_style import mark_agents, new_figure, place_legend, plain_legend
 from msg_analysis.types import FloatArray
 
 MOST_LINES = 8  # agents whose convergence is drawn at once
-_NUMBERED = 8  # most agents with which heat maps show numbers
 _POINTS = 200  # at most, on the line of an agent
 
 
@@ -76,7 +72,7 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
     return plot
 
 
-def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
+def node_errors(nodes: Sequence[Mapping[str, Any]], level: float, accused: Accused = NOBODY) -> UIElement:
     """Node errors with 95 % intervals next to the predicted ones; marked if p < ``level``; agents can be chosen."""
     agents = np.arange(1, len(nodes) + 1)
     measured, predicted, error = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
@@ -105,6 +101,7 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float) -> UIElement:
     )
     plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
     plot.xgrid.grid_line_color = None
+    mark_agents(plot, accused.involved)
     rows = [("agent", "@agent"), ("measured", "@measured{0.0000}")]
     size = float(np.clip(220 / len(nodes), 5, 11))
     if not np.isnan(predicted).all():
@@ -168,7 +165,7 @@ def agent_convergence(
     everything = ColumnDataSource({"part": parts.ravel().astype(np.float32)}, name="all_agents")
     times = ColumnDataSource({"time": (ends * dt).astype(np.float32)}, name="all_times")
     widths = ColumnDataSource({"width": HALF_WIDTH_95 * error / scale}, name="all_widths")
-    lines = ColumnDataSource({key: [] for key in ("xs", "ys", "agent", "colour", "dash")}, name="lines")
+    lines = ColumnDataSource({key: [] for key in ("xs", "ys", "agent", "colour", "dash", "width")}, name="lines")
     bands = ColumnDataSource({key: [] for key in ("xs", "ys", "colour")}, name="bands")
     plot = new_figure(270, x_axis_label="simulated time", y_axis_label="measured / predicted")
     plot.x_range = Range1d(0.0, float(len(states) * dt))
@@ -177,7 +174,7 @@ def agent_convergence(
     plot.y_range = Range1d(1 - reach, 1 + reach)
     plot.add_layout(Span(location=1.0, dimension="width", line_color=BLACK, line_width=1.2, line_dash="dashed"))
     plot.patches("xs", "ys", source=bands, color="colour", alpha=0.1, line_alpha=0)
-    drawn = plot.multi_line("xs", "ys", source=lines, color="colour", line_dash="dash", line_width=2)
+    drawn = plot.multi_line("xs", "ys", source=lines, color="colour", line_dash="dash", line_width="width")
     plot.add_layout(
         Legend(items=[LegendItem(label={"field": "agent"}, renderers=[drawn])], orientation="horizontal"), "above"
     )
@@ -189,64 +186,10 @@ def agent_convergence(
     return plot
 
 
-def covariances(measured: FloatArray | None, predicted: FloatArray | None) -> UIElement | None:
-    """Heat maps of the matrices (m, m) that exist and of their difference, of one scale; None without any."""
-    known = {key: value for key, value in (("measured", measured), ("predicted", predicted)) if value is not None}
-    if measured is not None and predicted is not None:
-        known["difference"] = measured - predicted
-    if not known:
-        return None
-    agents = len(next(iter(known.values())))
-    limit = max(float(np.abs(matrix).max()) for matrix in known.values()) or 1.0
-    light, dark = (interp_palette(HEAT, 255), interp_palette(DARK_HEAT, 255))
-    mapper = LinearColorMapper(palette=light, low=-limit, high=limit, tags=[dark])
-    source = ColumnDataSource({key: [matrix] for key, matrix in known.items()})
-    titles = {"measured": "measured", "predicted": "predicted", "difference": "measured − predicted"}
-    rows = [("agents", "$y{0}, $x{0}"), *((titles[key], f"@{key}{{0.0000}}") for key in known)]
-    across, down = Range1d(0.5, agents + 0.5), Range1d(agents + 0.5, 0.5)
-    panels = []
-    for key, matrix in known.items():
-        panel = new_figure(
-            290,
-            "box_zoom,wheel_zoom,pan,reset,save",
-            title=titles[key],
-            x_range=across,
-            y_range=down,
-            toolbar_location=None,
-            min_border_right=8,
-        )
-        panel.grid.grid_line_color = None
-        panel.axis.ticker = BasicTicker(desired_num_ticks=8, min_interval=1, num_minor_ticks=0)
-        image = panel.image(key, x=0.5, y=0.5, dw=agents, dh=agents, color_mapper=mapper, source=source)
-        panel.add_tools(HoverTool(renderers=[image], tooltips=rows))
-        if agents <= _NUMBERED:
-            _write_numbers(panel, matrix, limit)
-        panels.append(panel)
-    panels[0].yaxis.axis_label = "agent"
-    bar = ColorBar(color_mapper=mapper, width=10, label_standoff=6, border_line_color=None, padding=4)
-    bar.major_label_text_font, bar.major_label_text_color, bar.background_fill_color = SANS, INK, None
-    panels[-1].add_layout(bar, "right")
-    return gridplot([panels], sizing_mode="stretch_width", toolbar_options={"logo": None, "autohide": True})
-
-
-def _write_numbers(panel: Any, matrix: FloatArray, limit: float) -> None:
-    digits = max(0, 2 - int(np.floor(np.log10(limit))))
-    i, j = np.indices(matrix.shape)
-    panel.text(
-        x=(j + 1).ravel(),
-        y=(i + 1).ravel(),
-        text=[f"{value:.{digits}f}" for value in matrix.ravel()],
-        text_color=np.where(np.abs(matrix.ravel()) > 0.6 * limit, PAGE, BLACK).tolist(),
-        text_align="center",
-        text_baseline="middle",
-        text_font={"value": SANS},
-        text_font_size=f"{int(np.clip(60 / len(matrix), 7, 11))}px",
-    )
-
-
 def innovation_sizes(
     ratios: FloatArray,  # (m,); NaN for an agent without noise
     samples: int,  # innovations per agent
+    accused: Accused = NOBODY,
 ) -> UIElement:
     """Variance of each agent's innovations relative to the predicted one, and where 95 % of such ratios lie."""
     agents = np.arange(1, len(ratios) + 1)
@@ -261,6 +204,7 @@ def innovation_sizes(
     plot = new_figure(200, x_axis_label="agent", y_axis_label="variance / predicted", x_range=(0.3, len(ratios) + 0.7))
     plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
     plot.xgrid.grid_line_color = None
+    mark_agents(plot, accused.agents)
     ends = np.array([0.3, len(ratios) + 0.7])
     plot.varea(ends, np.full(2, 1 - half), np.full(2, 1 + half), color=SKY, alpha=0.3, legend_label="95 % band")
     plot.line(ends, np.ones(2), color=BLACK, line_dash="dashed", legend_label="predicted")

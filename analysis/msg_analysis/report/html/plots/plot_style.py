@@ -16,11 +16,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+from bokeh.models import BoxAnnotation
 from bokeh.plotting import figure
 
-from msg_analysis.report.html.plots.colours import GREY, INK, PALE
+from msg_analysis.report.html.plots.colours import GREY, INK, PALE, VERMILLION
 
 SANS = "system-ui, -apple-system, 'Segoe UI', 'Noto Sans', 'DejaVu Sans', sans-serif"
 
@@ -42,6 +44,14 @@ def new_figure(height: int, tools: str = "box_zoom,pan,wheel_zoom,reset,save", *
         axis.minor_tick_line_color = None
     plot.title.text_font, plot.title.text_color = SANS, INK
     return plot
+
+
+def mark_agents(plot: Any, agents: Iterable[int]) -> None:
+    """Shade the agents, along the horizontal axis, that the verdict names."""
+    for agent in agents:
+        mark = BoxAnnotation(left=agent - 0.5, right=agent + 0.5, level="underlay", name=f"accused {agent}")
+        mark.fill_color, mark.fill_alpha, mark.line_color = VERMILLION, 0.18, None
+        plot.add_layout(mark)
 
 
 def place_legend(plot: Any) -> None:

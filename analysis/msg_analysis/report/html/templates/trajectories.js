@@ -59,7 +59,7 @@
       xs: lines.map(([xs]) => xs), ys: lines.map(([, ys]) => ys),
       agent: chosen.map((agent) => `agent ${agent}`),
       colour: chosen.map(colour), dash: chosen.map(dash),
-      width: chosen.map((agent) => (ACCUSED.has(agent) ? 3 : 1.4)),
+      width: chosen.map((agent) => (ACCUSED.has(agent) ? 2.4 : 1.3)),
     };
     const found = [Infinity, -Infinity];
     for (const [, ys] of lines) extremes(ys, found);
