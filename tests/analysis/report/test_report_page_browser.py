@@ -16,6 +16,7 @@ from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.inference.verdict.pool import compare_pooled
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
+from msg_analysis.report.html.plots.colours import BLUE, DARK
 from msg_analysis.report.html.report_page import write_report
 from msg_analysis.twin.simulate import simulate
 
@@ -115,6 +116,63 @@ def test_small_and_large(browser: Any, tmp_path: Path, agents: int) -> None:
     assert page.locator(".plot.pictured").count() == 0  # as before
     assert page.locator("details[open]").count() == 1
     assert log.complaints == []
+    page.close()
+
+
+CUT = """() => [...document.querySelectorAll("body *")].filter((one) => {
+    const box = one.getBoundingClientRect();
+    return box.width > 0 && !one.closest(".hidden") && (box.left < -0.5 || box.right > innerWidth + 0.5);
+}).map((one) => one.outerHTML.slice(0, 200))"""
+# Texts whose contrast to their background is below that of WCAG 2.2, level AA.
+FAINT = """() => {
+    const numbers = (colour) => (colour.match(/[0-9.]+/g) || []).map(Number);
+    const part = (value) => (value <= 0.04045 * 255 ? value / 255 / 12.92 : ((value / 255 + 0.055) / 1.055) ** 2.4);
+    const light = ([r, g, b]) => 0.2126 * part(r) + 0.7152 * part(g) + 0.0722 * part(b);
+    const behind = (one) => {
+        for (let place = one; place; place = place.parentElement) {
+            const found = numbers(getComputedStyle(place).backgroundColor);
+            if (found.length === 3 || found[3] === 1) return found;
+        }
+        return [255, 255, 255];
+    };
+    const faint = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+    for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+        const one = node.parentElement, style = getComputedStyle(one);
+        if (!node.data.trim() || !one.checkVisibility() || one.closest("script, style, .hidden, .bk-Root")) continue;
+        const colour = numbers(one.closest("svg") ? style.fill : style.color);
+        const [high, low] = [light(colour), light(behind(one))].sort((a, b) => b - a);
+        const size = parseFloat(style.fontSize), large = size >= 24 || (size >= 18.66 && style.fontWeight >= 700);
+        if ((high + 0.05) / (low + 0.05) < (large ? 3 : 4.5)) faint.push([node.data.trim(), colour.join()]);
+    }
+    return faint;
+}"""
+
+
+def test_screens_of_all_kinds(browser: Any, tmp_path: Path) -> None:
+    """On large and small screens, light and dark, nothing is cut or faint; the keyboard reaches all controls."""
+    comparison, trajectory = _disagreeing()
+    path = tmp_path / "report.html"
+    write_report(comparison, trajectory, path)
+    page, log = _open(browser, path)
+    for one in page.locator("details").all():
+        one.evaluate("one => one.open = true")
+    for width in (1280, 390):
+        page.set_viewport_size({"width": width, "height": 900})
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+            assert page.evaluate(CUT) == []
+            assert page.evaluate(FAINT) == []
+            _check(page, log, path)
+            shown = page.evaluate("Bokeh.documents[0].get_model_by_name('graphs').data.colour[0]")
+            assert shown == (BLUE if scheme == "light" else DARK[BLUE])
+    page.focus("a")
+    reached = set()
+    while page.evaluate("document.activeElement !== document.body"):
+        reached.add(page.evaluate("document.activeElement.id || document.activeElement.textContent"))
+        page.keyboard.press("Tab")
+    controls = page.locator("a, button, input, summary").all()
+    assert {one.get_attribute("id") or one.text_content() for one in controls} <= reached
     page.close()
 
 

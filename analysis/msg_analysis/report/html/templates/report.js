@@ -65,6 +65,12 @@
     busy = false;
   }
 
+  // On narrow screens, legends have two columns.
+  function fitLegends(shown) {
+    const columns = document.body.clientWidth < 560 ? 2 : "auto";
+    for (const one of shown.all_models) if (one.type === "Legend" && one.ncols !== columns) one.ncols = columns;
+  }
+
   function start() {
     const shown = window.Bokeh && window.Bokeh.documents[0];
     if (!shown) return setTimeout(start, 20);
@@ -78,6 +84,8 @@
       choose(agents);
     });
     choose([]);
+    fitLegends(shown);
+    window.addEventListener("resize", () => fitLegends(shown));
     document.body.dataset.started = "yes";
     if (document.getElementById("trajectories")) return;  // its script says when it has drawn
     const drawn = () => { document.body.dataset.ready = "yes"; };
