@@ -375,7 +375,8 @@ def write_report(comparison: Comparison, file: str | Path, **options: Any) -> Pa
         path of the page; replaced if it exists
     **options
         what the network reported, if known: ``restarts``, a line per process that was restarted; ``strangers``, a
-        mapping with ``node``, ``topic``, ``reason`` and ``count`` per kind of refused message; ``wall_time``, the
+        mapping with ``node``, ``topic``, ``reason`` and ``count`` per kind of refused message; ``events``, a
+        mapping with ``kind`` ("killed", "back" or "refused"), ``step`` and ``words`` per event; ``wall_time``, the
         seconds that the run took
 
     Returns

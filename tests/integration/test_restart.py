@@ -67,6 +67,7 @@ def test_killed_and_back(network: Any, kinds: list[str], repetition: int, rng: r
     assert all(re.match(KILLED, line) for line in result["restarts"])
     report = html.unescape(Path(result["report"]).read_text())
     assert all(line in report for line in result["restarts"])
+    assert [one["words"] for one in result["events"] if one["kind"] == "killed"] == result["restarts"]
 
 
 def test_a_killed_fork_server(network: Any) -> None:

@@ -101,6 +101,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         "rate": result.rate,
         "wall_time": result.wall_time,
         "restarts": result.restarts,
+        "events": result.events,
         "strangers": result.strangers,
         "failures": result.failures,
     }

@@ -53,6 +53,8 @@ class RunResult:
         processes that were killed, or crashed, and were started again, one line each
     strangers
         messages that the nodes refused: dictionaries with "node", "topic", "reason", "count"
+    events
+        when processes were killed and back, and messages first refused: see ``running.event_log``
     reached
         newest step of the slowest agent, as last reported; -1: none
     trajectory
@@ -71,6 +73,7 @@ class RunResult:
     rate: float = 0.0
     restarts: list[str] = field(default_factory=list)
     strangers: list[dict[str, Any]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
     reached: int = -1
     trajectory: Trajectory | None = None
     comparison: Comparison | None = None
@@ -135,6 +138,7 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
             file,
             restarts=result.restarts,
             strangers=result.strangers,
+            events=result.events,
             wall_time=result.wall_time,
         )
         result.report = file

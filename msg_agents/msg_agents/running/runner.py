@@ -36,6 +36,7 @@ from msg_agents.processes.process_plan import (
     plan_network,
 )
 from msg_agents.recovery.checkpoint import room_for
+from msg_agents.running.event_log import EventLog
 from msg_agents.running.run_folder import make_bag_directory, workshop
 from msg_agents.running.run_result import RunResult
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, STEPS, Supervisor
@@ -216,9 +217,11 @@ def _watch(
     stall, steps, run = StallDetector(), experiment.steps, experiment.run
     due = run.speed / experiment.step_length  # steps per second in real time
     lag = LagDetector(due) if run.pace == "realtime" and follow_clock else None
-    while interruption.caught is None and _revive(supervisor, result, restarts, view) and supervisor.awaited:
+    events = EventLog(result.events)
+    while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
         time.sleep(POLL)
         supervisor.read_status()
+        events.look(supervisor.steps, supervisor.account)
         view.look(supervisor.steps)
         reached = min(supervisor.steps, default=-1)
         if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
@@ -235,6 +238,7 @@ def _watch(
         if reached < steps or not result.wall_time:
             result.wall_time = now - began
     supervisor.read_status()  # what was reported between the last look and the end
+    events.look(supervisor.steps, supervisor.account, last=True)
     view.look(supervisor.steps)
     if result.wall_time:
         result.rate = min(supervisor.steps, default=0) / result.wall_time
@@ -252,7 +256,7 @@ def _standstill(supervisor: Supervisor) -> str:
     return "; ".join(words) or "cause unknown"
 
 
-def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View) -> bool:
+def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View, events: EventLog) -> bool:
     """Start killed processes again; False if one cannot be."""
     for child in supervisor.failures:
         if not child.resumes or len(result.restarts) >= restarts:
@@ -261,6 +265,7 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
         after = f" after step {step}" if step >= 0 else ""
         words = f" ({child.last_words()})" if child.process.poll() == CRASHED else ""
         result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
+        events.killed(child.plan.name, child.plan.agents, step, result.restarts[-1])
         view.note(result.restarts[-1])
         supervisor.restart(child)
         view.started(supervisor.by_node)

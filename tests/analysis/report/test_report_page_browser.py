@@ -180,7 +180,8 @@ def test_trajectories(browser: Any, tmp_path: Path) -> None:
     """Agents are switched on and off, and every part of the run can be seen, with the keyboard alone."""
     trajectory = _trajectory(5, duration=200)
     path = tmp_path / "report.html"
-    write_report(compare(trajectory), trajectory, path)
+    killed = {"kind": "killed", "step": 1800, "node": "agent_2", "words": "agent_2: killed"}
+    write_report(compare(trajectory), trajectory, path, events=[killed])
     page, log = _open(browser, path)
 
     def drawn(name: str, column: str) -> Any:
@@ -231,6 +232,9 @@ def test_trajectories(browser: Any, tmp_path: Path) -> None:
     settled(f"Math.abs(Math.max(...model('states').data.ys[0]) - {apart.max()}) < 1e-4")
     page.click("#earlier")
     page.click("#closer")
+    page.click(".events button")
+    settled("model('time').start < 90 && model('time').end > 90 && model('time').end < 100")
+    assert drawn("events", "words") == ["agent_2: killed"]
     page.click("#show-none")
     settled("model('states').data.agent.length == 0")
     assert log.complaints == []

@@ -57,6 +57,7 @@ from msg_analysis.report.html.interval_bars import interval_bars, plus_minus
 from msg_analysis.report.html.plots import colours, error_plots, switching_plots, trajectory_plots
 from msg_analysis.report.html.plots.accused import Accused
 from msg_analysis.report.html.plots.covariance_plots import covariances
+from msg_analysis.report.html.plots.run_events import Event, run_events
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
@@ -72,11 +73,12 @@ def write_report(
     *,
     restarts: Sequence[str] = (),
     strangers: Sequence[Mapping[str, Any]] = (),
+    events: Sequence[Mapping[str, Any]] = (),
     wall_time: float | None = None,
 ) -> None:
     """Write the report of a comparison, whole or not at all; InputError if that fails. Arguments as in ``render``."""
     path = Path(path)
-    html = render(comparison, trajectory, restarts=restarts, strangers=strangers, wall_time=wall_time)
+    html = render(comparison, trajectory, restarts=restarts, strangers=strangers, events=events, wall_time=wall_time)
     try:
         write_whole(path, html.encode())
     except OSError as error:
@@ -89,6 +91,7 @@ def render(
     *,
     restarts: Sequence[str] = (),  # one line per process that was restarted
     strangers: Sequence[Mapping[str, Any]] = (),  # refused messages: node, topic, reason, count
+    events: Sequence[Mapping[str, Any]] = (),  # of processes and refused messages: kind, step, node, words
     wall_time: float | None = None,  # [s] that the run took, if known
 ) -> str:
     """The report as HTML text."""
@@ -104,7 +107,8 @@ def render(
     environment.filters |= {"number": _number, "p": _p}
     names = [graph.name for graph in experiment.graph_list]
     accused = Accused.of(document["blame"])
-    models, sojourns = _models(document, comparison, trajectory, accused)
+    happened, more_events = run_events(trajectory, events)
+    models, sojourns = _models(document, comparison, trajectory, accused, happened)
     figures = Document()
     with figures.models.freeze():  # otherwise every figure is gone through again for each one added
         for model in models.values():
@@ -148,6 +152,9 @@ def render(
         shown_sojourns=sojourns[0],
         shown=_shown_agents(experiment.agents, accused.involved),
         accused=accused,
+        events=happened,
+        more_events=more_events,
+        step_length=experiment.step_length,
         replica=trajectory_plots.REPLICA + 1,
         explained=explain(experiment),
         drawings=network_drawings.graph_drawings(experiment, accused),
@@ -166,11 +173,16 @@ def render(
 
 
 def _models(
-    document: dict[str, Any], comparison: Comparison, trajectory: Trajectory, accused: Accused
+    document: dict[str, Any],
+    comparison: Comparison,
+    trajectory: Trajectory,
+    accused: Accused,
+    events: Sequence[Event],
 ) -> tuple[dict[str, UIElement], tuple[int, int]]:
     """The figures that exist, by name; sojourns in the figure of the active graph, and in the run."""
     experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
+    predicted = document["system_error"]["predicted"]
     models: dict[str, UIElement | None] = {
         "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"], accused),
         **covariances(
@@ -178,8 +190,8 @@ def _models(
         ),
     }
     if len(comparison.running["time"]) > 1:
-        models["running"] = error_plots.convergence(comparison.running, document["system_error"]["predicted"])
-    drawn, sojourns = trajectory_plots.trajectory_plots(trajectory, document["system_error"]["predicted"])
+        models["running"] = error_plots.convergence(comparison.running, predicted)
+    drawn, sojourns = trajectory_plots.trajectory_plots(trajectory, predicted, events)
     models |= drawn
     known = trajectory.modes[:steps]
     if len(known):

@@ -23,8 +23,19 @@ from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, PlainText, Ra
 
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.report.figures.palette import shorten
-from msg_analysis.report.html.plots.colours import BLACK, BLUE, GREY, SKY, graph_colour
+from msg_analysis.report.html.plots.colours import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    graph_colour,
+)
 from msg_analysis.report.html.plots.plot_style import new_figure
+from msg_analysis.report.html.plots.run_events import KINDS, Event
 from msg_analysis.report.html.plots.thinned_run import Thinned, envelope, thin
 from msg_analysis.types import FloatArray, IntArray
 
@@ -34,10 +45,19 @@ _WHOLE, _FIRST_SOJOURNS = 1500, 30  # steps of a run that is seen whole at first
 _OVERVIEW = 400  # bins
 _LEFT, _RIGHT = 76, 14  # pixels beside every figure: equal, so that they have one time axis
 _SIDES = {"min_border_left": _LEFT, "min_border_right": _RIGHT}
+_EVENT_STYLE = {
+    "killed": (VERMILLION, "x"),
+    "back": (GREEN, "triangle"),
+    "late": (ORANGE, "square"),
+    "refused": (PURPLE, "diamond"),
+    "missing": (BLACK, "dash"),
+}
 _TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
 
 
-def trajectory_plots(trajectory: Trajectory, predicted: float | None) -> tuple[dict[str, UIElement], tuple[int, int]]:
+def trajectory_plots(
+    trajectory: Trajectory, predicted: float | None, events: Sequence[Event] = ()
+) -> tuple[dict[str, UIElement], tuple[int, int]]:
     """The figures by name, empty for a run without states; with them, how many sojourns are drawn and are known."""
     experiment = trajectory.record.experiment
     states, modes, dt = trajectory.values, trajectory.modes, experiment.step_length
@@ -47,7 +67,7 @@ def trajectory_plots(trajectory: Trajectory, predicted: float | None) -> tuple[d
     thinned = thin(states, REPLICA, reference)
     names = [graph.name for graph in experiment.graph_list]
     starts = np.flatnonzero(np.diff(modes, prepend=-2))
-    time = Range1d(0.0, _first_view(starts, len(modes), dt), bounds=(0.0, float(len(modes) * dt)), name="time")
+    time = Range1d(*_first_view(starts, len(modes), events, dt), bounds=(0.0, float(len(modes) * dt)), name="time")
     shown = min(len(starts), MOST_SOJOURNS)
     end = int(starts[shown]) if shown < len(starts) else len(modes)
     data = _data(thinned, experiment.agents, dt)
@@ -57,6 +77,7 @@ def trajectory_plots(trajectory: Trajectory, predicted: float | None) -> tuple[d
     data.append(_source("graphs", name=names, colour=[graph_colour(mode) for mode in range(len(names))]))
     figures = {
         "trajectories": _states(time, data),
+        **({"events": _events(time, events, dt)} if events else {}),
         "path": _active_graph(time, names),
         "errors": _error(time, predicted),
         "overview": _overview(time, thinned, float(len(modes) * dt)),
@@ -64,12 +85,15 @@ def trajectory_plots(trajectory: Trajectory, predicted: float | None) -> tuple[d
     return figures, (shown, len(starts))
 
 
-def _first_view(starts: IntArray, steps: int, dt: float) -> float:
-    """End of what is visible at first: so much that single sojourns can be seen."""
+def _first_view(starts: IntArray, steps: int, events: Sequence[Event], dt: float) -> tuple[float, float]:
+    """What is visible at first: so little that single sojourns can be seen, and the first process that was killed."""
     if steps <= _WHOLE:
-        return float(steps * dt)
+        return 0.0, float(steps * dt)
     sojourns = int(starts[_FIRST_SOJOURNS]) if len(starts) > _FIRST_SOJOURNS else steps
-    return float(min(max(sojourns, _WHOLE // 3), steps) * dt)
+    length = min(max(sojourns, _WHOLE // 3), steps)
+    killed = next((event.first for event in events if event.kind == "killed"), 0)
+    first = min(max(killed - length // 3, 0), steps - length)
+    return float(first * dt), float((first + length) * dt)
 
 
 def _source(label: str, **columns: object) -> ColumnDataSource:
@@ -133,6 +157,35 @@ def _active_graph(time: Range1d, names: Sequence[str]) -> UIElement:
     plot.yaxis.ticker = FixedTicker(ticks=list(range(len(names))))
     # As plain text: for mathematics, the page would load a library from the network.
     plot.yaxis.major_label_overrides = {g: PlainText(text=shorten(name, 7)) for g, name in enumerate(names)}
+    return plot
+
+
+def _events(time: Range1d, events: Sequence[Event], dt: float) -> UIElement:
+    """A lane for each kind that there is."""
+    kinds = [kind for kind in KINDS if any(event.kind == kind for event in events)]
+    plot = new_figure(
+        int(26 + 20 * len(kinds)), _TOOLS, x_range=time, y_range=Range1d(len(kinds) - 0.4, -0.6),
+        y_axis_label="events", toolbar_location=None, **_SIDES,
+    )  # fmt: skip
+    plot.xaxis.visible = False
+    plot.ygrid.grid_line_color = None
+    plot.yaxis.ticker = FixedTicker(ticks=list(range(len(kinds))))
+    plot.yaxis.major_label_overrides = dict(enumerate(kinds))
+    source = ColumnDataSource(
+        {
+            "lane": [kinds.index(event.kind) for event in events],
+            "left": [event.first * dt for event in events],
+            "right": [event.last * dt for event in events],
+            "colour": [_EVENT_STYLE[event.kind][0] for event in events],
+            "marker": [_EVENT_STYLE[event.kind][1] for event in events],
+            "words": [event.words for event in events],
+        },
+        name="events",
+    )
+    bars = plot.hbar("lane", left="left", right="right", height=0.5, color="colour", line_alpha=0, source=source)
+    marks = plot.scatter("left", "lane", marker="marker", size=9, color="colour", line_width=2, source=source)
+    rows = [("", "@words"), ("from", "@left{0.[00]} to @right{0.[00]}")]
+    plot.add_tools(HoverTool(renderers=[bars, marks], tooltips=rows))
     return plot
 
 

@@ -242,5 +242,10 @@
     const chosen = window.parseAgents(field.value, agents);
     if (!chosen.wrong) show(chosen.agents);
   });
+  for (const button of document.querySelectorAll(".events button")) button.addEventListener("click", () => {
+    const length = Math.min(time.end - time.start, 200 * scale.dt), at = Number(button.dataset.time);
+    look(at - length / 3, at + 2 * length / 3);
+    box.scrollIntoView();
+  });
   start();
 })();
