@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import click
 
 from msg_analysis.cli.console import examples, print_json, result_console
-from msg_analysis.cli.options import PATH, SOURCE, is_bag, json_option, seed_option
+from msg_analysis.cli.options import FILE, PATH, SOURCE, is_bag, json_option, seed_option
 
 if TYPE_CHECKING:
     from msg_analysis.runs.run_filter import SortKey
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
         "msg-agents runs",
         "msg-agents runs --name 'line_*' --verdict disagrees --since 7d",
         "msg-agents runs --last 20 --sort error --json | jq '.runs[].folder'",
-        "msg-analysis runs elsewhere",
+        "msg-agents runs --open",
+        "msg-analysis runs elsewhere --page overview.html",
     )
 )
 @click.argument("folder", type=PATH, default=Path("runs"))
@@ -52,6 +53,10 @@ if TYPE_CHECKING:
 @click.option(
     "--sort", type=click.Choice(["date", "name", "seed", "verdict", "error"]), default="date", help="Order of the list."
 )
+@click.option("--page", type=FILE, metavar="FILE", help="Write these runs as a page for browsers, and print its name.")
+@click.option(
+    "--open", "shown", is_flag=True, help="Open the page in a browser; without --page it is FOLDER/index.html."
+)
 @json_option
 def runs(
     folder: Path,
@@ -63,14 +68,17 @@ def runs(
     seed: int | None,
     last: int | None,
     sort: SortKey,
+    page: Path | None,
+    shown: bool,
     as_json: bool,
 ) -> None:
-    """List the runs in FOLDER.
+    """List the runs in FOLDER, or write them as one page with overlays and differences.
 
     Saved results are read, and run records where there is no result, but no states.
     """
     from datetime import datetime
 
+    from msg_analysis.common.files import require_place
     from msg_analysis.runs.run_filter import RunFilter, moment
     from msg_analysis.runs.run_list import list_runs
 
@@ -83,14 +91,39 @@ def runs(
         seed=seed,
         last=last,
     )
+    page = page or (folder / "index.html" if shown else None)
+    require_place(page)
     found = list_runs(folder)
     chosen = wanted.choose(found, sort)
+    if page is not None:
+        from msg_analysis.report.html.runs_page import write_runs_page
+
+        write_runs_page(chosen, folder, page)
     if as_json:
-        print_json({"folder": str(folder), "total": len(found), "runs": [run.to_json() for run in chosen]})
+        listed = [run.to_json() for run in chosen]
+        print_json({"folder": str(folder), "total": len(found), "page": str(page) if page else None, "runs": listed})
+    elif page is not None:
+        click.echo(page)
     else:
         from msg_analysis.report.terminal.runs_text import print_runs
 
         print_runs(chosen, folder, len(found), result_console())
+    if shown and page is not None:
+        _open(page)
+
+
+def _open(page: Path) -> None:
+    """Show a page in a browser; where there is none, or no display, say where it is."""
+    import os
+    import sys
+    import webbrowser
+
+    from msg_analysis.common.text.notes import print_note
+
+    address = page.absolute().as_uri()
+    screen = sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+    if not screen or not webbrowser.open(address):
+        print_note(f"no {'browser' if screen else 'display'} here: open {address} in a browser")
 
 
 @click.command(

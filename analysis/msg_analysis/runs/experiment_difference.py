@@ -76,8 +76,11 @@ def _prediction(experiment: ValidExperiment) -> Prediction | str:
 def _laws(prediction: Prediction) -> dict[str, Moments]:
     """By their names in ``msg-analysis predict --json``."""
     steps = "discrete" if prediction.experiment.time == "discrete" else "emulated"
-    continuous, static = prediction.continuous_moments, prediction.static_moments
-    laws = {"continuous": continuous, steps: prediction.emulated, "static": static}
+    laws = {
+        "continuous": prediction.continuous_moments,
+        steps: prediction.emulated,
+        "static": prediction.static_moments,
+    }
     return {name: moments for name, moments in laws.items() if moments is not None}
 
 

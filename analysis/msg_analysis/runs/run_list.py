@@ -75,8 +75,8 @@ def list_runs(folder: Path) -> list[RunEntry]:
     InputError: it is not there, not a folder, or a bag itself.
     """
     try:
-        inner = [Path(entry) for entry in os.scandir(folder) if entry.is_dir() and not entry.name.startswith(".")]
-        names = {entry.name for entry in Path(folder).iterdir()}
+        with os.scandir(folder) as entries:
+            inside = list(entries)
     except NotADirectoryError as error:
         raise InputError(f"{folder}: a file: expected a folder with the folders of runs in it") from error
     except OSError as error:
@@ -84,14 +84,15 @@ def list_runs(folder: Path) -> list[RunEntry]:
             f"{folder}: {error.strerror}: expected a folder with the folders of runs in it, as `msg-agents run --out` "
             "makes it"
         ) from error
-    if METADATA_FILE in names or any(name.endswith(BAG_SUFFIXES) for name in names):
+    if any(entry.name == METADATA_FILE or entry.name.endswith(BAG_SUFFIXES) for entry in inside):
         raise InputError(f"{folder}: a bag: give the folder it is in: {folder.absolute().parent}")
-    return sorted((_entry(each) for each in inner), key=lambda entry: (entry.date, entry.folder))
+    inner = (Path(entry) for entry in inside if entry.is_dir() and not entry.name.startswith("."))
+    return sorted(map(_entry, inner), key=lambda entry: (entry.date, entry.folder))
 
 
 def _entry(folder: Path) -> RunEntry:
     try:
-        names = {entry.name for entry in Path(folder).iterdir()}
+        names = {entry.name for entry in folder.iterdir()}
         date = _date(folder, names)
     except OSError as error:
         return RunEntry(str(folder), "damaged", datetime.now().astimezone(), error.strerror)

@@ -66,6 +66,24 @@ def test_runs() -> None:
     assert [run["seed"] for run in document["runs"]] == [8]
 
 
+def test_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is opened where there is a display; elsewhere its place is said."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    assert invoke("runs", "--page", "page.html").stdout == "page.html\n"
+    result = invoke("runs", "--open", "--seed", "8")
+    place = Path("runs/index.html")
+    assert result.stdout == f"{place}\n"
+    assert f"no display here: open {place.absolute().as_uri()} in a browser" in result.stderr
+    assert "pair_20261127_120000" not in place.read_text()
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", lambda address: not opened.append(address))
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert json.loads(invoke("runs", "--open", "--json").stdout)["page"] == str(place)
+    assert opened == [place.absolute().as_uri()]
+    assert "no such directory" in invoke("runs", "--page", "none/page.html", code=2).stderr
+
+
 def test_diff_of_bags() -> None:
     bags = [f"runs/pair_2026112{seed}_120000" for seed in (7, 8)]
     text = invoke("diff", *bags).stdout

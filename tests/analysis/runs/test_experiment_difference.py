@@ -69,7 +69,9 @@ def test_other_sizes_and_laws() -> None:
 
 def test_one_without_a_prediction() -> None:
     """It has a reason, and the other its numbers."""
-    saturated = experiment(protocol={"name": "saturated"}, run={"dt": 0.1, "duration": 20, "start": "zero"})
+    saturated = experiment(
+        protocol={"name": "saturated"}, run={"dt": 0.1, "duration": 20, "start": "zero"}
+    )  # not linear
     found = experiment_difference(saturated, experiment())
     assert found["a"]["unpredicted"]
     assert found["leaders"]["a"]["note"] == "no prediction"
