@@ -18,12 +18,14 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from msg_analysis.common.bounded_input import read_text
 from msg_analysis.common.files import RESULT_FILE
+from msg_analysis.common.text.agent_names import agent_name, with_names
 from msg_analysis.errors import InputError
 
 _WANTED = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
@@ -37,7 +39,7 @@ class Result:
     experiment: str
     seeds: str  # of all runs: "1 2"
     bags: int  # number of runs
-    leaders: str  # numbers from 1: "3" or "1 4"; empty without
+    leaders: str  # names, or numbers from 1: "3" or "1 4"; empty without
     verdict: str
     simulated_time: float  # of all runs [units of simulated time]
     measured: float | None  # system error, like the next five
@@ -84,7 +86,9 @@ def result_row(path: Path, document: dict[str, Any]) -> Result:
     bags = _parts(document, "bags", file)
     seeds = [run.get("seed") for run in bags or [document]]
     tests = [_number(test, "p_adjusted", file) for test in _parts(document, "tests", file)]
-    blame = [str(cause.get("words")) for cause in _parts(document, "blame", file)]
+    given = document.get("names")
+    names = list(map(str, given)) if isinstance(given, list) else None
+    blame = [with_names(str(cause.get("words")), names) for cause in _parts(document, "blame", file)]
     leaders = document.get("leaders")
     identity = document.get("experiment_identity")
     return Result(
@@ -92,7 +96,7 @@ def result_row(path: Path, document: dict[str, Any]) -> Result:
         experiment=_part(document, "experiment", str, file),
         seeds=" ".join(str(seed) for seed in seeds if seed is not None),
         bags=len(bags) or 1,
-        leaders=" ".join(str(leader) for leader in leaders) if isinstance(leaders, list) else "",
+        leaders=" ".join(_leader(leader, names) for leader in leaders) if isinstance(leaders, list) else "",
         verdict=_part(document, "verdict", str, file),
         simulated_time=_number(document, "simulated_time", file) or 0.0,
         measured=_number(total, "measured", file),
@@ -143,3 +147,7 @@ def tested_error(document: dict[str, Any], file: Path) -> dict[str, float | None
         if isinstance(error, dict) and error.get("standard_error") is not None:
             return {key: _number(error, key, file) for key in ("measured", "standard_error", "predicted")}
     return None
+
+
+def _leader(leader: object, names: Sequence[str] | None) -> str:
+    return agent_name(leader, names) if isinstance(leader, int) else str(leader)

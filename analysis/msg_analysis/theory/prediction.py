@@ -29,6 +29,7 @@ import networkx as nx
 import numpy as np
 
 from msg_analysis.common.blas_threads import few_blas_threads, one_blas_thread
+from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.common.text.json_numbers import finite
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
@@ -201,8 +202,11 @@ class Prediction:
     def _repr_markdown_(self) -> str:
         laws = self._laws()
         rows = [("**system**", *(number_text(law.system_error) for law in laws.values()))]
-        shown = min(self.experiment.agents, SHOWN_AGENTS)
-        rows += [(f"agent {i + 1}", *(number_text(law.node_errors[i]) for law in laws.values())) for i in range(shown)]
+        shown, names = min(self.experiment.agents, SHOWN_AGENTS), self.experiment.names
+        rows += [
+            (agent_text(i + 1, names), *(number_text(law.node_errors[i]) for law in laws.values()))
+            for i in range(shown)
+        ]
         rows += [("...", *("" for _ in laws))] * (shown < self.experiment.agents)
         return "Mean-square error in the steady state\n\n" + markdown_table(("", *laws), rows)
 
@@ -215,6 +219,7 @@ class Prediction:
         """The document of ``msg-analysis predict --json``."""
         document: dict[str, Any] = {
             "agents": self.experiment.agents,
+            "names": self.experiment.names,
             "modes": [graph.name for graph in self.experiment.graph_list],
             "stationary": self.step.stationary.tolist(),
         }

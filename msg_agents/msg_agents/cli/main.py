@@ -224,15 +224,18 @@ def check(bag: Path | None, *, as_json: bool) -> None:
     Without BAG, the newest bag below ./runs is checked.
     """
     from msg_analysis.bags.reader import read_bag
+    from msg_analysis.common.text.agent_names import with_names
     from msg_analysis.twin.check import check as check_trajectory
 
     path = bag or _newest_bag(Path("runs"))
-    outcome = check_trajectory(read_bag(path))
+    run = read_bag(path)
+    outcome = check_trajectory(run)
     if as_json:
         document = {"bag": str(path), "equal": outcome.difference is None, "compared": outcome.compared}
         print_json(document | {"missing": outcome.missing, "difference": outcome.difference})
     elif outcome.difference:
-        print_text(f"{path}: differs from the twin, first: {outcome.difference}")
+        first = with_names(outcome.difference, run.record.experiment.names)
+        print_text(f"{path}: differs from the twin, first: {first}")
     else:
         missing = f", {outcome.missing} missing" if outcome.missing else ""
         print_text(f"{path}: equal to the twin to the last bit: {outcome.compared} states{missing}")

@@ -49,6 +49,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.writer import RECORDING_MARKER
 from msg_analysis.common.cores import available_cores
+from msg_analysis.common.text.agent_names import agent_text, with_names
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
@@ -225,7 +226,7 @@ def _watch(
         view.look(supervisor.steps)
         reached = min(supervisor.steps, default=-1)
         if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
-            view.note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor)}")
+            view.note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor, result.experiment.names)}")
         if reached < 0:
             continue
         if lag and reached < steps and (behind := lag.update(reached)):
@@ -244,7 +245,7 @@ def _watch(
         result.rate = min(supervisor.steps, default=0) / result.wall_time
 
 
-def _standstill(supervisor: Supervisor) -> str:
+def _standstill(supervisor: Supervisor, names: Sequence[str] | None) -> str:
     """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
     words = [f"{node}: {message}" for node, message in sorted(supervisor.account().waiting.items())]
     silent = [child.plan.name for child in supervisor.silent]
@@ -253,7 +254,7 @@ def _standstill(supervisor: Supervisor) -> str:
     if not words and supervisor.steps:  # the processes that know are on another host
         last = min(supervisor.steps)
         words.append(f"slowest: agent {supervisor.steps.index(last) + 1}, at step {last}")
-    return "; ".join(words) or "cause unknown"
+    return with_names("; ".join(words), names) or "cause unknown"
 
 
 def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View, events: EventLog) -> bool:
@@ -317,9 +318,11 @@ def _settle(bag: Path, result: RunResult) -> None:
         result.failures.append(str(error))
         return
     if result.failures:
+        names = result.experiment.names
         last = [
             int(steps[-1]) if (steps := present.nonzero()[0]).size else -1 for present in result.trajectory.present.T
         ]
         result.failures.append(
-            "last recorded step: " + ", ".join(f"agent {i + 1}: {k if k >= 0 else 'none'}" for i, k in enumerate(last))
+            "last recorded step: "
+            + ", ".join(f"{agent_text(i, names)}: {k if k >= 0 else 'none'}" for i, k in enumerate(last, start=1))
         )

@@ -204,6 +204,7 @@ def run_description(experiment: ValidExperiment) -> dict[str, Any]:
         "name": experiment.name,
         "problem": experiment.problem,
         "agents": experiment.agents,
+        "names": experiment.names,
         "steps": experiment.steps,
         "dt": experiment.step_length,
         "pace": experiment.run.pace,

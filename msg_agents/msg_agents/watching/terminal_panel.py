@@ -26,6 +26,8 @@ from rich.table import Table
 from rich.text import Text
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
+from msg_analysis.common.text.agent_names import agent_name
+from msg_analysis.report.figures.palette import shorten
 from msg_analysis.report.terminal.live_text import coverage, error_text
 
 if TYPE_CHECKING:
@@ -172,12 +174,12 @@ def _agents(snapshot: Snapshot, experiment: ValidExperiment, room: int) -> list[
         which = "agents with the largest |z|" if judged else "slowest agents" if steps_known else "first agents"
         tail = [_summary(snapshot, experiment), Text(f"above: the {which}", style="dim")]
     for i in order:
-        cells = [str(i + 1)]
+        cells = [shorten(agent_name(i + 1, experiment.names))]
         if steps_known:
             cells += [str(snapshot.steps[i]), f"{snapshot.rates[i]:.0f}" if snapshot.rates else "-"]
         node = nodes[i] if nodes else None
         cells += _errors(node) if node else ["-"] * 4
-        table.add_row(*cells, style="red" if node and abs(node.z or 0.0) > 4 else "")
+        table.add_row(*map(Text, cells), style="red" if node and abs(node.z or 0.0) > 4 else "")
     return [table, *tail] if order else tail
 
 

@@ -24,6 +24,7 @@ from typing import Any, Literal
 import numpy as np
 
 from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.common.text.agent_names import agent_text, with_names
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import half_width_text, measured_text, number_text, z_text
 from msg_analysis.inference.blame.causes import Cause
@@ -180,6 +181,7 @@ class Comparison:
         return f"<Comparison, {runs} of {name!r}: {self.verdict}; system error {numbers}>"
 
     def _repr_markdown_(self) -> str:
+        names = self.trajectory.record.experiment.names
         rows = [
             (
                 name,
@@ -190,12 +192,12 @@ class Comparison:
             )
             for name, error in [
                 ("**system**", self.system_error),
-                *((f"agent {i}", node) for i, node in enumerate(self.node_errors[:SHOWN_AGENTS], start=1)),
+                *((agent_text(i, names), node) for i, node in enumerate(self.node_errors[:SHOWN_AGENTS], start=1)),
             ]
         ]
         rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
         table = markdown_table(("mean-square error", "measured", "± (95 %)", "predicted", "z"), rows)
-        blame = "".join(f"- {cause.words}\n" for cause in self.blame)
+        blame = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.blame)
         return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
 
     @property
@@ -234,6 +236,7 @@ class Comparison:
             "run": None if self.pool else str(record.run),
             "experiment": record.experiment.name,
             "experiment_identity": law_identity(record.experiment),
+            "names": record.experiment.names,
             "leaders": (np.flatnonzero(record.experiment.leader_gains) + 1).tolist(),
             "seed": None if self.pool else record.experiment.run.seed,
             "level": self.level,

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.common.text.number_words import number_text, percent
 from msg_analysis.theory.prediction import LAW_NAMES
 
@@ -102,7 +103,7 @@ def agent_order(document: dict[str, Any]) -> list[str]:
     """Which agents are more certain than which, in sentences; empty where that is not known."""
     if not document.get("order"):
         return []
-    names = [f"agent {i}" for i in range(1, len(document["node_errors"]) + 1)]
+    names = [agent_text(i, document.get("names")) for i in range(1, len(document["node_errors"]) + 1)]
     return order_statements(document["order"], names, "is more certain than")
 
 

@@ -19,8 +19,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from msg_analysis.common.text.agent_names import agent_name
+from msg_analysis.common.text.number_words import listed
 from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.experiment.problems import show
 from msg_analysis.theory.graph_indices import algebraic_connectivity
 
 
@@ -60,8 +61,8 @@ def _task(experiment: ValidExperiment) -> str:
             f"{text} (consensus). An agent error is the mean square of the distance of a state from the average of all "
             "states; the system error is the sum of the agent errors."
         )
-    one = len(leaders.agents) == 1
-    who = f"leader, agent {leaders.agents[0]}, is" if one else f"leaders, agents {show(leaders.agents)[1:-1]}, are"
+    named = listed([agent_name(agent, experiment.names) for agent in leaders.agents])
+    who = f"leader, agent {named}, is" if len(leaders.agents) == 1 else f"leaders, agents {named}, are"
     pull = "held at" if math.isinf(leaders.gain) else f"pulled with gain {leaders.gain:g} to"
     return (
         f"{text}; the {who} {pull} the reference {leaders.reference:g} (tracking). An agent error is the mean square "

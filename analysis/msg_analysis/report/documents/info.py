@@ -54,6 +54,7 @@ def describe_experiment(experiment: ValidExperiment) -> dict[str, Any]:
         "problem": experiment.problem,
         "time": experiment.time,
         "agents": experiment.agents,
+        "names": experiment.names,
         "leaders": document.get("leaders"),
         "protocol": _protocol(experiment),
         "noise": document["noise"],
@@ -118,7 +119,18 @@ def _describe_run(path: Path, inventory: Inventory) -> dict[str, Any]:
     except InputError as error:
         if all(entry.problem for entry in inventory.files):
             raise
-        keys = ("run", "experiment", "seed", "agents", "replicas", "steps", "simulated_time", "completeness", "prefix")
+        keys = (
+            "run",
+            "experiment",
+            "seed",
+            "agents",
+            "names",
+            "replicas",
+            "steps",
+            "simulated_time",
+            "completeness",
+            "prefix",
+        )
         return {"problem": str(error), **dict.fromkeys(keys), "protocol": None, "versions": {}}
     record = trajectory.record
     run = record.experiment.run
@@ -129,6 +141,7 @@ def _describe_run(path: Path, inventory: Inventory) -> dict[str, Any]:
         "experiment": record.experiment.name,
         "seed": run.seed,
         "agents": record.experiment.agents,
+        "names": record.experiment.names,
         "replicas": run.replicas,
         "steps": record.experiment.steps,
         "simulated_time": run.duration,

@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.decay_rates import asymptotic_rates
@@ -59,6 +60,7 @@ def describe_transient(
         "law": "discrete" if experiment.time == "discrete" else law,
         "unreduced": unreduced,
         "agents": experiment.agents,
+        "names": experiment.names,
         "modes": [graph.name for graph in experiment.graph_list],
         "times": times.tolist(),
         "graph_law": found.laws.tolist(),
@@ -123,6 +125,7 @@ def describe_facts(experiment: ValidExperiment) -> dict[str, Any]:
         forms = unless_refused(lambda: {law: two_topology(system).to_json() for law, system in laws.items()})
     indices = [graph_indices(graph) for graph in experiment.graph_list]
     return {
+        "names": experiment.names,
         "modes": [graph.name for graph in experiment.graph_list],
         "facts": facts,
         "bounds": error_bounds(prediction).to_json(),
@@ -135,7 +138,7 @@ def describe_facts(experiment: ValidExperiment) -> dict[str, Any]:
 def write_transient_csv(document: dict[str, Any], path: Path) -> None:
     """Write a row per time: the law of the graph, means and mean squares of the agents; whole or not at all."""
     system, nodes = _mean_squares(document)
-    agents = range(1, document["agents"] + 1)
+    agents = [agent_name(i, document["names"]) for i in range(1, document["agents"] + 1)]
     header = ["time", *(f"probability of {name}" for name in document["modes"])]
     header += [*(f"mean of agent {i}" for i in agents), system.replace("_", " ")]
     header += [f"{nodes.removesuffix('s').replace('_', ' ')} of agent {i}" for i in agents]

@@ -17,12 +17,13 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 
 import networkx as nx
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.report.figures.agent_places import LABELLED, line_width
 from msg_analysis.report.figures.palette import BLACK, DARK_GREY, INK, LIGHT_GREY, PALE, shorten
@@ -67,6 +68,7 @@ def draw_graph(
     colour: str,
     *,
     leaders: Set[int] = frozenset(),  # from 0
+    names: Sequence[str] | None = None,
     size: float | None = None,  # area of an agent [points^2]; None: by the number of agents
 ) -> None:
     """Draw one graph; leaders are squares."""
@@ -88,8 +90,8 @@ def draw_graph(
         network, places, ax=axes, edge_color=colour, width=widths, node_size=size, alpha=0.8, **arrows
     )
     if agents <= LABELLED:
-        names = {i: str(i + 1) for i in range(agents)}
-        nx.draw_networkx_labels(network, places, names, ax=axes, font_size=8 if agents <= 20 else 5.5)
+        labels = {i: plain(shorten(agent_name(i + 1, names), 8)) for i in range(agents)}
+        nx.draw_networkx_labels(network, places, labels, ax=axes, font_size=8 if agents <= 20 else 5.5)
     axes.set_title(plain(shorten(graph.name)), color=BLACK)
     axes.margins(0.12)
     axes.set_aspect("equal")

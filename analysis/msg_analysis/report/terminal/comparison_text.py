@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from msg_analysis.common.text.agent_names import agent_text, with_names
 from msg_analysis.common.text.number_words import measured_text, number_text, p_text, z_text
 from msg_analysis.inference.realtime.laws import SUPPORT
 from msg_analysis.report.documents.comparison_words import (
@@ -58,7 +59,7 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
     if document.get("transient"):
         console.print(f"The errors leave out the first {document['transient']} steps (transient).")
     for cause in (document.get("blame") or [])[:ROWS]:
-        console.print(Text(sentence(cause["words"])), style="bold red")
+        console.print(Text(with_names(sentence(cause["words"]), document.get("names"))), style="bold red")
     _print_bags(document.get("bags") or [], console)
     _print_errors(document, console)
     _print_tests(document, console)
@@ -119,7 +120,7 @@ def _print_errors(document: dict[str, Any], console: Console) -> None:
     def row(label: str, entry: dict[str, Any] | None, end_section: bool = False) -> None:
         entry = entry or {}
         measured, predicted = number_text(entry.get("measured")), number_text(entry.get("predicted"))
-        cells = (label, measured, interval_text(entry.get("interval")), predicted, z_text(entry.get("z")))
+        cells = (Text(label), measured, interval_text(entry.get("interval")), predicted, z_text(entry.get("z")))
         table.add_row(*cells, end_section=end_section)
 
     given = document.get("given_path")
@@ -128,7 +129,7 @@ def _print_errors(document: dict[str, Any], console: Console) -> None:
         row("system, given the path", given["system_error"], end_section=True)
     agents, corrected = agent_errors(document)
     for agent, entry in enumerate(first_rows(table, agents, "agents"), start=1):
-        row(f"agent {agent}, given the path" if corrected else f"agent {agent}", entry)
+        row(agent_text(agent, document.get("names")) + (", given the path" if corrected else ""), entry)
     print_table(console, table)
 
 
@@ -164,7 +165,8 @@ def _print_tests(document: dict[str, Any], console: Console) -> None:
     # Rejected tests first: with many agents the table is cut.
     shown = [test for test in tests if test["rejected"]] + [test for test in tests if not test["rejected"]]
     for test in first_rows(table, shown, "tests"):
-        table.add_row(Text(str(test["name"])), p_text(test["p"]), p_text(test["p_adjusted"]), _mark(test))
+        name = with_names(str(test["name"]), document.get("names"))
+        table.add_row(Text(name), p_text(test["p"]), p_text(test["p_adjusted"]), _mark(test))
     print_table(console, table)
 
 

@@ -16,12 +16,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.common.text.number_words import listed, number_text
 from msg_analysis.model.experiment.memory import amount
 from msg_analysis.report.terminal.tables import ROWS, fact_table, number_table
@@ -29,13 +31,16 @@ from msg_analysis.report.terminal.tables import ROWS, fact_table, number_table
 
 def print_experiment(document: dict[str, Any], console: Console) -> None:
     """Print an experiment: a document of ``info.describe_experiment``."""
-    run = document["run"]
+    run, names = document["run"], document["names"]
     facts = fact_table(console, document["name"])
     facts.add_row("problem", f"{document['problem']} of {document['agents']} agents in {document['time']} time")
+    if names:
+        facts.add_row("agents", Text(listed(names)))
     if document["leaders"]:
         leaders = document["leaders"]
-        text = f"{listed(leaders['agents'])}, gain {leaders['gain']}, reference {leaders['reference']}"
-        facts.add_row("leaders", text)
+        named = listed([agent_name(agent, names) for agent in leaders["agents"]])
+        text = f"{named}, gain {leaders['gain']}, reference {leaders['reference']}"
+        facts.add_row("leaders", Text(text))
     add_protocol(facts, document.get("protocol"))
     facts.add_row("noise", ", ".join(f"{key} {_short(value)}" for key, value in document["noise"].items()))
     facts.add_row("steps", f"{run['steps']} of {number_text(run['dt'])}, {number_text(run['duration'])} units of time")
@@ -59,15 +64,15 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
             number_text(graph["stationary"]),
             number_text(graph["mean_holding_time"]),
             number_text(graph["stability_limit"]),
-            _links(graph),
+            Text(_links(graph, names)),
         )
     console.print(graphs)
     switching = document["switching"]
     title = "Switching rates" if document["time"] == "continuous" else "Switching probabilities"
-    names = [graph["name"] for graph in document["graphs"]]
-    if 1 < len(names) <= ROWS:
-        chain = number_table(console, title, "from / to", *names)
-        for name, row in zip(names, switching["matrix"], strict=True):
+    modes = [graph["name"] for graph in document["graphs"]]
+    if 1 < len(modes) <= ROWS:
+        chain = number_table(console, title, "from / to", *modes)
+        for name, row in zip(modes, switching["matrix"], strict=True):
             chain.add_row(Text(name), *map(number_text, row))
         console.print(chain)
     for line in document["unavailable"]:
@@ -97,7 +102,8 @@ def _short(value: Any) -> str:
     return str(value)
 
 
-def _links(graph: dict[str, Any]) -> str:
+def _links(graph: dict[str, Any], names: Sequence[str] | None) -> str:
     """``1-2, 2-3 (0.5)`` for edges, ``1>2`` for arcs (2 hears 1)."""
     sign, links = ("-", graph["edges"]) if graph["edges"] is not None else (">", graph["arcs"])
-    return listed([f"{i}{sign}{j}" + (f" ({weight:g})" if weight != 1 else "") for i, j, weight in links]) or "none"
+    ends = [(agent_name(i, names), agent_name(j, names), weight) for i, j, weight in links]
+    return listed([f"{i}{sign}{j}" + (f" ({weight:g})" if weight != 1 else "") for i, j, weight in ends]) or "none"

@@ -32,6 +32,7 @@ def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
     return {
         "run": str(record.run),
         "experiment": record.experiment.name,
+        "names": record.experiment.names,
         "first_step": report.first,
         "last_step": report.last,
         "steps": report.steps,

@@ -16,11 +16,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
 from rich.text import Text
 
+from msg_analysis.common.text.agent_names import agent_name, agent_text
 from msg_analysis.common.text.number_words import listed, number_text
 from msg_analysis.report.terminal.tables import fact_table, first_rows, number_table, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
@@ -42,7 +44,8 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     errors = number_table(console, "Mean-square error in the steady state", "", *laws)
     errors.add_row("system", *(number_text(law["system_error"]) for law in laws.values()), end_section=True)
     for agent in first_rows(errors, range(document["agents"]), "agents"):
-        errors.add_row(f"agent {agent + 1}", *(number_text(law["node_errors"][agent]) for law in laws.values()))
+        name = Text(agent_text(agent + 1, document["names"]))
+        errors.add_row(name, *(number_text(law["node_errors"][agent]) for law in laws.values()))
     errors.add_section()
     errors.add_row("certainty", *(number_text(law["system_certainty"]) for law in laws.values()))
     console.print(errors)
@@ -55,6 +58,10 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
             console.print(f"{title}: not finite, or not defined with this noise", style="dim")
 
 
+def _named(entry: dict[str, Any], document: dict[str, Any]) -> str:
+    return listed([agent_name(agent, document["names"]) for agent in entry["agents"]])
+
+
 def print_leaders(document: dict[str, Any], console: Console) -> None:
     """Print a document of ``Selection.to_json()``: the best sets of leaders, and how good the first is."""
     gain = "held at the reference" if document["gain"] == "inf" else f"gain {document['gain']:g}"
@@ -64,7 +71,11 @@ def print_leaders(document: dict[str, Any], console: Console) -> None:
     centrality = "joint centrality" if document["gain"] == "inf" else "certainty"
     table = number_table(console, title, "agents", "system error", centrality)
     for entry in first_rows(table, document["sets"], "sets"):
-        row = (listed(entry["agents"]), number_text(entry["system_error"]), number_text(entry["joint_centrality"]))
+        row = (
+            Text(_named(entry, document)),
+            number_text(entry["system_error"]),
+            number_text(entry["joint_centrality"]),
+        )
         table.add_row(*row)
     print_table(console, table)
     facts = fact_table(console, f"Method: {_METHODS[document['method']]}")
@@ -78,7 +89,7 @@ def print_leaders(document: dict[str, Any], console: Console) -> None:
     else:
         facts.add_row("guarantee", f"none: {document['note']}")
     if present := document["present"]:
-        facts.add_row(f"leaders now: {listed(present['agents'])}", number_text(present["system_error"]))
+        facts.add_row(Text(f"leaders now: {_named(present, document)}"), number_text(present["system_error"]))
     console.print(facts)
 
 
@@ -121,7 +132,7 @@ def print_facts(document: dict[str, Any], console: Console) -> None:
         )
     _print_graphs(document, console)
     for law, form in (document["two_topology"] or {}).items():
-        _print_form(law, form, console)
+        _print_form(law, form, document["names"], console)
     for note in document["notes"]:
         console.print(Text(note, style="yellow"))
 
@@ -143,7 +154,8 @@ def _print_graphs(document: dict[str, Any], console: Console) -> None:
         return
     table = number_table(console, "Undirected connected graphs", "graph")
     table.add_column("Kirchhoff index", justify="right")
-    table.add_column("information centrality of agents 1, 2, ...", overflow="fold")
+    first = ", ".join(agent_name(agent, document["names"]) for agent in (1, 2))
+    table.add_column(Text(f"information centrality of agents {first}, ..."), overflow="fold")
     for entry in shown:
         centrality = entry["information_centrality"]
         values = listed([number_text(value) for value in centrality])
@@ -151,7 +163,7 @@ def _print_graphs(document: dict[str, Any], console: Console) -> None:
     print_table(console, table)
 
 
-def _print_form(law: str, form: dict[str, Any], console: Console) -> None:
+def _print_form(law: str, form: dict[str, Any], names: Sequence[str] | None, console: Console) -> None:
     title = f"Two graphs in closed form, {LAW_NAMES[law]}, beta = {number_text(form['rate'])}"
     table = number_table(console, title, "", "static", "switching adds", "error", "fastest adds")
     keys = ("static", "switching", "error", "fast")
@@ -162,5 +174,5 @@ def _print_form(law: str, form: dict[str, Any], console: Console) -> None:
         for row in zip(*(form["nodes"][key] for key in keys), strict=True)
     ]
     for agent, row in enumerate(first_rows(table, rows, "agents"), start=1):
-        table.add_row(f"agent {agent}", *map(number_text, row))
+        table.add_row(Text(agent_text(agent, names)), *map(number_text, row))
     print_table(console, table)

@@ -29,6 +29,7 @@ import numpy as np
 import scipy.sparse.csgraph
 
 from msg_analysis.common.blas_threads import few_blas_threads
+from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import InputError
@@ -157,12 +158,15 @@ class Selection:
 
     def __repr__(self) -> str:
         error, agents = self.sets[0]
-        best = f"agents {', '.join(str(agent + 1) for agent in agents)} with system error {error:.6g}"
+        best = f"agents {self._named(agents)} with system error {error:.6g}"
         return f"<Selection for {self.problem.experiment.name!r}: {best}; {self.method}, {self.evaluations} evaluated>"
 
     def _repr_markdown_(self) -> str:
-        rows = [(", ".join(str(agent + 1) for agent in agents), number_text(error)) for error, agents in self.sets]
+        rows = [(self._named(agents), number_text(error)) for error, agents in self.sets]
         return markdown_table(("leaders", "system error"), rows)
+
+    def _named(self, agents: tuple[int, ...]) -> str:
+        return ", ".join(agent_name(agent + 1, self.problem.experiment.names) for agent in agents)
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis leaders --json``; agents count from 1."""
@@ -170,6 +174,7 @@ class Selection:
         gap = best / self.bound - 1.0 if self.bound else None
         return {
             "experiment": self.problem.experiment.name,
+            "names": self.problem.experiment.names,
             "law": self.problem.law,
             "gain": "inf" if math.isinf(self.problem.gain) else self.problem.gain,
             "count": len(self.sets[0][1]),

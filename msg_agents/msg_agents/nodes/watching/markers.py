@@ -27,6 +27,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from msg_agents.nodes.ros.rclpy_error import until_shutdown
 from msg_agents.nodes.ros.timers import every
 from msg_agents.nodes.watching.watch_process import Watcher, run_watcher
+from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.errors import InputError
 from msg_analysis.wire import topics
 from msg_analysis.wire.messages import AgentState
@@ -168,12 +169,12 @@ class Markers(Watcher):
         return marker
 
     def _name(self, agent: int) -> Marker:
-        """The number of an agent, outside the circle."""
+        """The name or number of an agent, outside the circle."""
         marker = self._marker("names", Marker.TEXT_VIEW_FACING, TEXT_SIZE, agent)
         x, y = self._places[agent]
         away = 1 + AGENT_SIZE / max(math.hypot(x, y), AGENT_SIZE)
         marker.pose = _at(x * away, y * away)
-        marker.text = str(agent + 1)
+        marker.text = agent_name(agent + 1, self.record.experiment.names if self.record else None)
         return marker
 
 
