@@ -83,6 +83,9 @@ setup(
         "lz4",
         "zstandard",
     ],
-    extras_require={"test": ["pytest"]},  # by which colcon knows how to test it
+    extras_require={
+        "pandas": ["pandas"],  # run.to_dataframe()
+        "test": ["pytest"],  # by which colcon knows how to test it
+    },
     entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli.entry_point:msg_analysis"]},
 )

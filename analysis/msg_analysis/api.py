@@ -34,15 +34,15 @@ from msg_analysis.common.files import require_place
 from msg_analysis.errors import BagError, InputError, NotAvailableError
 from msg_analysis.examples.bundled import find
 from msg_analysis.inference.verdict.compare import compare as compare_trajectory
-from msg_analysis.inference.verdict.comparison import Comparison
 from msg_analysis.inference.verdict.pool import compare_pooled
 from msg_analysis.model.experiment import experiment as model
 from msg_analysis.model.experiment.problems import ExperimentError
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.results import Comparison, Prediction, ShownRun, fields
 from msg_analysis.theory.leaders.search import SearchProgress, ignore
 from msg_analysis.theory.leaders.selection import SearchMethod, Selection, SelectionLaw, select_leaders
-from msg_analysis.theory.prediction import Moments, Prediction, predict
+from msg_analysis.theory.prediction import Moments, predict
 from msg_analysis.theory.transient import Transient, TransientLaw, solve_transient
 from msg_analysis.twin.simulate import simulate
 from msg_analysis.types import FloatArray
@@ -106,7 +106,7 @@ class Experiment(model.ValidExperiment):
         Experiment
             ``experiment`` itself if it is of this class already
         """
-        return experiment if isinstance(experiment, cls) else cls(**_fields(experiment))
+        return experiment if isinstance(experiment, cls) else cls(**fields(experiment))
 
     def predict(self) -> Prediction:
         """The exact steady second moments; see :func:`msg_analysis.theory.prediction.predict`.
@@ -126,7 +126,7 @@ class Experiment(model.ValidExperiment):
             too large, or without finite steady errors
         """
         self.require_available("predict")
-        return predict(self)
+        return Prediction.of(predict(self))
 
     def transient(self, times: ArrayLike, *, law: TransientLaw = "emulated", unreduced: bool = False) -> Transient:
         """The exact moments over time from the experiment's own start.
@@ -237,7 +237,7 @@ class Experiment(model.ValidExperiment):
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Run(Trajectory):
+class Run(ShownRun):
     """A run of an experiment, by a network or by the twin: states and graphs of every step.
 
     The arrays are those of :class:`msg_analysis.model.run.trajectory.Trajectory`. A missing state is NaN, a missing
@@ -253,7 +253,7 @@ class Run(Trajectory):
         trajectory
             of a bag or of the twin; its arrays are shared, not copied
         """
-        return trajectory if isinstance(trajectory, cls) else cls(**_fields(trajectory))
+        return trajectory if isinstance(trajectory, cls) else cls(**fields(trajectory))
 
     @property
     def experiment(self) -> Experiment:
@@ -356,12 +356,12 @@ def compare(*runs: Trajectory | str | Path, level: float = 0.01) -> Comparison:
     if not 0.0 < level <= 0.5:
         raise InputError(f"level: {level:g}: expected a probability above 0, at most 0.5")
     if len(runs) == 1:
-        return compare_trajectory(_read(runs[0]), level=level)
+        return Comparison.of(compare_trajectory(_read(runs[0]), level=level))
     absent = [str(path) for path in runs if not isinstance(path, Trajectory) and not Path(path).exists()]
     if absent:
         raise InputError(f"{', '.join(absent)}: not found: expected bags, {len(runs)} were given")
     named = ((_name(run, place), _read(run)) for place, run in enumerate(runs, start=1))
-    return compare_pooled(named, level=level)
+    return Comparison.of(compare_pooled(named, level=level))
 
 
 def write_report(comparison: Comparison, file: str | Path, **options: Any) -> Path:
@@ -404,7 +404,3 @@ def _read(run: Trajectory | str | Path) -> Trajectory:
 
 def _name(run: Trajectory | str | Path, place: int) -> str:
     return f"run {place}" if isinstance(run, Trajectory) else str(run)
-
-
-def _fields(instance: Any) -> dict[str, Any]:
-    return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}

@@ -17,6 +17,7 @@ from msg_analysis.model.experiment.experiment import ValidExperiment as ModelExp
 
 ROOT = Path(__file__).parents[2]
 LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"
+TRACKING = ROOT / "tests/data/golden/tracking.yaml"
 GOLDEN = json.loads((ROOT / "tests/data/golden/line_ring.predict.json").read_text())
 
 
@@ -177,3 +178,54 @@ def test_large_networks_are_short_too() -> None:
     experiment = Experiment.parse(document)
     assert "g3, ...;" in repr(experiment)
     assert len(experiment.predict()._repr_markdown_().splitlines()) < 40
+
+
+def test_every_object_has_a_table_for_notebooks(experiment: Experiment, run: Run) -> None:
+    """Every class that is exported, errors aside, and what its attributes are in the documentation."""
+    prediction, comparison = experiment.predict(), run.compare()
+    shown = [
+        *(experiment, prediction, prediction.emulated, run, run.completeness, comparison, comparison.system_error),
+        *(experiment.transient([0, 1, 2]), Experiment.load(TRACKING).select_leaders(1)),
+    ]
+    classes = [getattr(msg_analysis, name) for name in msg_analysis.__all__ if name[0].isupper()]
+    assert {kind for kind in classes if not issubclass(kind, Exception)} <= {type(each) for each in shown}
+    for each in shown:
+        lines = each._repr_markdown_().splitlines()
+        assert any(re.fullmatch(r"(\| -{3}:? )+\|", line) for line in lines), each
+        assert lines[-1].startswith("|"), each
+
+
+def test_plots(experiment: Experiment, run: Run) -> None:
+    """What is drawn: numbers of the run, its comparison, its prediction; notebooks show it as PNG."""
+    figure = run.plot([4, 0], replica=3)
+    axes, band = figure.axes
+    assert [line.get_label() for line in axes.lines] == ["agent 5", "agent 1"]
+    assert np.array_equal(axes.lines[0].get_ydata(), run.states[:, 4, 3])
+    assert np.array_equal(axes.lines[0].get_xdata(), run.times)
+    assert [label.get_text() for label in band.get_yticklabels()] == ["line", "ring"]
+    share = [sum(path.get_extents().width for path in each.get_paths()) / run.times[-1] for each in band.collections]
+    np.testing.assert_allclose(share, [np.mean(run.modes == mode) for mode in (0, 1)])
+    comparison = run.compare()
+    above, below = comparison.plot().axes
+    assert above.lines[0].get_ydata()[-1] == pytest.approx(comparison.system_error.measured)
+    prediction = experiment.predict()
+    drawn = prediction.plot().axes[0].lines
+    assert len(drawn) == 3
+    np.testing.assert_allclose(drawn[0].get_ydata(), prediction.emulated.node_errors)
+    assert below.get_xlabel() == "agent"
+    for each in (figure, comparison.plot(), prediction.plot()):
+        assert each._repr_png_().startswith(b"\x89PNG")
+    for agents, replica in (([5], 0), ([], 0), (None, 16)):
+        with pytest.raises(InputError, match=r"agents: |replica: 16"):
+            run.plot(agents, replica=replica)
+
+
+def test_plots_of_unusual_runs() -> None:
+    """One graph, one step, many agents with names, leaders, no prediction, missing states."""
+    names = [f"town ${i}_{i}$" for i in range(31)]
+    many = Experiment.parse({"name": "many", "names": names, "graphs": {"$x$": {"complete": True}}, "agents": 31})
+    many = many.with_run(dt=0.01, duration=0.01)
+    run = many.simulate()
+    run.states[1, 3] = np.nan
+    for figure in (run.plot(), many.predict().plot(), compare(Experiment.load(TRACKING).simulate(duration=1)).plot()):
+        assert figure._repr_png_()

@@ -20,13 +20,14 @@ input, 3 data incomplete. Slow imports are made inside the commands that need th
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from msg_analysis.cli import compare, runs, sweep, theory
-from msg_analysis.cli.console import CommandGroup, examples, print_json, result_console
+from msg_analysis.cli.console import CommandGroup, complain, examples, print_json, print_text, result_console
 from msg_analysis.cli.options import (
     BAG,
     PATH,
@@ -268,6 +269,46 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
         from msg_analysis.report.terminal.bag_text import print_salvage
 
         print_salvage(document, result_console())
+
+
+@main.command(
+    epilog=examples(
+        "msg-analysis export runs/line_ring_20250101_120000 --parquet",
+        "msg-analysis export line_ring_twin --csv --npz --out data",
+    )
+)
+@click.argument("bag", type=BAG)
+@click.option("--csv", is_flag=True, help="Write states.csv, graphs.csv and errors.csv.")
+@click.option("--parquet", is_flag=True, help="Write states.parquet, graphs.parquet and errors.parquet.")
+@click.option("--npz", is_flag=True, help="Write run.npz, the arrays of Python.")
+@click.option("--out", type=PATH, metavar="DIR", show_default="<name of BAG>_export", help="Output directory.")
+@json_option
+def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, out: Path | None, as_json: bool) -> None:
+    """Write the states, graphs and errors of the run in BAG for other programs; print the names of the files.
+
+    Existing files of the same names are replaced. Exit code 3: states or graphs of the run are missing.
+    """
+    from msg_analysis.bags.reader import read_bag
+    from msg_analysis.cli.progress import WorkProgress
+    from msg_analysis.common.exit_codes import ExitCode
+    from msg_analysis.common.long_work import watched
+    from msg_analysis.report.export.export_files import FORMS, export_run
+
+    forms = [form for form, wanted in zip(FORMS, (csv, parquet, npz), strict=True) if wanted]
+    if not forms:
+        raise InputError("no format: expected at least one of --csv, --parquet, --npz")
+    directory = out or Path(f"{bag.resolve().name.partition('.')[0]}_export")
+    with WorkProgress() as progress, watched(progress):
+        run = read_bag(bag)
+        files = [str(file) for file in export_run(run, directory, forms)]
+    count = run.completeness
+    if as_json:
+        print_json({"run": str(run.record.run), "files": files, "missing": count.missing + count.missing_modes})
+    else:
+        print_text("\n".join(files))
+    if not count.complete:
+        complain(f"{bag}: {count.missing} states and {count.missing_modes} graphs are missing: empty there", "warning:")
+        sys.exit(ExitCode.INCOMPLETE)
 
 
 main.add_command(compare.compare)

@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from msg_analysis.errors import InputError
@@ -57,16 +59,22 @@ def no_temporary_directory(error: OSError) -> str | None:
 
 def write_whole(path: Path, content: bytes) -> Path:
     """Write under a temporary name and rename; after an OSError, what was at ``path`` is unchanged."""
+    with written_whole(path) as temporary:
+        temporary.write_bytes(content)
+    return path
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """A temporary file to write, beside ``path``, which it replaces at the end; after any error, nothing is changed."""
     with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as stream:
         temporary = Path(stream.name)
-        try:
-            stream.write(content)
-            stream.flush()  # a full disk is noticed here
-            mask = os.umask(0)
-            os.umask(mask)
-            temporary.chmod(0o666 & ~mask)
-            temporary.replace(path)
-        except OSError:
-            temporary.unlink()
-            raise
-    return path
+    try:
+        yield temporary
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

@@ -85,6 +85,14 @@ class Moments:
     def __repr__(self) -> str:
         return f"<Moments of {len(self.covariance)} agents: system error {self.system_error:.6g}>"
 
+    def _repr_markdown_(self) -> str:
+        errors, certainty = self.node_errors, self.node_certainty
+        rows = [("**system**", number_text(self.system_error), number_text(self.system_certainty))]
+        shown = range(min(len(errors), SHOWN_AGENTS))
+        rows += [(f"agent {i + 1}", number_text(errors[i]), number_text(certainty[i])) for i in shown]
+        rows += [("...", "", "")] * (len(shown) < len(errors))
+        return markdown_table(("", "mean-square error", "certainty"), rows)
+
     @property
     def node_errors(self) -> FloatArray:
         """(m,) E_i."""
@@ -189,18 +197,18 @@ class Prediction:
             return None
         return _static(self.paper)
 
-    def _laws(self) -> dict[str, Moments]:
+    def laws(self) -> dict[str, Moments]:
         """Those moments that there are, by the name that texts give them."""
         steps = "sequential" if self.emulated.law == "sequential" else "emulated"
         laws = {steps: self.emulated, "continuous": self.continuous_moments, "static": self.static_moments}
         return {LAW_NAMES[key]: law for key, law in laws.items() if law is not None}
 
     def __repr__(self) -> str:
-        errors = ", ".join(f"{law.system_error:.6g} ({name})" for name, law in self._laws().items())
+        errors = ", ".join(f"{law.system_error:.6g} ({name})" for name, law in self.laws().items())
         return f"<Prediction of {self.experiment.name!r}: system error {errors}>"
 
     def _repr_markdown_(self) -> str:
-        laws = self._laws()
+        laws = self.laws()
         rows = [("**system**", *(number_text(law.system_error) for law in laws.values()))]
         shown, names = min(self.experiment.agents, SHOWN_AGENTS), self.experiment.names
         rows += [

@@ -26,6 +26,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from msg_analysis.common.blas_threads import few_blas_threads
+from msg_analysis.common.text.markdown import markdown_table
+from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import InputError
 from msg_analysis.model.step.sequential_law import build_run_model
 from msg_analysis.theory.moments import MomentSolver
@@ -44,6 +46,7 @@ TransientLaw = Literal["emulated", "continuous"]
 
 MAX_UNKNOWNS = 300  # largest n p + n, with p = d (d + 1) / 2, whose matrix is propagated as a whole
 MAX_BYTES = 2e9  # largest result
+SHOWN_TIMES = 11  # in a notebook's table; the arrays have all of them
 MAX_STEPS = 10_000_000  # most single steps (discrete time, beyond MAX_UNKNOWNS)
 
 
@@ -84,6 +87,12 @@ class Transient:
         errors, times = self.system_error, self.times
         course = f"{errors[0]:.6g} at {times[0]:g} to {errors[-1]:.6g} at {times[-1]:g}"
         return f"<Transient of {len(self.system.output)} agents, {len(times)} times: system error {course}>"
+
+    def _repr_markdown_(self) -> str:
+        chosen = np.unique(np.linspace(0, len(self.times) - 1, SHOWN_TIMES).round().astype(int))
+        rows = [(number_text(self.times[k]), number_text(self.system_error[k])) for k in chosen.tolist()]
+        table = markdown_table(("time", "system error"), rows, names=0)
+        return f"Moments of {len(self.system.output)} agents at {len(self.times)} times, of which are shown:\n\n{table}"
 
     @property
     def mean(self) -> FloatArray:

@@ -131,7 +131,7 @@ def test_facts_of_a_large_network(tmp_path):
 def test_facts(name):
     document = document_of("facts", GOLDEN / f"{name}.yaml")
     assert all(fact["holds"] for fact in document["facts"])
-    assert set(document) == {"modes", "facts", "bounds", "graphs", "two_topology", "notes"}
+    assert set(document) == {"names", "modes", "facts", "bounds", "graphs", "two_topology", "notes"}
     prediction = predict(ValidExperiment.load(GOLDEN / f"{name}.yaml"))
     if name in ("line_ring", "discrete"):
         law = "emulated" if name == "line_ring" else "discrete"

@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
+from msg_analysis.common.text.markdown import markdown_table
+from msg_analysis.common.text.number_words import number_text
 from msg_analysis.inference.errors.time_means import TimeMeans
 from msg_analysis.inference.statistics.distributions import chi2_tail, two_sided
 from msg_analysis.inference.statistics.holm import holm
@@ -55,6 +57,11 @@ class Estimate:
     z: float | None = None
     p: float | None = None
     p_holm: float | None = None
+
+    def _repr_markdown_(self) -> str:
+        numbers = (self.measured, self.predicted, self.standard_error, self.z, self.p)
+        heads = ("measured", "predicted", "standard error", "z", "p")
+        return markdown_table(heads, [[number_text(number) for number in numbers]], names=0)
 
     @property
     def interval(self) -> tuple[float | None, float | None]:

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from msg_analysis.common.large_arrays import pieces
+from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
@@ -52,6 +53,12 @@ class Completeness:
     out_of_order: int = 0
     missing_modes: int = 0
     refused: dict[str, int] = field(default_factory=dict)
+
+    def _repr_markdown_(self) -> str:
+        keys = ("expected", "received", "missing", "duplicates", "out_of_order", "missing_modes")
+        rows = [(key.replace("_", " "), str(getattr(self, key))) for key in keys]
+        rows += [(f"refused: {reason}", str(count)) for reason, count in self.refused.items()]
+        return markdown_table(("states", "number"), rows)
 
     @property
     def complete(self) -> bool:

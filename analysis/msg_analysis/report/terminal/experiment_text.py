@@ -31,7 +31,7 @@ from msg_analysis.report.terminal.tables import ROWS, fact_table, number_table
 
 def print_experiment(document: dict[str, Any], console: Console) -> None:
     """Print an experiment: a document of ``info.describe_experiment``."""
-    run, names = document["run"], document["names"]
+    run, names = document["run"], document.get("names")
     facts = fact_table(console, document["name"])
     facts.add_row("problem", f"{document['problem']} of {document['agents']} agents in {document['time']} time")
     if names:

@@ -44,7 +44,7 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     errors = number_table(console, "Mean-square error in the steady state", "", *laws)
     errors.add_row("system", *(number_text(law["system_error"]) for law in laws.values()), end_section=True)
     for agent in first_rows(errors, range(document["agents"]), "agents"):
-        name = Text(agent_text(agent + 1, document["names"]))
+        name = Text(agent_text(agent + 1, document.get("names")))
         errors.add_row(name, *(number_text(law["node_errors"][agent]) for law in laws.values()))
     errors.add_section()
     errors.add_row("certainty", *(number_text(law["system_certainty"]) for law in laws.values()))
@@ -59,7 +59,7 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
 
 
 def _named(entry: dict[str, Any], document: dict[str, Any]) -> str:
-    return listed([agent_name(agent, document["names"]) for agent in entry["agents"]])
+    return listed([agent_name(agent, document.get("names")) for agent in entry["agents"]])
 
 
 def print_leaders(document: dict[str, Any], console: Console) -> None:
@@ -132,7 +132,7 @@ def print_facts(document: dict[str, Any], console: Console) -> None:
         )
     _print_graphs(document, console)
     for law, form in (document["two_topology"] or {}).items():
-        _print_form(law, form, document["names"], console)
+        _print_form(law, form, document.get("names"), console)
     for note in document["notes"]:
         console.print(Text(note, style="yellow"))
 
@@ -154,7 +154,7 @@ def _print_graphs(document: dict[str, Any], console: Console) -> None:
         return
     table = number_table(console, "Undirected connected graphs", "graph")
     table.add_column("Kirchhoff index", justify="right")
-    first = ", ".join(agent_name(agent, document["names"]) for agent in (1, 2))
+    first = ", ".join(agent_name(agent, document.get("names")) for agent in (1, 2))
     table.add_column(Text(f"information centrality of agents {first}, ..."), overflow="fold")
     for entry in shown:
         centrality = entry["information_centrality"]
