@@ -11,7 +11,7 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 GALLERY = sorted((DOCS / "gallery").glob("*.py"))
-LINE_RING = DOCS.parent / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+LINE_RING = DOCS.parent / "ros_ws/src/msg_agents_bringup/experiments/line_ring.yaml"
 
 
 @pytest.fixture(autouse=True)
@@ -39,5 +39,6 @@ def test_what_the_page_begins_with(elsewhere: Path) -> None:
     page = (DOCS / "python.md").read_text(encoding="utf-8")
     first, network, *others = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     compile(network, "docs/python.md", "exec")  # tests/integration/test_python.py runs it
-    for block in (first, *others):
-        exec(compile(block, "docs/python.md", "exec"), {})
+    for script in (first, *others):
+        exec(compile(script, "docs/python.md", "exec"), {})
+    assert {file.name for file in elsewhere.glob("*.png")} == {"run.png", "comparison.png", "prediction.png"}

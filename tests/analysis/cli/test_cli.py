@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests/data/golden"
 LINE_RING = str(GOLDEN / "line_ring.yaml")
 HEAVY = ["numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich", "dask", "distributed", "pyarrow"]
-COMMANDS = ["compare", "facts", "info", "predict", "salvage", "schema", "simulate", "sweep", "transient"]
+COMMANDS = ["compare", "export", "facts", "info", "predict", "salvage", "schema", "simulate", "sweep", "transient"]
 
 
 def call(*arguments: str | Path) -> Result:
