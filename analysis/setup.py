@@ -85,6 +85,7 @@ setup(
     ],
     extras_require={
         "pandas": ["pandas"],  # run.to_dataframe()
+        "rerun": ["rerun-sdk"],  # msg-analysis export --rrd
         "test": ["pytest"],  # by which colcon knows how to test it
     },
     entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli.entry_point:msg_analysis"]},

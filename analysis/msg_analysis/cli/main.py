@@ -281,9 +281,10 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
 @click.option("--csv", is_flag=True, help="Write states.csv, graphs.csv and errors.csv.")
 @click.option("--parquet", is_flag=True, help="Write states.parquet, graphs.parquet and errors.parquet.")
 @click.option("--npz", is_flag=True, help="Write run.npz, the arrays of Python.")
+@click.option("--rrd", is_flag=True, help="Write run.rrd, a recording for the viewer Rerun; needs rerun-sdk.")
 @click.option("--out", type=PATH, metavar="DIR", show_default="<name of BAG>_export", help="Output directory.")
 @json_option
-def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, out: Path | None, as_json: bool) -> None:
+def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Path | None, as_json: bool) -> None:
     """Write the states, graphs and errors of the run in BAG for other programs; print the names of the files.
 
     Existing files of the same names are replaced. Exit code 3: states or graphs of the run are missing.
@@ -293,10 +294,13 @@ def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, out: Path | None, 
     from msg_analysis.common.exit_codes import ExitCode
     from msg_analysis.common.long_work import watched
     from msg_analysis.report.export.export_files import FORMS, export_run
+    from msg_analysis.report.export.rerun_file import require_rerun
 
-    forms = [form for form, wanted in zip(FORMS, (csv, parquet, npz), strict=True) if wanted]
+    forms = [form for form, wanted in zip(FORMS, (csv, parquet, npz, rrd), strict=True) if wanted]
     if not forms:
-        raise InputError("no format: expected at least one of --csv, --parquet, --npz")
+        raise InputError("no format: expected at least one of --csv, --parquet, --npz, --rrd")
+    if rrd:
+        require_rerun()
     directory = out or Path(f"{bag.resolve().name.partition('.')[0]}_export")
     with WorkProgress() as progress, watched(progress):
         run = read_bag(bag)

@@ -173,7 +173,7 @@ def test_numbers_of_other_runs(tmp_path: Path) -> None:
 
 def test_mistakes(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for arguments, words in (
-        ([bag], "no format: expected at least one of --csv, --parquet, --npz"),
+        ([bag], "no format: expected at least one of --csv, --parquet, --npz, --rrd"),
         ([tmp_path / "no", "--csv"], "not found: expected the directory of a bag"),
         ([bag, "--csv", "--out", bag / "metadata.yaml"], "metadata.yaml: cannot be written (File exists)"),
     ):
@@ -186,6 +186,17 @@ def test_mistakes(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setitem(sys.modules, "pandas", None)  # as if it were not installed
     with pytest.raises(NotAvailableError, match=r"pandas is not installed: .*: pip install pandas"):
         run.to_dataframe()
+
+
+def test_rerun_is_not_installed(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is told before anything is read or written."""
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    result = export(bag, "--csv", "--rrd", "--out", tmp_path / "data")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == (
+        "error: --rrd: rerun-sdk is not installed: expected it for recordings of Rerun: pip install rerun-sdk\n"
+    )
+    assert not (tmp_path / "data").exists()
 
 
 def test_files_are_replaced_whole_or_not_at_all(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

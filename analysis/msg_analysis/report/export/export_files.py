@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Files of a run for other programs: CSV, Parquet, numpy; each written whole or not at all, piece by piece."""
+"""Files of a run for other programs: CSV, Parquet, numpy, Rerun; each written whole or not at all, piece by piece."""
 
 from __future__ import annotations
 
@@ -29,28 +29,32 @@ from msg_analysis.common.large_arrays import BLOCK_NUMBERS, pieces, release
 from msg_analysis.common.long_work import tell
 from msg_analysis.errors import InputError
 from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.report.export.rerun_file import require_rerun, write_recording
 from msg_analysis.report.export.run_tables import RunTable, run_tables, square_errors
 from msg_analysis.types import AnyArray
 
-Form = Literal["csv", "parquet", "npz"]
+Form = Literal["csv", "parquet", "npz", "rrd"]
 FORMS: tuple[Form, ...] = get_args(Form)
-ARRAY_FILE = "run.npz"
+ARRAY_FILE, RECORDING_FILE = "run.npz", "run.rrd"
 _OLDEST = (1980, 1, 1, 0, 0, 0)  # of files in an archive: the same run gives the same bytes
 
 
 def export_run(trajectory: Trajectory, directory: Path, forms: Sequence[Form]) -> list[Path]:
     """Write the files of these forms into a directory, made if need be; files of the same names are replaced.
 
-    InputError: a file cannot be written.
+    InputError: a file cannot be written; NotAvailableError: the library for it is not installed.
     """
     writers = {
         directory / f"{table.name}.{form}": _table_writer(table, form)
         for form in forms
-        if form != "npz"
+        if form in ("csv", "parquet")
         for table in run_tables(trajectory)
     }
     if "npz" in forms:
         writers[directory / ARRAY_FILE] = lambda file, shown: _write_arrays(trajectory, file, shown)
+    if "rrd" in forms:
+        require_rerun()
+        writers[directory / RECORDING_FILE] = lambda file, shown: write_recording(trajectory, file, shown)
     with _readable(directory):
         directory.mkdir(parents=True, exist_ok=True)
     for path in writers:
