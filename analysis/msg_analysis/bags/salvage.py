@@ -24,7 +24,7 @@ import itertools
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -146,7 +146,7 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
                 counts.append(entry.count)
             else:
                 counts.append(_copy(entry.file.path, copy))
-        write_metadata(workshop, _information(entries, counts))
+        write_metadata(workshop, _information((entry.file for entry in entries), counts))
         workshop.rename(out)
     except OSError as error:
         raise BagError(f"{out}: cannot be written ({error.strerror}): choose another place") from error
@@ -185,7 +185,7 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
                 if count.name != file.name:
                     file.unlink()
         counts = [count for _, _, count in saved]
-        write_metadata(directory, _information(entries, counts))
+        write_metadata(directory, _information((entry.file for entry in entries), counts))
         (directory / RECORDING_MARKER).unlink(missing_ok=True)
     except OSError as error:
         raise BagError(f"{directory}: cannot be written ({error.strerror}): nothing was lost, try again") from error
@@ -234,11 +234,11 @@ def _report(entry: FileInventory) -> SalvageReport:
     return SalvageReport(entry.count.messages, source.whole_bytes, dropped, lost, damaged, torn=source.torn)
 
 
-def _information(entries: Sequence[FileInventory], counts: Sequence[FileCount]) -> dict[str, Any]:
-    """What metadata.yaml says of the new bag: that it was salvaged, and what is known of the torn one."""
+def _information(files: Iterable[StoredFile], counts: Sequence[FileCount]) -> dict[str, Any]:
+    """What is said of the new bag, or of one of its files: that it was salvaged, and what is known of the torn one."""
     custom = {"complete": "false", "salvaged": "true"}
-    for entry in entries:
-        record = _run_record(entry.file)
+    for file in files:
+        record = _run_record(file)
         if "run" in record:
             return bag_information(counts, {"run": str(record["run"]), **custom}, _distribution(record))
     return bag_information(counts, custom, "")
@@ -288,8 +288,7 @@ def _copy(file: Path, copy: Path) -> FileCount:
             writer.add_metadata(record.name, record.metadata)
         for item in source.attachments:
             writer.add_attachment(item)
-        information = bag_information([count], {"salvaged": "true"}, _distribution(_run_record(source)))
-        writer.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(information)})
+        writer.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(_information([source], [count]))})
         writer.finish()
         stream.flush()
         os.fsync(stream.fileno())

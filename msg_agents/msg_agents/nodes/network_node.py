@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -111,11 +112,22 @@ class NetworkNode(LeanNode):
         here = self.get_namespace()
         return Counter(name for name, namespace in self.get_node_names_and_namespaces() if namespace == here)
 
+    def _own_names(self) -> list[str]:
+        return [*map(agent_name, range(self.record.experiment.agents)), SWITCHER, RECORDER]
+
     def duplicate_names(self) -> list[str]:
         """Names of this run that more than one node has."""
         count = self.names_in_namespace()
-        names = [*map(agent_name, range(self.record.experiment.agents)), SWITCHER, RECORDER]
-        return [name for name in names if count[name] > 1]
+        return [name for name in self._own_names() if count[name] > 1]
+
+    def undiscovered(self, expected: Iterable[str]) -> list[str]:
+        """Those of the expected nodes that are not there: nodes of the run in its namespace, others in any.
+
+        Recorders such as that of ``ros2 bag record`` are always in the namespace /.
+        """
+        here, everywhere = self.names_in_namespace(), set(self.get_node_names())
+        own = set(self._own_names())
+        return [name for name in expected if name not in (here if name in own else everywhere)]
 
     def duplicate_name_error(self, names: Iterable[str], seconds: float) -> InputError:
         """The error after several nodes have had the same name for so many seconds."""
@@ -190,14 +202,16 @@ class NetworkNode(LeanNode):
         )
 
     def _announced_reader(self, name: str, topic: str) -> bool:
-        """Whether a node in our namespace has announced a reader of a topic that is known.
+        """Whether a node of this name has announced a reader of a topic that is known.
 
         From Fast DDS 3 on, readers of Cyclone DDS have no node: it does not repeat to which participant each belongs.
         """
-        try:
-            return topic in dict(self.get_subscriber_names_and_types_by_node(name, self.get_namespace()))
-        except NodeNameNonExistentError:
-            return False
+        for node, namespace in self.get_node_names_and_namespaces():
+            if node == name:
+                with contextlib.suppress(NodeNameNonExistentError):  # it has just left
+                    if topic in dict(self.get_subscriber_names_and_types_by_node(name, namespace)):
+                        return True
+        return False
 
     def missing_readers(self, publisher: Publisher, expected: Sequence[str]) -> list[str]:
         """Names of the expected nodes that do not read a topic of this node yet."""

@@ -42,8 +42,9 @@ class PeerPresence:
         every(node, CHECK_PERIOD, self._check)
 
     def _check(self) -> None:
-        there, now = self._node.names_in_namespace(), time.monotonic()
-        self._since = {name: self._since.get(name, now) for name in self._node.required_peers() if name not in there}
+        now = time.monotonic()
+        gone = self._node.undiscovered(self._node.required_peers())
+        self._since = {name: self._since.get(name, now) for name in gone}
         if now - min(self._since.values(), default=now) > self._patience:
             self._node.fail(
                 PeersLostError(

@@ -96,8 +96,7 @@ class Switcher(NetworkNode):
 
     def missing_nodes(self) -> list[str]:
         """Names of nodes that have not been discovered yet; all topics are latched, so readers need not be matched."""
-        there = self.names_in_namespace()
-        return [name for name in self._expected if name not in there]
+        return self.undiscovered(self._expected)
 
     def required_peers(self) -> list[str]:
         """All agents and the required readers."""

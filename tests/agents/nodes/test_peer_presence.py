@@ -58,3 +58,13 @@ def test_a_switcher_of_another_namespace_is_not_ours(start: Callable[..., Node],
     if not there:
         with pytest.raises(PeersLostError, match="switcher left the network"):
             agent.done.result()
+
+
+def test_a_reader_of_the_user_may_be_in_any_namespace(start: Callable[..., Node]) -> None:
+    """That of `ros2 bag record` is always in /; another run's nodes have the names of ours."""
+    agent = start("agent_1")
+    assert isinstance(agent, NetworkNode)
+    start("guest", "/other")
+    start("recorder", "/other")
+    wait_for(lambda: {"guest", "recorder"} <= set(agent.get_node_names()))
+    assert agent.undiscovered(["guest", "recorder", "agent_1", "agent_2"]) == ["recorder", "agent_2"]

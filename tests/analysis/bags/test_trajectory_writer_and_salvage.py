@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message
@@ -271,7 +272,15 @@ def test_salvaged_file_is_valid(recorded: tuple[Trajectory, Path], tmp_path: Pat
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
         assert sum(1 for _ in reader.iter_messages()) == report.kept_messages
-        assert [record.name for record in reader.iter_metadata()] == ["rosbag2", "msg_agents", "rosbag2"]
+        records = list(reader.iter_metadata())
+    assert [record.name for record in records] == ["rosbag2", "msg_agents", "rosbag2"]
+    said = yaml.safe_load(records[-1].metadata["serialized_metadata"])  # from which `ros2 bag reindex` takes it
+    known = {"run": str(recorded[0].record.run), "complete": "false", "salvaged": "true"}
+    assert said["custom_data"] == known
+    assert (
+        yaml.safe_load((tmp_path / "out/metadata.yaml").read_text())["rosbag2_bagfile_information"]["custom_data"]
+        == known
+    )
     with pytest.raises(BagError, match="exists already"):
         salvage(tmp_path / "torn.mcap", tmp_path / "out")
     assert (tmp_path / "torn.mcap").read_bytes() == data[: len(data) // 2]
