@@ -82,8 +82,9 @@ def test_options_of_one_name_are_one_option() -> None:
             kinds[long_name(option)].add((type(option.type).__name__, option.is_flag, option.multiple))
             helps[long_name(option)].add(option.help)
     several = {name: kind for name, kind in kinds.items() if len(kind) > 1}
-    # A rate in Hz, or of a player; the duration of a run, or of a bag; the format of drawings, or of a table.
-    assert set(several) == {"--rate", "--duration", "--format"}
+    # A rate in Hz, or of a player; the duration of a run, or of a bag; the format of drawings, or of a table;
+    # a table that is also written, or the format of what is.
+    assert set(several) == {"--rate", "--duration", "--format", "--csv"}
     for name in ("--json", "--seed", "--compression", "--split-size", "--use-sim-time"):
         assert len(helps[name]) == 1, name
 

@@ -35,6 +35,7 @@ WORDS = {  # what each of the others is given
     ("msg-analysis", "figures"): ["1", "--out", NEW, "--format", "svg"],
     ("msg-analysis", "info"): ["EXPERIMENT"],
     ("msg-analysis", "salvage"): ["BAG", NEW],
+    ("msg-analysis", "export"): ["BAG", "--csv", "--parquet", "--npz", "--out", NEW],
     ("msg-analysis", "compare"): ["BAG"],
     ("msg-analysis", "tabulate"): ["RESULT"],
     ("msg-analysis", "transient"): ["EXPERIMENT", "--times", "0,1"],
@@ -156,7 +157,7 @@ def test_a_result_that_cannot_be_printed(folder: Path) -> None:
 @pytest.mark.timeout(400)
 def test_a_disk_that_is_full(folder: Path) -> None:
     """Files cannot grow: one line says which, exit code 2, no traceback."""
-    writing = [(("msg-analysis", name), "limit") for name in ("simulate", "figures", "salvage")]
+    writing = [(("msg-analysis", name), "limit") for name in ("simulate", "figures", "salvage", "export")]
     for command, _, code, text, _ in outcomes(folder, *writing):
         assert code == 2, command
         assert re.fullmatch(r"error: .*File too large.*\n", text), (command, text)

@@ -31,6 +31,8 @@ PREPARED = (
     "msg_analysis.api",
     "msg_analysis.paper.figures",
     "msg_analysis.report.terminal.comparison_text",
+    "pyarrow.csv",
+    "pyarrow.parquet",
     "msg_analysis.twin.check",
     "scipy.stats",
 )

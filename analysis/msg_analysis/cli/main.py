@@ -289,6 +289,9 @@ def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Pa
 
     Existing files of the same names are replaced. Exit code 3: states or graphs of the run are missing.
     """
+    import pyarrow.csv  # before the progress of the work begins
+    import pyarrow.parquet  # noqa: F401
+
     from msg_analysis.bags.reader import read_bag
     from msg_analysis.cli.progress import WorkProgress
     from msg_analysis.common.exit_codes import ExitCode

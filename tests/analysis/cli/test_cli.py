@@ -295,7 +295,7 @@ def test_salvage_of_nothing(bag: Path, tmp_path: Path) -> None:
     for path, reason in (
         (head, "no whole message"),
         (tmp_path / "nope", "not found"),
-        (ROOT / "README.md", "not an MCAP file"),
+        (ROOT / "LICENSE", "not an MCAP file"),
         (LINE_RING, "is an experiment file"),
     ):
         result = call("salvage", path, tmp_path / "out")

@@ -119,6 +119,31 @@ def test_small_and_large(browser: Any, tmp_path: Path, agents: int) -> None:
     page.close()
 
 
+def test_agents_by_name(browser: Any, tmp_path: Path) -> None:
+    """Both fields take names and numbers, and the figures show names, whatever is in them."""
+    names = ["Bad Ems", "<b>Ulm</b>", "$$x$$", "Kiel", "1"]
+    trajectory = simulate(ValidExperiment.parse(_document(5) | {"names": names}))
+    path = tmp_path / "report.html"
+    write_report(compare(trajectory), trajectory, path)
+    page, log = _open(browser, path)
+    _check(page, log, path)
+    page.fill("#agents", "Kiel, Bad Ems ,3; 1")
+    assert page.locator("#node-table tbody tr:visible td:first-child").all_inner_texts() == [
+        *("Bad Ems", "$$x$$", "Kiel", "1"),
+    ]
+    chosen = "Bokeh.documents[0].get_model_by_name('lines').data.agent"
+    assert page.evaluate(chosen) == ["agent Bad Ems", "agent $$x$$", "agent Kiel", "agent 1"]
+    page.fill("#agents", "Bonn")
+    assert "expected" in page.inner_text("#chosen")
+    page.click("#all-agents")
+    assert page.locator("#agent-buttons button").all_inner_texts() == names
+    page.click("#agent-buttons button >> nth=3")
+    assert "Kiel" not in page.input_value("#shown-agents").split(", ")
+    assert page.locator("main b, svg b", has_text="Ulm").count() == 0
+    assert log.complaints == []
+    page.close()
+
+
 CUT = """() => [...document.querySelectorAll("body *")].filter((one) => {
     const box = one.getBoundingClientRect();
     return box.width > 0 && !one.closest(".hidden") && (box.left < -0.5 || box.right > innerWidth + 0.5);

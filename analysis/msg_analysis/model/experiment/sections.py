@@ -99,7 +99,7 @@ class Sections:
         leaders = self.values["leaders"]
         leaders_good = self.values["problem"] is not None and "leaders" in self.known
         if leaders_good:
-            found = validation.leader_problems(self.values["problem"], leaders, self.agents)
+            found = validation.leader_problems(self.values["problem"], leaders, self.agents, self.values["names"])
             leaders_good = not found
             self.problems += found
         if self.values["graphs"] and self.values["switching"] and time:

@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from msg_analysis.common.text.agent_names import agent_name
+from msg_analysis.common.text.agent_names import agent_name, agent_text
 from msg_analysis.model.experiment.problems import problem, show
 from msg_analysis.model.experiment.spec import LeadersSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
 from msg_analysis.model.network.graphs import Graph, hops
@@ -252,7 +252,9 @@ def _ragged(value: object) -> bool:
     return len({len(row) for row in rows if isinstance(row, list)}) > 1
 
 
-def leader_problems(problem_kind: str, leaders: LeadersSpec | None, agents: int | None) -> list[str]:
+def leader_problems(
+    problem_kind: str, leaders: LeadersSpec | None, agents: int | None, names: Sequence[str] | None = None
+) -> list[str]:
     """Leaders that are forbidden, missing, duplicate, unknown or without followers; ``agents``: None if unknown."""
     if problem_kind == "consensus":
         if leaders is None:
@@ -263,7 +265,9 @@ def leader_problems(problem_kind: str, leaders: LeadersSpec | None, agents: int 
         return [problem("leaders", "missing", wanted, "for example leaders: {agents: [1], gain: 1.0}")]
     found = []
     for label in sorted(label for label in set(leaders.agents) if leaders.agents.count(label) > 1):
-        found.append(problem("leaders.agents", f"agent {label} twice", "expected every leader once", "remove one"))
+        found.append(
+            problem("leaders.agents", f"{agent_text(label, names)} twice", "expected every leader once", "remove one")
+        )
     if agents is None:
         return found
     for label in leaders.agents:

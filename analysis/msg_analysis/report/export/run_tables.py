@@ -19,7 +19,7 @@ Agents, graphs and replicas count from 1, as in all files. What is missing is nu
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ import numpy as np
 from msg_analysis.common.large_arrays import release
 from msg_analysis.model.arithmetic.step_clock import SECOND
 from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.types import AnyArray, FloatArray
+from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -103,14 +103,14 @@ def _states(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
     states = trajectory.states[first:end]
     step = np.repeat(np.arange(first, end), agents * replicas)
     agent = np.tile(np.repeat(np.arange(agents), replicas), end - first)
-    columns = {
+    columns: dict[str, Any] = {
         "step": step,
         "time": step * experiment.step_length,
         "agent": agent + 1,
         "replica": np.tile(np.arange(1, replicas + 1), (end - first) * agents),
     }
     if experiment.names:
-        columns["name"] = np.array(experiment.names, dtype=object)[agent]
+        columns["name"] = _Names(experiment.names, agent)
     for row in range(states.shape[2] // replicas):
         columns[f"state_{row + 1}" if row else "state"] = states[:, :, row * replicas : (row + 1) * replicas].ravel()
     if trajectory.published is not None:
@@ -124,9 +124,9 @@ def _states(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
 def _graphs(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
     experiment = trajectory.record.experiment
     modes, step = trajectory.modes[first:end], np.arange(first, end)
-    names = np.array([*(graph.name for graph in experiment.graph_list), None], dtype=object)
+    names = _Names([graph.name for graph in experiment.graph_list], modes)
     graph = np.ma.masked_less(modes + 1, 1)
-    return {"step": step, "time": step * experiment.step_length, "graph": graph, "graph_name": names[modes]}
+    return {"step": step, "time": step * experiment.step_length, "graph": graph, "graph_name": names}
 
 
 def _errors(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
@@ -148,9 +148,36 @@ def square_errors(trajectory: Trajectory, first: int, end: int) -> FloatArray:
     return np.asarray(np.square(values - middle).mean(axis=2))
 
 
-def _arrow(values: AnyArray, kind: pa.DataType) -> pa.Array:
+class _Names:
+    """A column of texts: ``texts[places]``; null where a place is -1."""
+
+    def __init__(self, texts: Sequence[str], places: IntArray) -> None:
+        self.texts, self.places = texts, places
+
+    def arrow(self) -> pa.Array:
+        import pyarrow as pa
+
+        encoded = [*(text.encode() for text in self.texts), b""]
+        ends = np.cumsum(np.array([len(text) for text in encoded])[self.places])
+        offsets = np.concatenate(([0], ends)).astype(np.int32)
+        content = b"".join([encoded[place] for place in self.places.tolist()])
+        known = _known(self.places >= 0)
+        return pa.StringArray.from_buffers(len(self.places), pa.py_buffer(offsets), pa.py_buffer(content), known)
+
+
+def _arrow(values: AnyArray | _Names, kind: pa.DataType) -> pa.Array:
+    """Without ``pyarrow.array``, which imports pandas, if it is installed: that takes longer than most exports."""
     import pyarrow as pa
 
-    if isinstance(values, np.ma.MaskedArray):
-        return pa.array(values.data, kind, mask=np.ma.getmaskarray(values), safe=False)
-    return pa.array(values, kind, from_pandas=True, safe=False)  # NaN becomes null
+    if isinstance(values, _Names):
+        return values.arrow()
+    plain = np.ascontiguousarray(np.ma.getdata(values), dtype=kind.to_pandas_dtype())
+    missing = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else np.isnan(plain)
+    return pa.Array.from_buffers(kind, len(plain), [_known(~missing), pa.py_buffer(plain)])
+
+
+def _known(known: BoolArray) -> pa.Buffer | None:
+    """Arrow's bitmap of what is not null; None where all is known."""
+    import pyarrow as pa
+
+    return None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))

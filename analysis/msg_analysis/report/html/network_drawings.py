@@ -17,11 +17,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from markupsafe import Markup, escape
 
+from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.report.figures.agent_places import LABELLED, places
@@ -44,7 +45,7 @@ def graph_drawings(experiment: ValidExperiment, accused: Accused = NOBODY) -> li
     where = _scaled(places(experiment.graph_list), experiment.agents)
     leaders = set(experiment.leaders.agents) if experiment.leaders else set()
     return [
-        _graph(graph, where, graph_variable(mode), leaders, accused)
+        _graph(graph, where, graph_variable(mode), leaders, accused, experiment.names)
         for mode, graph in enumerate(experiment.graph_list[:MOST_GRAPHS])
     ]
 
@@ -59,7 +60,9 @@ def _scaled(where: Mapping[int, FloatArray], agents: int) -> FloatArray:
     return np.asarray(points + _SIDE / 2)
 
 
-def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int], accused: Accused) -> Markup:
+def _graph(
+    graph: Graph, where: FloatArray, colour: str, leaders: set[int], accused: Accused, names: Sequence[str] | None
+) -> Markup:
     radius = 11.0 if graph.agents <= 12 else 8.0 if graph.agents <= LABELLED else 3.0
     links = graph.edges if graph.symmetric else graph.arcs
     parts = [
@@ -69,6 +72,7 @@ def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int], accu
         *_marked_links(accused.links_of(graph.name), links, where),
     ]
     for agent, (x, y) in enumerate(where, start=1):
+        name = agent_name(agent, names)
         kind = "leader, agent" if agent in leaders else "agent"
         shape = (
             f'<rect x="{x - radius:.1f}" y="{y - radius:.1f}" width="{2 * radius:g}" height="{2 * radius:g}"'
@@ -76,16 +80,20 @@ def _graph(graph: Graph, where: FloatArray, colour: str, leaders: set[int], accu
             else f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"'
         )
         hears: list[int] = (np.flatnonzero(graph.adjacency[agent - 1]) + 1).tolist()
-        heard = ", ".join(map(str, hears[:20])) + (", …" if len(hears) > 20 else "") if hears else "no agent"
+        heard = (
+            ", ".join(agent_name(other, names) for other in hears[:20]) + (", …" if len(hears) > 20 else "")
+            if hears
+            else "no agent"
+        )
         parts.append(
             f'<g>{shape} fill="var(--page)" stroke="{colour}" stroke-width="1.5"'
-            f"{MARK if agent in accused.agents else ''}/><title>{kind} {agent} hears {heard}</title>"
+            f"{MARK if agent in accused.agents else ''}/><title>{escape(f'{kind} {name} hears {heard}')}</title>"
         )
         if graph.agents <= LABELLED:
-            size = radius if agent < 100 else 0.8 * radius
+            size = radius * min(1.0, 2.4 / len(name)) if names else radius if agent < 100 else 0.8 * radius
             parts.append(
                 f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="middle" dominant-baseline="central" '
-                f'fill="var(--ink)" pointer-events="none">{agent}</text>'
+                f'fill="var(--ink)" pointer-events="none">{escape(shorten(name, 8))}</text>'
             )
         parts.append("</g>")
     return Markup("".join([*parts, "</svg>"]))

@@ -20,7 +20,7 @@ import datetime
 import platform
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,13 @@ from bokeh.resources import Resources
 from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
+from msg_analysis.common.text.agent_names import with_names
 from msg_analysis.common.text.number_words import p_text
 from msg_analysis.errors import InputError
 from msg_analysis.inference.observed.observation import bounded
 from msg_analysis.inference.realtime.laws import SUPPORT
 from msg_analysis.inference.verdict.comparison import Comparison
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.report.documents.comparison_words import (
     QUANTILES,
@@ -104,7 +106,7 @@ def render(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": _number, "p": _p}
+    environment.filters |= {"number": _number, "p": _p, "named": _namer(experiment)}
     names = [graph.name for graph in experiment.graph_list]
     accused = Accused.of(document["blame"])
     happened, more_events = run_events(trajectory, events)
@@ -131,7 +133,7 @@ def render(
         law_name=LAW_NAMES["emulated" if document["law"] == "synchronous" else document["law"]],
         support=SUPPORT,
         explanation=_explanation(document),
-        blame=[sentence(cause["words"]) for cause in document["blame"]],
+        blame=[with_names(sentence(cause["words"]), experiment.names) for cause in document["blame"]],
         cause_known=bool(document["blame"]) and document["blame"][0]["kind"] != "unknown",
         plus_minus=plus_minus,
         interval_bars=interval_bars,
@@ -162,7 +164,12 @@ def render(
         chain=network_drawings.chain_drawing(experiment, accused),
         yaml=yaml.safe_dump(experiment.to_document(), sort_keys=False, allow_unicode=True, default_flow_style=None),
         host=platform.node() or "unnamed host",
-        tests=[test for test in document["tests"] if not test["name"].startswith(_NODE_TEST)],
+        tests=[
+            test | {"name": with_names(test["name"], experiment.names)}
+            for test in document["tests"]
+            if not test["name"].startswith(_NODE_TEST)
+        ],
+        agent_names=experiment.names,
         node_tests=_node_tests(document),
         nodes_open=experiment.agents <= _OPEN_TABLE,
         names=names,
@@ -184,9 +191,13 @@ def _models(
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
     predicted = document["system_error"]["predicted"]
     models: dict[str, UIElement | None] = {
-        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"], accused),
+        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"], accused, experiment.names),
         **covariances(
-            _matrix(covariance["measured"]), _matrix(covariance["predicted"]), _matrix(covariance["z"]), accused
+            _matrix(covariance["measured"]),
+            _matrix(covariance["predicted"]),
+            _matrix(covariance["z"]),
+            accused,
+            experiment.names,
         ),
     }
     if len(comparison.running["time"]) > 1:
@@ -205,7 +216,9 @@ def _models(
             )
     if ratios is not None and any(ratio is not None for ratio in ratios):
         sizes = np.array(ratios, dtype=float)  # None: nan
-        models["innovations"] = error_plots.innovation_sizes(sizes, document["innovations"]["samples"], accused)
+        models["innovations"] = error_plots.innovation_sizes(
+            sizes, document["innovations"]["samples"], accused, experiment.names
+        )
     if document["timing"]:
         models["lateness"] = error_plots.lateness(document["timing"])
         models["staleness"] = error_plots.staleness(document["timing"])
@@ -246,7 +259,8 @@ def _explanation(document: dict[str, Any]) -> str:
     rejected = [test for test in tests if test["rejected"]]
     if not rejected:
         return f"All {len(tests)} tests passed. {chance}"
-    named = ", ".join(f"{test['name']} (p = {_p(test['p_adjusted'])})" for test in rejected[:6])
+    names = document["names"]
+    named = ", ".join(f"{with_names(test['name'], names)} (p = {_p(test['p_adjusted'])})" for test in rejected[:6])
     more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
     return f"Rejected: {len(rejected)} of {len(tests)} tests: {named}{more}. {chance}"
 
@@ -262,6 +276,10 @@ def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
 
 def _number(value: float | None, digits: int = 4) -> str:
     return "–" if value is None else _typeset(f"{value:#.{digits}g}".rstrip("."))
+
+
+def _namer(experiment: ValidExperiment) -> Callable[[str], str]:
+    return lambda text: with_names(text, experiment.names)
 
 
 def _p(p: float | None) -> str:

@@ -153,7 +153,7 @@ def _print_timing(document: dict[str, Any], console: Console) -> None:
         error = law["system_error"]
         table.add_row(title, number_text(error["predicted"]), z_text(error["z"]), Text(SUPPORT[law["supported"]]))
     print_table(console, table)
-    console.print(Text(laws["why"]))
+    console.print(Text(with_names(laws["why"], document.get("names"))))
 
 
 def _print_tests(document: dict[str, Any], console: Console) -> None:

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ from bokeh.palettes import interp_palette
 
 from msg_analysis.report.html.plots.accused import NOBODY, Accused
 from msg_analysis.report.html.plots.colours import BLACK, DARK_HEAT, HEAT, INK, PAGE, VERMILLION
-from msg_analysis.report.html.plots.plot_style import SANS, new_figure
+from msg_analysis.report.html.plots.plot_style import SANS, name_agents, new_figure
 from msg_analysis.types import FloatArray
 
 _NUMBERED = 8  # most agents with which heat maps show numbers
@@ -47,7 +48,11 @@ TITLES = {
 
 
 def covariances(
-    measured: FloatArray | None, predicted: FloatArray | None, z: FloatArray | None, accused: Accused = NOBODY
+    measured: FloatArray | None,
+    predicted: FloatArray | None,
+    z: FloatArray | None,
+    accused: Accused = NOBODY,
+    names: Sequence[str] | None = None,
 ) -> dict[str, UIElement]:
     """Heat maps of the matrices (m, m) that exist, by name; ``z``: measured - predicted in standard errors."""
     known = {key: value for key, value in (("measured", measured), ("predicted", predicted)) if value is not None}
@@ -67,7 +72,7 @@ def covariances(
     across, down = Range1d(0.5, agents + 0.5), Range1d(agents + 0.5, 0.5)
     return {
         f"covariance_{key}": _panel(
-            key, matrix, mappers["z" if key == "z" else "moments"], source, rows, (across, down), accused
+            key, matrix, mappers["z" if key == "z" else "moments"], source, rows, (across, down), accused, names
         )
         for key, matrix in known.items()
     }
@@ -86,6 +91,7 @@ def _panel(
     rows: list[tuple[str, str]],
     ranges: tuple[Range1d, Range1d],
     accused: Accused,
+    names: Sequence[str] | None,
 ) -> UIElement:
     agents = len(matrix)
     panel = new_figure(
@@ -95,6 +101,7 @@ def _panel(
     panel.grid.grid_line_color = None
     panel.axis.ticker = BasicTicker(desired_num_ticks=8, min_interval=1, num_minor_ticks=0)
     panel.xaxis.axis_label = "agent"
+    name_agents(panel.axis, names)
     image = panel.image(key, x=0.5, y=0.5, dw=agents, dh=agents, color_mapper=mapper, source=source)
     panel.add_tools(HoverTool(renderers=[image], tooltips=rows))
     if agents <= _NUMBERED:

@@ -35,10 +35,11 @@ from bokeh.models import (
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.common.large_arrays import BLOCK_NUMBERS, release
+from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.report.documents.comparison_words import TIMES
 from msg_analysis.report.html.plots.accused import NOBODY, Accused
 from msg_analysis.report.html.plots.colours import BLACK, BLUE, GREY, PAGE, SKY, VERMILLION
-from msg_analysis.report.html.plots.plot_style import mark_agents, new_figure, place_legend, plain_legend
+from msg_analysis.report.html.plots.plot_style import mark_agents, name_agents, new_figure, place_legend, plain_legend
 from msg_analysis.types import FloatArray
 
 MOST_LINES = 8  # agents whose convergence is drawn at once
@@ -72,7 +73,9 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
     return plot
 
 
-def node_errors(nodes: Sequence[Mapping[str, Any]], level: float, accused: Accused = NOBODY) -> UIElement:
+def node_errors(
+    nodes: Sequence[Mapping[str, Any]], level: float, accused: Accused = NOBODY, names: Sequence[str] | None = None
+) -> UIElement:
     """Node errors with 95 % intervals next to the predicted ones; marked if p < ``level``; agents can be chosen."""
     agents = np.arange(1, len(nodes) + 1)
     measured, predicted, error = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
@@ -80,6 +83,7 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float, accused: Accus
     half = HALF_WIDTH_95 * error
     data = {
         "agent": agents,
+        "name": [agent_name(agent, names) for agent in agents.tolist()],
         "measured": measured,
         "predicted": predicted,
         "left": agents - 0.32,
@@ -101,8 +105,9 @@ def node_errors(nodes: Sequence[Mapping[str, Any]], level: float, accused: Accus
     )
     plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
     plot.xgrid.grid_line_color = None
+    name_agents(plot.xaxis, names)
     mark_agents(plot, accused.involved)
-    rows = [("agent", "@agent"), ("measured", "@measured{0.0000}")]
+    rows = [("agent", "@name"), ("measured", "@measured{0.0000}")]
     size = float(np.clip(220 / len(nodes), 5, 11))
     if not np.isnan(predicted).all():
         plot.segment(
@@ -190,6 +195,7 @@ def innovation_sizes(
     ratios: FloatArray,  # (m,); NaN for an agent without noise
     samples: int,  # innovations per agent
     accused: Accused = NOBODY,
+    names: Sequence[str] | None = None,
 ) -> UIElement:
     """Variance of each agent's innovations relative to the predicted one, and where 95 % of such ratios lie."""
     agents = np.arange(1, len(ratios) + 1)
@@ -197,6 +203,7 @@ def innovation_sizes(
     inside = np.abs(ratios - 1.0) <= half
     data = {
         "agent": agents,
+        "name": [agent_name(agent, names) for agent in agents.tolist()],
         "ratio": ratios,
         "colour": np.where(inside, BLUE, VERMILLION),
         "marker": np.where(inside, "circle", "square"),
@@ -204,6 +211,7 @@ def innovation_sizes(
     plot = new_figure(200, x_axis_label="agent", y_axis_label="variance / predicted", x_range=(0.3, len(ratios) + 0.7))
     plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
     plot.xgrid.grid_line_color = None
+    name_agents(plot.xaxis, names)
     mark_agents(plot, accused.agents)
     ends = np.array([0.3, len(ratios) + 0.7])
     plot.varea(ends, np.full(2, 1 - half), np.full(2, 1 + half), color=SKY, alpha=0.3, legend_label="95 % band")
@@ -212,7 +220,7 @@ def innovation_sizes(
         "agent", "ratio", source=data, marker="marker", size=float(np.clip(220 / len(ratios), 5, 10)), color="colour"
     )
     plot.add_tools(
-        HoverTool(renderers=[points], tooltips=[("agent", "@agent"), ("variance / predicted", "@ratio{0.0000}")])
+        HoverTool(renderers=[points], tooltips=[("agent", "@name"), ("variance / predicted", "@ratio{0.0000}")])
     )
     reach = 1.25 * max(float(np.nanmax(np.abs(ratios - 1.0), initial=0.0)), half)
     plot.y_range = Range1d(max(1 - reach, 0.0), 1 + reach)

@@ -16,12 +16,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from bokeh.models import BoxAnnotation
+from bokeh.models import BoxAnnotation, PlainText
 from bokeh.plotting import figure
 
+from msg_analysis.report.figures.palette import shorten
 from msg_analysis.report.html.plots.colours import GREY, INK, PALE, VERMILLION
 
 SANS = "system-ui, -apple-system, 'Segoe UI', 'Noto Sans', 'DejaVu Sans', sans-serif"
@@ -44,6 +45,12 @@ def new_figure(height: int, tools: str = "box_zoom,pan,wheel_zoom,reset,save", *
         axis.minor_tick_line_color = None
     plot.title.text_font, plot.title.text_color = SANS, INK
     return plot
+
+
+def name_agents(axes: Any, names: Sequence[str] | None) -> None:
+    """Write the names of the agents, if any, beside these axes, instead of the numbers 1 to m."""
+    if names:
+        axes.major_label_overrides = {i: PlainText(text=shorten(name, 10)) for i, name in enumerate(names, start=1)}
 
 
 def mark_agents(plot: Any, agents: Iterable[int]) -> None:

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.large_arrays import pieces, release
+from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.common.text.number_words import counted
 from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.run.trajectory import Trajectory
@@ -51,12 +52,15 @@ def run_events(trajectory: Trajectory, reported: Sequence[Mapping[str, Any]] = (
         for one in reported
         if one["kind"] in KINDS
     ]
+    names = trajectory.record.experiment.names
     late = [
-        Event("late", first, last, f"agent {agent}: late by more than a period in {counted(number, 'step')}")
+        Event(
+            "late", first, last, f"{agent_text(agent, names)}: late by more than a period in {counted(number, 'step')}"
+        )
         for agent, first, last, number in _stretches(_late(trajectory), _NEAR)
     ]
     missing = [
-        Event("missing", first, last, f"agent {agent}: {counted(number, 'state')} missing")
+        Event("missing", first, last, f"{agent_text(agent, names)}: {counted(number, 'state')} missing")
         for agent, first, last, number in _stretches(_missing(trajectory), 1)
     ]
     kept, more = [], 0

@@ -12,9 +12,15 @@
   let model = () => null;
   let busy = false;
 
+  const NAMES = window.NAMES = JSON.parse(document.body.dataset.names);  // null: agents have only numbers
+  window.called = (agent) => NAMES ? NAMES[agent - 1] : `${agent}`;
   window.parseAgents = (text, agents) => {
     const chosen = new Set();
-    for (const part of text.split(/[\s,;]+/).filter(Boolean)) {
+    for (const part of text.split(NAMES ? /\s*[,;]\s*/ : /[\s,;]+/).map((each) => each.trim()).filter(Boolean)) {
+      if (NAMES && NAMES.includes(part)) {
+        chosen.add(NAMES.indexOf(part) + 1);
+        continue;
+      }
       const found = /^(\d+)(?:[-–](\d+))?$/.exec(part);
       const from = found ? Number(found[1]) : 0, to = found ? Number(found[2] || found[1]) : 0;
       if (!found || from < 1 || to > agents || from > to) return { wrong: part };
@@ -35,7 +41,7 @@
     lines.data = {
       xs: known.map(() => x),
       ys: known.map((agent) => Array.from(parts.slice((agent - 1) * points, agent * points))),
-      agent: known.map((agent) => `agent ${agent}`),
+      agent: known.map((agent) => `agent ${window.called(agent)}`),
       colour: known.map(colour),
       width: known.map((agent) => (ACCUSED.has(agent) ? 4 : 2)),
       dash: known.map((agent) => DASHES[Math.floor((agent - 1) / COLOURS.length) % DASHES.length]),
@@ -80,7 +86,7 @@
     if (nodes) nodes.selected.properties.indices.change.connect(() => {
       if (busy) return;
       const agents = nodes.selected.indices.map((index) => index + 1).sort((a, b) => a - b);
-      field.value = agents.join(", ");
+      field.value = agents.map(window.called).join(", ");
       choose(agents);
     });
     choose([]);

@@ -57,7 +57,7 @@
     const lines = chosen.map((agent) => line(low, high, (agent - 1) * bins, first, last, pixels));
     model("states").data = {
       xs: lines.map(([xs]) => xs), ys: lines.map(([, ys]) => ys),
-      agent: chosen.map((agent) => `agent ${agent}`),
+      agent: chosen.map((agent) => `agent ${window.called(agent)}`),
       colour: chosen.map(colour), dash: chosen.map(dash),
       width: chosen.map((agent) => (ACCUSED.has(agent) ? 2.4 : 1.3)),
     };
@@ -172,6 +172,7 @@
   }
 
   function ranges(numbers) {
+    if (window.NAMES) return numbers.map(window.called).join(", ");
     const parts = [];
     for (const number of numbers) {
       const last = parts[parts.length - 1];
@@ -187,10 +188,10 @@
       const button = document.createElement("button"), mark = document.createElement("i");
       button.type = "button";
       button.dataset.agent = agent;
-      button.setAttribute("aria-label", `agent ${agent}${ACCUSED.has(agent) ? ", accused" : ""}`);
+      button.setAttribute("aria-label", `agent ${window.called(agent)}${ACCUSED.has(agent) ? ", accused" : ""}`);
       mark.style.borderTopColor = `var(--line-${(agent - 1) % COLOURS.length})`;
       mark.style.borderTopStyle = { dotdash: "dashed" }[dash(agent)] || dash(agent);
-      button.append(mark, ACCUSED.has(agent) ? `${agent} ✗` : `${agent}`);
+      button.append(mark, ACCUSED.has(agent) ? `${window.called(agent)} ✗` : window.called(agent));
       button.addEventListener("click", () => {
         if (on.has(agent)) on.delete(agent);
         else on.add(agent);
