@@ -199,7 +199,7 @@ def test_interrupted_it_says_what_it_has(
     ended(live, 3)
     play.send_signal(signal.SIGINT)
     ended(play, 130)
-    assert "waiting for one" in alone.stderr.readline()
+    assert "waiting for one. Another domain: --domain D" in alone.stderr.readline()
     alone.send_signal(signal.SIGTERM)
     assert "no network was seen" in ended(alone, 3)[1]
     said = ended(network.start("live", "--timeout", "1"), 2)[1]

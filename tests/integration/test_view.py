@@ -75,6 +75,7 @@ def test_json_on_a_terminal_is_json_elsewhere(network: Any, terminal: Any) -> No
     assert screen.read_to_the_end() in (0, 1)
     assert json.loads(out.read_text())["steps"] == 300
     assert "net: 5 agents, lockstep" in _plain(screen.text)
+    assert re.search(r"note: ROS_DOMAIN_ID (\d+): to watch the run, msg-agents live --domain \1\b", _plain(screen.text))
     assert "verdict" not in screen.text
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import io
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,15 @@ def record_document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise InputError(f"{path}: its run record is not a JSON object: the bag is damaged")
     return document
+
+
+def started(path: Path) -> datetime | None:
+    """When the run of a bag was started, by the head of its first file alone; None where that does not say it."""
+    try:
+        found = datetime.fromisoformat(json.loads(_head_record(first_file(path)) or "{}")["started"])
+        return found if found.tzinfo else found.replace(tzinfo=UTC)
+    except (BagError, ValueError, KeyError, TypeError, RecursionError):
+        return None
 
 
 def _head_record(file: Path | None) -> str | None:

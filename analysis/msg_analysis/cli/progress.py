@@ -16,9 +16,16 @@
 
 from __future__ import annotations
 
+import math
 import time
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
+
+from msg_analysis.common.text.number_words import duration_text
+
+if TYPE_CHECKING:
+    from rich.progress import Task
+    from rich.text import Text
 
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal
 _SHORT = 2.0  # s of work of which nothing is shown
@@ -33,12 +40,19 @@ class _Progress:
             BarColumn,
             MofNCompleteColumn,
             Progress,
+            ProgressColumn,
             TextColumn,
             TimeElapsedColumn,
-            TimeRemainingColumn,
         )
+        from rich.text import Text
 
         from msg_analysis.common.text.safe_console import SafeConsole
+
+        times = self._times
+
+        class TimesColumn(ProgressColumn):
+            def render(self, _: Task) -> Text:
+                return Text(times())
 
         console = SafeConsole(stderr=True, highlight=False, markup=False)
         self._bar = Progress(
@@ -46,8 +60,7 @@ class _Progress:
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[words]}"),
-            TimeElapsedColumn(),
-            *((TextColumn("left"), TimeRemainingColumn()) if time_left else ()),
+            TimesColumn() if time_left else TimeElapsedColumn(),
             console=console,
             disable=not console.is_terminal,
             transient=True,
@@ -55,21 +68,38 @@ class _Progress:
         self._console = console
         self._title = title
         self._task = self._bar.add_task(title, total=None, words="")
-        self._told = time.monotonic()
+        self._time_left = time_left
+        self._begun = self._told = time.monotonic()
+        self._first: int | None = None  # done when the work began, by an earlier call for example
+        self._newest = (0, 0, self._begun)  # done, of how many, when
         self._shown = 0.0
 
     def __enter__(self) -> Self:
         self._bar.start()
         return self
 
+    def _times(self) -> str:
+        """The time so far, and what is left at the mean speed so far, once it is known."""
+        now = time.monotonic()
+        text = f"{duration_text(now - self._begun)} so far"
+        done, total, when = self._newest
+        new = done - (self._first or 0)
+        if new <= 0 or done >= total:
+            return text
+        left = (total - done) * (when - self._begun) / new - (now - when)
+        return f"{text}, {duration_text(math.ceil(max(left, 0.0)))} left"
+
     def _show(self, title: str, done: int, total: int, words: str, in_short: str) -> None:
+        if self._first is None:
+            self._first = done
+        self._newest = done, total, time.monotonic()
         self._bar.update(self._task, completed=done, total=total, description=title, words=in_short)
         if not self._console.is_terminal and time.monotonic() - self._told >= _LINE_PERIOD:
             self._told = time.monotonic()
             self._console.print(self._line(title, done, total, words))
 
     def _line(self, title: str, done: int, total: int, words: str) -> str:
-        return f"{title}: {done} of {total}{', ' if words else ''}{words}"
+        return ", ".join(filter(None, (f"{title}: {done} of {total}", words, self._times() if self._time_left else "")))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -122,7 +152,6 @@ class WorkProgress(_Progress):
 
     def __init__(self) -> None:
         super().__init__("", time_left=False)
-        self._begun = time.monotonic()
 
     def __enter__(self) -> Self:
         return self

@@ -72,6 +72,7 @@ def _side(path: Path, run: Trajectory, result: dict[str, Any]) -> dict[str, Any]
         "experiment": record.experiment.name,
         "seed": record.experiment.run.seed,
         "agents": record.experiment.agents,
+        "names": record.experiment.names,
         "steps": record.experiment.steps,
         "simulated_time": record.experiment.run.duration,
         "complete": completeness.complete,

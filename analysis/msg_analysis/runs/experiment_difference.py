@@ -60,6 +60,7 @@ def _side(experiment: ValidExperiment, prediction: Prediction | str) -> dict[str
         "problem": experiment.problem,
         "time": experiment.time,
         "agents": experiment.agents,
+        "names": experiment.names,
         "unpredicted": prediction if isinstance(prediction, str) else None,
     }
 

@@ -110,13 +110,17 @@ def _entry(folder: Path) -> RunEntry:
 
 
 def _date(folder: Path, names: set[str]) -> datetime:
-    """When the run began: by the name of its folder, else by its bag, else when the bag was last changed."""
+    """When the run began: by the name of its folder, its record, its bag, or when the bag was last changed."""
     stamp = _STAMP.search(folder.name)
     if stamp:
         try:
             return datetime.strptime(stamp[1], "%Y%m%d_%H%M%S").astimezone()
         except ValueError:  # no date
             pass
+    from msg_analysis.bags.record_head import started  # here: where all folders have dates, no bag is touched
+
+    if (recorded := started(folder)) is not None:
+        return recorded.astimezone()
     start = starting_time(folder) if METADATA_FILE in names else None
     if start is not None and start > _CLOCKS:
         return datetime.fromtimestamp(start / 1e9, UTC).astimezone()

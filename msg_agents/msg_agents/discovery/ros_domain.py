@@ -74,16 +74,26 @@ def free_domain(count: int = 1) -> Iterator[int]:
     raise InputError(f"no free ROS domain among {DOMAINS[0]}..{DOMAINS[-1]}: end some runs or give --domain")
 
 
+def held_domains() -> list[int]:
+    """The domains that runs on this machine hold."""
+    names = (file.stem.rpartition("_")[2] for file in Path(tempfile.gettempdir()).glob(_lock_name("*")))
+    return sorted(domain for domain in map(int, filter(str.isdecimal, names)) if domain in DOMAINS and is_held(domain))
+
+
 def is_held(domain: int) -> bool:
     """Whether a run holds a domain."""
     with ExitStack() as locks:
         return not _lock(domain, locks)
 
 
+def _lock_name(domain: str) -> str:
+    return f"msg_agents_domain_{domain}.lock"
+
+
 def _lock(domain: int, locks: ExitStack) -> bool:
     """Lock a domain until the end of ``locks``; whether that was possible."""
     try:
-        descriptor = _open_lock(Path(tempfile.gettempdir()) / f"msg_agents_domain_{domain}.lock")
+        descriptor = _open_lock(Path(tempfile.gettempdir()) / _lock_name(str(domain)))
     except OSError:
         return False
     locks.callback(os.close, descriptor)

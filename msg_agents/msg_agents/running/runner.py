@@ -145,6 +145,8 @@ def run_network(
             surroundings(folder, domain, environment or {}, processes + 2) as around,
         ):
             variables = around.environment
+            if share is None:
+                view.joined(around.domain)
             with NodeServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 record = record or new_record(experiment)
                 run_file = folder / "run.json"

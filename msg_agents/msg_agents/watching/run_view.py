@@ -75,6 +75,10 @@ class RunView(View):
         if self._begun:
             self._source.happened(line)
 
+    def joined(self, domain: int) -> None:
+        """Say where the run is, for whoever wants to watch it."""
+        self.note(f"ROS_DOMAIN_ID {domain}: to watch the run, msg-agents live --domain {domain}")
+
     def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
         """Follow the run: its processes have been started. Without ``checkpoints`` its errors are not followed."""
         self._begun = True

@@ -29,6 +29,9 @@ class View:
     def __init__(self, on_progress: Callable[[int], None], on_note: Callable[[str], None]) -> None:
         self._on_progress, self._on_note = on_progress, on_note
 
+    def joined(self, domain: int) -> None:
+        """The run is in this ROS_DOMAIN_ID, and nothing has been started yet."""
+
     def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
         """The processes have been started; ``checkpoints``: directory of the agents' states, if they are kept here."""
 

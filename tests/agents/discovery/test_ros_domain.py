@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from msg_agents.discovery import ros_domain
-from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN, free_domain
+from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN, free_domain, held_domains
 from msg_analysis.errors import InputError
 
 HOLD = """
@@ -71,8 +71,11 @@ def test_a_killed_holder_gives_its_domain_back(
         assert held == domains[0]
         with pytest.raises(InputError), free_domain():
             pass
+        (tmp_path / "msg_agents_domain_x.lock").touch()
+        assert held_domains() == [held]
         process.kill()
         process.wait()
+        assert held_domains() == []
         with free_domain() as mine:
             assert mine == held
 

@@ -42,8 +42,8 @@ def _there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
 
 
-def invoke(*words: str, code: int = 0) -> Result:
-    result = CliRunner().invoke(main, words, prog_name="msg-analysis", env={"COLUMNS": "120"})
+def invoke(*words: str, code: int = 0, columns: int = 120) -> Result:
+    result = CliRunner().invoke(main, words, prog_name="msg-analysis", env={"COLUMNS": str(columns)})
     assert (result.exit_code, result.exception if code == 0 else None) == (code, None), result.output
     return result
 
@@ -60,6 +60,11 @@ def test_runs() -> None:
     text = invoke("runs", "--name", "pair").stdout
     assert "2 runs of 3" in text
     assert "2026-11-27 12:00" not in text  # the names of the folders have it
+    wide, narrow = (invoke("runs", columns=columns).stdout.splitlines() for columns in (140, 40))
+    assert len(wide) == len(narrow)  # a line for each run, with what there is room for
+    assert {"predicted", "z"} < set(wide[2].split())
+    assert not {"predicted", "z"} & set(narrow[2].split())
+    assert any("pair_20261128_120000" in line and "2026-11-28 12:00" in line and "agrees" in line for line in narrow)
     assert "none of 3 runs" in invoke("runs", "--seed", "9").stdout
     document = json.loads(invoke("runs", "--verdict", "agrees", "--json").stdout)
     assert (document["folder"], document["total"]) == ("runs", 3)
@@ -100,6 +105,19 @@ def test_diff_of_experiments() -> None:
     for words in ("noise.process", "+300 %", "Decay rates", "best of A"):
         assert words in text
     assert json.loads(invoke("diff", "a.yaml", "b.yaml", "--json").stdout)["kind"] == "experiments"
+
+
+def test_agents_have_their_names(tmp_path: Path) -> None:
+    """Where both files have the same ones."""
+    named = DOCUMENT | {"names": ["Ulm", "Bonn", "Kiel"]}
+    for place, extra in (("a", {}), ("b", {"noise": {"process": 2.0}})):
+        (tmp_path / f"{place}.yaml").write_text(yaml.safe_dump(named | extra))
+        Experiment.load(tmp_path / f"{place}.yaml").simulate().save(tmp_path / place)
+    text = invoke("diff", str(tmp_path / "a.yaml"), str(tmp_path / "b.yaml")).stdout
+    assert "agent Kiel" in text
+    assert "agent 1" not in text
+    assert "agent Ulm" in invoke("diff", str(tmp_path / "a"), str(tmp_path / "b")).stdout
+    assert "agent 1" in invoke("diff", str(tmp_path / "a.yaml"), "b.yaml").stdout
 
 
 @pytest.mark.parametrize(

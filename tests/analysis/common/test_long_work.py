@@ -8,8 +8,9 @@ import pytest
 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.cli.progress import WorkProgress
+from msg_analysis.cli.progress import SweepProgress, WorkProgress
 from msg_analysis.common.long_work import tell, watched
+from msg_analysis.common.text.number_words import duration_text
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
@@ -54,3 +55,25 @@ def test_long_work_says_how_far_it_is(capfd: pytest.CaptureFixture[str], monkeyp
             now[0] = 100.0 + second
             tell("reading x.mcap", second, 25)
     assert capfd.readouterr().err == "reading x.mcap: 40 %\nreading x.mcap: 80 %\n"
+
+
+def test_a_sweep_says_what_is_left(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the mean speed of what is new: 40 of 100 points were there before, each takes a second and a half."""
+    now = [100.0]
+    monkeypatch.setattr("msg_analysis.cli.progress.time.monotonic", lambda: now[0])
+    with SweepProgress("sweep") as progress:
+        progress.done(40, 100, 0)
+        for done in range(41, 101):
+            now[0] = 100.0 + 1.5 * (done - 40)
+            progress.done(done, 100, int(done > 60))
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[0] == "sweep: 47 of 100, 10 s so far, 1 min 20 s left"
+    assert lines[2] == "sweep: 61 of 100, 1 without a result, 32 s so far, 59 s left"
+    assert lines[-1] == "sweep: 96 of 100, 1 without a result, 1 min 24 s so far, 6 s left"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.2, "0 s"), (57.4, "57 s"), (59.6, "1 min 0 s"), (3599, "59 min 59 s"), (7512, "2 h 5 min")]
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert duration_text(seconds) == text

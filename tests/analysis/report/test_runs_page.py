@@ -46,16 +46,15 @@ def test_rows_links_and_data(tmp_path: Path) -> None:
     """Newest first; the experiment of a bag is in it once, however many runs have it."""
     document = {"name": "pair", "graphs": {"line": {"path": [1, 2, 3]}}, "run": {"dt": 0.1, "duration": 5, "seed": 7}}
     run = Experiment.parse(document | {"run": document["run"] | {"start": "zero"}}).simulate()
-    for name in ("pair 1", "pair_2"):
+    names = ("pair 1_20261125_120000", "pair_20261126_120000")
+    for name in names:
         run.save(tmp_path / "runs" / name)
-    (tmp_path / "runs" / "pair 1" / "report.html").write_text("")
-    runs = list_runs(tmp_path / "runs")
-    page = Page(render_runs(runs, tmp_path / "runs", tmp_path / "pages"))
+    (tmp_path / "runs" / names[0] / "report.html").write_text("")
+    page = Page(render_runs(list_runs(tmp_path / "runs"), tmp_path / "runs", tmp_path / "pages"))
     assert "2 runs" in page.text
-    assert [each for each in page.references if not each.startswith("data:")] == sorted(
-        ["../runs/pair_2/", "../runs/pair%201/", "../runs/pair%201/report.html"],
-        key=lambda link: ("pair_2" not in link) == (Path(runs[-1].folder).name == "pair_2"),
-    )
+    quoted = names[0].replace(" ", "%20")
+    wanted = [f"../runs/{names[1]}/", f"../runs/{quoted}/", f"../runs/{quoted}/report.html"]
+    assert [each for each in page.references if not each.startswith("data:")] == wanted
     data = json.loads(page.data)
     assert {each["experiment"] for each in data["runs"]} == {0}
     assert {each["versions"] for each in data["runs"]} == {1}

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import json
 import os
 import shutil
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -147,19 +148,21 @@ def test_other_folders_are_listed_with_a_word(tmp_path: Path) -> None:
     assert "tests: expected a list of objects" in (found["result_c"].problem or "")
 
 
-def test_dates_without_a_name(tmp_path: Path, bag: Path) -> None:
-    """By the bag, unless that has the simulated time of the twin; else by the file."""
-    recorded = tmp_path / "a"
-    shutil.copytree(bag, recorded)
-    text = (recorded / "metadata.yaml").read_text()
-    (recorded / "metadata.yaml").write_text(text.replace("epoch: 0\n", "epoch: 1795000000000000000\n", 1))
-    twin = tmp_path / "pair_20269999_120000"  # not a date
-    shutil.copytree(bag, twin)
-    (file,) = twin.glob("*.mcap")
+def test_dates_without_a_name(tmp_path: Path) -> None:
+    """By the record; else by the bag, unless that has the simulated time of the twin; else by the file."""
+    run = Experiment.parse(PAIR).simulate()
+    began = datetime(2026, 9, 1, 12, tzinfo=UTC)
+    for name, start in (("recorded", began), ("clocked", None), ("pair_20269999_120000", None)):  # not a date
+        record = dataclasses.replace(run.record, started=start)
+        dataclasses.replace(run, record=record).save(tmp_path / name)
+    metadata = tmp_path / "clocked" / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("epoch: 0\n", "epoch: 1795000000000000000\n", 1))
+    (file,) = (tmp_path / "pair_20269999_120000").glob("*.mcap")
     os.utime(file, (1_790_000_000, 1_790_000_000))
     assert [(Path(entry.folder).name, entry.date.timestamp()) for entry in list_runs(tmp_path)] == [
-        (twin.name, 1_790_000_000),
-        ("a", 1_795_000_000),
+        ("recorded", began.timestamp()),
+        ("pair_20269999_120000", 1_790_000_000),
+        ("clocked", 1_795_000_000),
     ]
 
 

@@ -63,3 +63,11 @@ def listed(values: Sequence[object], longest: int = 12) -> str:
     """The values, separated by commas; of more than ``longest``, how many are left out."""
     more = f", and {len(values) - longest} more" if len(values) > longest else ""
     return ", ".join(str(value) for value in values[:longest]) + more
+
+
+def duration_text(seconds: float) -> str:
+    """A duration in its two largest units, up to hours: ``57 s``, ``3 min 20 s``, ``2 h 5 min``."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"

@@ -22,6 +22,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
+from msg_analysis.common.text.agent_names import agent_name, agent_text
 from msg_analysis.common.text.number_words import counted, listed, measured_text, number_text, percent, z_text
 from msg_analysis.model.experiment.problems import show
 from msg_analysis.report.terminal.tables import fact_table, first_rows, number_table, print_table
@@ -49,7 +50,7 @@ def print_bag_difference(document: dict[str, Any], console: Console) -> None:
     _print_keys("Versions", document["versions"], console)
     for line in _states(document):
         console.print(Text(line))
-    _print_errors(document["errors"], console)
+    _print_errors(document["errors"], _names(document), console)
     for name, side in (("A", a), ("B", b)):
         if side["unpredicted"]:
             console.print(Text(f"{name} has no prediction: {side['unpredicted']}"))
@@ -69,18 +70,19 @@ def print_experiment_difference(document: dict[str, Any], console: Console) -> N
         )
         table.add_row("system", *_relative(errors["system_error"]), end_section=True)
         for place, error in enumerate(first_rows(table, errors["node_errors"], "agents"), start=1):
-            table.add_row(f"agent {place}", *_relative(error))
+            table.add_row(Text(agent_text(place, _names(document))), *_relative(error))
         print_table(console, table)
     table = number_table(console, "Decay rates of the steps of the run", "", "A", "B", "change")
     for key, title in _RATES.items():
         table.add_row(title, *_relative(document["rates"][key]))
     print_table(console, table)
     leaders = number_table(console, "Leaders", "", "agents", "gain", "system error")
-    for name, side in (("A", document["leaders"]["a"]), ("B", document["leaders"]["b"])):
+    for name, key in (("A", "a"), ("B", "b")):
+        side, names = document["leaders"][key], document[key]["names"]
         if side["agents"]:
-            leaders.add_row(name, *_leaders(side))
+            leaders.add_row(name, *_leaders(side, names))
         if side["best"]:
-            leaders.add_row(f"best of {name}", *_leaders(side["best"]))
+            leaders.add_row(f"best of {name}", *_leaders(side["best"], names))
         elif side["note"]:
             leaders.caption = f"{leaders.caption or ''}{name}: {side['note']}. "
     print_table(console, leaders)
@@ -112,21 +114,21 @@ def _states(document: dict[str, Any]) -> list[str]:
     if states["compared"] is None:
         return [f"States: not comparable: {states['why']}"]
     lines = []
-    first, largest, last = states["first"], states["largest"], states["last"]
+    first, largest, last, names = states["first"], states["largest"], states["last"], _names(document)
     if states["equal"]:
         lines.append(f"States: equal to the last bit, x(0) to x({states['compared']})")
     elif first is None:
         lines.append(f"States: equal to the last bit up to x({states['compared']}), where both runs have them")
     else:
-        agents = (
-            "all agents" if len(first["agents"]) == document["a"]["agents"] else f"agents {listed(first['agents'])}"
-        )
+        everybody = len(first["agents"]) == document["a"]["agents"]
+        agents = "all agents" if everybody else _agents(first["agents"], names)
+        agent = agent_text(largest["agent"], names)
         lines += [
             f"States: first difference at step {first['step']} (time {number_text(first['time'])}), {agents}, by "
             f"{number_text(first['difference'])}",
             f"  different: {counted(states['states'], 'state')} in {counted(states['steps'], 'step')} of "
             f"{states['compared'] + 1}",
-            f"  largest: {number_text(largest['difference'])} at step {largest['step']}, agent {largest['agent']}, "
+            f"  largest: {number_text(largest['difference'])} at step {largest['step']}, {agent}, "
             f"number {largest['number']}; at the last common step {last['step'] if last else '-'}: "
             f"{number_text(last['difference'] if last else None)}",
         ]
@@ -143,11 +145,11 @@ def _states(document: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _print_errors(errors: dict[str, Any], console: Console) -> None:
+def _print_errors(errors: dict[str, Any], names: Sequence[str] | None, console: Console) -> None:
     table = number_table(console, "Measured mean-square errors", "", "A", "B", "B - A", "in standard errors")
     table.add_row("system", *_measured(errors["system"]), end_section=True)
     for place, error in enumerate(first_rows(table, errors["agents"], "agents"), start=1):
-        table.add_row(f"agent {place}", *_measured(error))
+        table.add_row(Text(agent_text(place, names)), *_measured(error))
     print_table(console, table)
     if not errors["independent"]:
         console.print(Text("Both runs have the same seed: their errors are not independent.", style="dim"))
@@ -172,6 +174,17 @@ def _relative(pair: dict[str, Any]) -> list[str]:
     return [number_text(a), number_text(b), text]
 
 
-def _leaders(side: dict[str, Any]) -> list[str]:
+def _leaders(side: dict[str, Any], names: Sequence[str] | None) -> list[str | Text]:
+    agents = Text(listed([agent_name(agent, names) for agent in side["agents"]]))
     gain = side["gain"]
-    return [listed(side["agents"]), gain if gain == "inf" else number_text(gain), number_text(side["system_error"])]
+    return [agents, gain if gain == "inf" else number_text(gain), number_text(side["system_error"])]
+
+
+def _names(document: dict[str, Any]) -> list[str] | None:
+    """The names of the agents, where both have the same ones."""
+    names: list[str] | None = document["a"]["names"]
+    return names if names == document["b"]["names"] else None
+
+
+def _agents(agents: Sequence[int], names: Sequence[str] | None) -> str:
+    return f"{'agent' if len(agents) == 1 else 'agents'} {listed([agent_name(agent, names) for agent in agents])}"

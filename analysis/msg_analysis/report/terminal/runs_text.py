@@ -17,17 +17,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.text import Text
 
 from msg_analysis.common.text.number_words import counted, half_width_text, number_text, z_text
-from msg_analysis.report.terminal.tables import number_table, print_table, room_for_names
+from msg_analysis.report.terminal.tables import MARGIN, number_table
 from msg_analysis.runs.run_list import RunEntry
 
 _STYLES = {"agrees": "green", "disagrees": "bold red", "incomplete": "yellow"}
+
+
+_OPTIONAL = ("predicted", "z", "± (95 %)")  # left out in this order where the terminal is too narrow
 
 
 def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Console) -> None:
@@ -38,6 +42,7 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
     heads = ["run", "experiment", "date", "seed", "verdict", "system error", "± (95 %)", "predicted", "z"]
     rows = [
         [
+            Path(run.folder).name,
             run.name or "-",
             f"{run.date:%Y-%m-%d %H:%M}",
             "-" if run.seed is None else str(run.seed),
@@ -49,25 +54,30 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
         ]
         for run in runs
     ]
+    columns = dict(zip(heads, zip(*rows, strict=True), strict=True))
     if all(Path(run.folder).name.startswith(f"{run.name}_{run.date:%Y%m%d_%H%M}") for run in runs):
-        heads.remove("experiment")  # the names of the folders have it, and the date
-        heads.remove("date")
-        rows = [row[2:] for row in rows]
-    empty = {place for place in range(len(rows[0])) if {row[place] for row in rows} == {"-"}}
-    heads = [heads[0], *(head for place, head in enumerate(heads[1:]) if place not in empty)]
-    rows = [[cell for place, cell in enumerate(row) if place not in empty] for row in rows]
-    room = max(room_for_names(console, heads[1:], rows), max(len(Path(run.folder).name) for run in runs))
-    table = number_table(console, f"Runs in {folder}", *heads)
-    verdict = heads.index("verdict")
-    table.columns[0].min_width = min(room, max(len(Path(run.folder).name) for run in runs))
-    for run, row in zip(runs, rows, strict=True):
+        del columns["experiment"], columns["date"]  # the names of the folders have them
+    columns = {head: cells for head, cells in columns.items() if set(cells) != {"-"}}
+    for head in _OPTIONAL:
+        if _width(columns) > console.width:
+            columns.pop(head, None)
+    table = number_table(console, f"Runs in {folder}", *columns)
+    for run, cells in zip(runs, zip(*columns.values(), strict=True), strict=True):
         style = _STYLES.get(run.verdict or "", "dim" if run.verdict is None else "")
-        cells = [Text(cell, style=style if place == verdict else "") for place, cell in enumerate(row, start=1)]
-        table.add_row(Text(Path(run.folder).name), *cells)
-    print_table(console, table)
+        table.add_row(
+            *(Text(cell, style if head == "verdict" else "") for head, cell in zip(columns, cells, strict=True))
+        )
+    width = console.width
+    console.width = max(width, _width(columns))  # a line of its own for each run
+    console.print(table)
+    console.width = width
     counts = Counter(run.verdict or run.status for run in runs)
     listed = ", ".join(f"{number} {word}" for word, number in counts.most_common())
     console.print(Text(f"{counted(len(runs), 'run')}{f' of {total}' if len(runs) < total else ''}: {listed}"))
     for run in runs:
         if run.status == "damaged" and run.problem:
             console.print(Text(f"damaged: {run.problem}", style="yellow"))
+
+
+def _width(columns: Mapping[str, Sequence[str]]) -> int:
+    return 1 + sum(MARGIN + max(map(cell_len, (head, *cells))) for head, cells in columns.items())

@@ -30,6 +30,7 @@ from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
+from msg_agents.discovery.ros_domain import held_domains
 from msg_agents.nodes.node_process import INTERRUPTED_GRACE, SPIN_SLICE, leave, make_executor
 from msg_agents.nodes.ros.lean_node import LeanNode
 from msg_agents.nodes.ros.node_parameters import ros_arguments
@@ -166,10 +167,12 @@ def run_watcher(
             executor.spin_until_future_complete(node.known, timeout_sec=SPIN_SLICE)
             waited = time.monotonic() - began
             if timeout is not None and waited > timeout and not node.known.done():
-                raise InputError(f"after {timeout:g} s {no_network}: is one running or being played there?")
+                raise InputError(
+                    f"after {timeout:g} s {no_network}: is one running or being played there? {_other_domain()}"
+                )
             if waited > NOTE_DELAY and not noted and not node.known.done():
                 noted = True
-                on_note(f"{no_network} yet: waiting for one")
+                on_note(f"{no_network} yet: waiting for one. {_other_domain()}")
         if not followed:
             node.follow()
         _spin(executor, node.done, on_look)
@@ -184,6 +187,13 @@ def run_watcher(
         else:
             leave(nodes, executor, complete=False)
     return nodes[0] if nodes else None
+
+
+def _other_domain() -> str:
+    """How to look elsewhere."""
+    mine = os.environ.get("ROS_DOMAIN_ID", "0")
+    found = [str(domain) for domain in held_domains() if str(domain) != mine]
+    return "Another domain: --domain D" + (f"; runs on this machine are in {', '.join(found)}" if found else "")
 
 
 def _stop_reading(nodes: Sequence[Watcher], executor: Executor | None) -> None:

@@ -106,10 +106,10 @@
     });
     element("text", { x: (left + width - right) / 2, y: height - 7, "text-anchor": "middle" }, svg, `${points.length} ${points.length === 1 ? "run" : "runs"}, oldest first`);
     const cell = (width - left - right) / points.length, size = Math.max(1.8, Math.min(5, cell / 2.2));
-    svg.style.setProperty("--bar", Math.max(0.6, Math.min(1.5, cell * 0.35)));
+    svg.style.setProperty("--whisker", Math.max(0.6, Math.min(1.5, cell * 0.35)));
     points.forEach((place, i) => {
       const run = runs[place], kind = run.verdict === "agrees" || run.verdict === "disagrees" ? run.verdict : "other", cx = x(i), cy = y(run.measured);
-      if (half(run)) element("line", { class: `bar ${kind}`, x1: cx, x2: cx, y1: y(run.measured - half(run)), y2: y(run.measured + half(run)) }, svg);
+      if (half(run)) element("line", { class: `whisker ${kind}`, x1: cx, x2: cx, y1: y(run.measured - half(run)), y2: y(run.measured + half(run)) }, svg);
       if (kind === "agrees") element("circle", { class: "dot agrees", cx, cy, r: size }, svg);
       else if (kind === "disagrees") element("path", { class: "dot disagrees", d: `M${cx} ${cy - size * 1.5}l${size * 1.4} ${size * 2.5}h${-size * 2.8}Z` }, svg);
       else element("rect", { class: "dot other", x: cx - size, y: cy - size, width: 2 * size, height: 2 * size }, svg);
@@ -217,7 +217,7 @@
 
   for (const id of ["a", "b"]) {
     node("option", at(id), "–", { value: "" });
-    runs.forEach((run, place) => node("option", at(id), `${run.id} (${run.word}, seed ${run.seed ?? "–"})`, { value: place }));
+    runs.forEach((run, place) => node("option", at(id), run.id, { value: place }));
     at(id).addEventListener("change", () => { pair = [at("a").value, at("b").value].filter((value) => value !== "").map(Number); compare(); });
   }
   at("swap").addEventListener("click", () => { pair.reverse(); compare(); });
