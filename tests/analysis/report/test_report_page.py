@@ -120,7 +120,7 @@ def _page(comparison: Comparison, path: Path) -> Page:
 
 
 def _checked(text: str) -> Page:
-    assert len(text.encode()) < 5_000_000
+    assert len(text.encode()) < 3_000_000
     page = Page(text)
     assert all(reference.startswith("#") for reference in page.references)
     assert "default-src 'none'" in text

@@ -71,7 +71,7 @@ def test_small_and_large(browser: Any, tmp_path: Path, agents: int) -> None:
     trajectory = _trajectory(agents, **({"duration": 20} if agents == 5 else {"duration": 6, "start": "zero"}))
     path = tmp_path / "report.html"
     write_report(compare(trajectory), trajectory, path)
-    assert path.stat().st_size < 5_000_000
+    assert path.stat().st_size < 3_000_000
     page, log = _open(browser, path)
     _check(page, log, path)
 

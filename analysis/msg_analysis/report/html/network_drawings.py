@@ -115,7 +115,7 @@ def _links(
             left, right = b - 6 * step + 3 * across, b - 6 * step - 3 * across
             heads.append(f"M{_at(b)}L{_at(left)}L{_at(right)}Z")
         lines.setdefault(math.ceil(_WEIGHTS * weight / heaviest), []).append(f"M{_at(a)}L{_at(b)}")
-    thin = 0.4 if len(links) > 400 else 1.0
+    thin = 0.25 if len(links) > 400 else 0.5 if len(links) > 60 else 1.0
     drawn = [
         f'<path d="{"".join(paths)}" fill="none" stroke="{colour}" stroke-opacity=".8" '
         f'stroke-width="{thin * _line_width(width / _WEIGHTS):.2f}"/>'

@@ -21,7 +21,6 @@ from typing import Any, Literal
 
 import numpy as np
 from bokeh.models import (
-    BasicTicker,
     ColumnDataSource,
     FixedTicker,
     HoverTool,
@@ -39,7 +38,7 @@ from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.report.documents.comparison_words import TIMES
 from msg_analysis.report.html.plots.accused import NOBODY, Accused
 from msg_analysis.report.html.plots.colours import BLACK, BLUE, GREY, PAGE, SKY, VERMILLION
-from msg_analysis.report.html.plots.plot_style import mark_agents, name_agents, new_figure, place_legend, plain_legend
+from msg_analysis.report.html.plots.plot_style import agent_ticker, mark_agents, name_agents, new_figure, place_legend, plain_legend
 from msg_analysis.types import FloatArray
 
 MOST_LINES = 8  # agents whose convergence is drawn at once
@@ -103,7 +102,7 @@ def node_errors(
         y_axis_label="mean-square error",
         x_range=(0.3, len(nodes) + 0.7),
     )
-    plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
+    plot.xaxis.ticker = agent_ticker()
     plot.xgrid.grid_line_color = None
     name_agents(plot.xaxis, names)
     mark_agents(plot, accused.involved)
@@ -209,7 +208,7 @@ def innovation_sizes(
         "marker": np.where(inside, "circle", "square"),
     }
     plot = new_figure(200, x_axis_label="agent", y_axis_label="variance / predicted", x_range=(0.3, len(ratios) + 0.7))
-    plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0)
+    plot.xaxis.ticker = agent_ticker()
     plot.xgrid.grid_line_color = None
     name_agents(plot.xaxis, names)
     mark_agents(plot, accused.agents)

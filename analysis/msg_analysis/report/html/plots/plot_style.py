@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from bokeh.models import BoxAnnotation, PlainText
+from bokeh.models import BasicTicker, BoxAnnotation, PlainText
 from bokeh.plotting import figure
 
 from msg_analysis.report.figures.palette import shorten
@@ -51,6 +51,11 @@ def name_agents(axes: Any, names: Sequence[str] | None) -> None:
     """Write the names of the agents, if any, beside these axes, instead of the numbers 1 to m."""
     if names:
         axes.major_label_overrides = {i: PlainText(text=shorten(name, 10)) for i, name in enumerate(names, start=1)}
+
+
+def agent_ticker() -> BasicTicker:
+    """Whole numbers; fewer on narrow screens, by the page's script."""
+    return BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0, tags=["agents"])
 
 
 def mark_agents(plot: Any, agents: Iterable[int]) -> None:

@@ -71,10 +71,13 @@
     busy = false;
   }
 
-  // On narrow screens, legends have two columns.
-  function fitLegends(shown) {
-    const columns = document.body.clientWidth < 560 ? 2 : "auto";
-    for (const one of shown.all_models) if (one.type === "Legend" && one.ncols !== columns) one.ncols = columns;
+  // On narrow screens, legends have two columns, and axes fewer numbers.
+  function fitWidth(shown) {
+    const narrow = document.body.clientWidth < 560, columns = narrow ? 2 : "auto";
+    for (const one of shown.all_models) {
+      if (one.type === "Legend" && one.ncols !== columns) one.ncols = columns;
+      if (one.type === "BasicTicker" && one.tags.includes("agents")) one.desired_num_ticks = narrow ? 8 : 20;
+    }
   }
 
   function start() {
@@ -90,8 +93,8 @@
       choose(agents);
     });
     choose([]);
-    fitLegends(shown);
-    window.addEventListener("resize", () => fitLegends(shown));
+    fitWidth(shown);
+    window.addEventListener("resize", () => fitWidth(shown));
     document.body.dataset.started = "yes";
     if (document.getElementById("trajectories")) return;  // its script says when it has drawn
     const drawn = () => { document.body.dataset.ready = "yes"; };
@@ -108,11 +111,12 @@
 
   // On paper nothing can be opened, and figures, which keep the width of the screen, would be cut: pictures are not.
   let closed = [], pictures = [];
+  // Between two listeners, the plots take over the colours for white pages.
+  window.addEventListener("beforeprint", () => window.paintPaper());
   window.addEventListener("beforeprint", () => {
     closed = [...document.querySelectorAll("details:not([open])")];
     closed.forEach((one) => { one.open = true; });
     if (!window.Bokeh) return;
-    window.paintPaper();
     for (const view of window.Bokeh.index.roots) {
       const place = view.el.closest(".plot") || view.el.getRootNode().host?.closest(".plot");
       if (!place) continue;
