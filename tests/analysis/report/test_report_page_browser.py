@@ -201,6 +201,37 @@ def test_screens_of_all_kinds(browser: Any, tmp_path: Path) -> None:
     page.close()
 
 
+def test_a_finger_scrolls_the_page(browser: Any, tmp_path: Path) -> None:
+    """Only the frame of the overview is moved by it, until a tool is chosen."""
+    trajectory = _trajectory(3)
+    path = tmp_path / "report.html"
+    write_report(compare(trajectory), trajectory, path)
+    page = browser.new_page(viewport={"width": 390, "height": 800}, has_touch=True, is_mobile=True)
+    page.goto(path.as_uri())
+    page.wait_for_selector("body[data-ready=yes]")
+    actions = page.evaluate(
+        """() => [...Bokeh.index.roots].filter((view) => view.canvas_view).map((view) => [
+            view.model.toolbar.tools.some((tool) => tool.type == "RangeTool"),
+            getComputedStyle(view.canvas_view.shadow_el.querySelector(".bk-events")).touchAction])"""
+    )
+    assert sorted(map(tuple, actions)) == [*[(False, "auto")] * (len(actions) - 1), (True, "pan-y")]
+    page.click("#closer")
+    page.click("#closer")
+    overview = page.locator("#trajectories .plot").first
+    overview.scroll_into_view_if_needed()
+    box = overview.bounding_box()
+    y, middle = box["y"] + 20, box["x"] + 76 + (box["width"] - 90) / 2
+    before = page.evaluate("Bokeh.documents[0].get_model_by_name('time').start")
+    touch = page.context.new_cdp_session(page)
+    for kind, shift in (("touchStart", 0), ("touchMove", 10), ("touchMove", 30), ("touchMove", 50), ("touchEnd", 50)):
+        points = [] if kind == "touchEnd" else [{"x": middle + shift, "y": y}]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    after = page.evaluate("Bokeh.documents[0].get_model_by_name('time').start")
+    assert after > before
+    assert page.evaluate("document.documentElement.scrollWidth <= 390")
+    page.close()
+
+
 def test_trajectories(browser: Any, tmp_path: Path) -> None:
     """Agents are switched on and off, and every part of the run can be seen, with the keyboard alone."""
     trajectory = _trajectory(5, duration=200)

@@ -80,6 +80,16 @@
     }
   }
 
+  // A finger on a figure scrolls the page, until a tool is chosen; sideways it moves the frame of the overview.
+  function leaveScrolling(shown) {
+    for (const one of shown.all_models) if (["BoxZoomTool", "PanTool"].includes(one.type)) one.active = false;
+    for (const view of window.Bokeh.index.roots) {
+      if (view.canvas_view && view.model.toolbar.tools.some((tool) => tool.type === "RangeTool")) {
+        view.canvas_view.touch_action.replace(".bk-events { touch-action: pan-y; }");
+      }
+    }
+  }
+
   function start() {
     const shown = window.Bokeh && window.Bokeh.documents[0];
     if (!shown) return setTimeout(start, 20);
@@ -94,6 +104,7 @@
     });
     choose([]);
     fitWidth(shown);
+    if (window.matchMedia("(pointer: coarse)").matches) leaveScrolling(shown);
     window.addEventListener("resize", () => fitWidth(shown));
     document.body.dataset.started = "yes";
     if (document.getElementById("trajectories")) return;  // its script says when it has drawn
