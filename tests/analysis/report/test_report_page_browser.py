@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Log, chromium
+from PIL import Image
 
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.inference.verdict.pool import compare_pooled
@@ -191,6 +194,21 @@ def test_screens_of_all_kinds(browser: Any, tmp_path: Path) -> None:
             _check(page, log, path)
             shown = page.evaluate("Bokeh.documents[0].get_model_by_name('graphs').data.colour[0]")
             assert shown == (BLUE if scheme == "light" else DARK[BLUE])
+    # On paper, the colours are those for white pages.
+    page.evaluate(
+        """() => window.addEventListener("beforeprint", () => {
+            window.printed = document.querySelector("[aria-label='Active graph over time'] img").src;
+        })"""
+    )
+    page.pdf(format="A4")
+    printed = Image.open(io.BytesIO(base64.b64decode(page.evaluate("window.printed").partition(",")[2]))).convert(
+        "RGBA"
+    )
+    seen = {colour for _, colour in printed.getcolors(printed.width * printed.height)}
+    assert (*bytes.fromhex(BLUE[1:]), 255) in seen
+    assert (*bytes.fromhex(DARK[BLUE][1:]), 255) not in seen
+    assert page.evaluate("Bokeh.documents[0].get_model_by_name('graphs').data.colour[0]") == DARK[BLUE]
+
     page.focus("a")
     reached = set()
     while page.evaluate("document.activeElement !== document.body"):

@@ -131,6 +131,7 @@
     for (const view of window.Bokeh.index.roots) {
       const place = view.el.closest(".plot") || view.el.getRootNode().host?.closest(".plot");
       if (!place) continue;
+      view._actual_paint?.();  // at once: legends are empty until they are painted in new colours
       const canvas = view.export("png", true).canvas;
       const picture = new Image();
       picture.src = canvas.toDataURL();
