@@ -38,7 +38,14 @@ from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.report.documents.comparison_words import TIMES
 from msg_analysis.report.html.plots.accused import NOBODY, Accused
 from msg_analysis.report.html.plots.colours import BLACK, BLUE, GREY, PAGE, SKY, VERMILLION
-from msg_analysis.report.html.plots.plot_style import agent_ticker, mark_agents, name_agents, new_figure, place_legend, plain_legend
+from msg_analysis.report.html.plots.plot_style import (
+    agent_ticker,
+    mark_agents,
+    name_agents,
+    new_figure,
+    place_legend,
+    plain_legend,
+)
 from msg_analysis.types import FloatArray
 
 MOST_LINES = 8  # agents whose convergence is drawn at once

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import pieces, release
+from msg_analysis.common.large_arrays import pieces
 from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.common.text.number_words import counted
 from msg_analysis.model.arithmetic.step_clock import StepClock
@@ -81,7 +81,6 @@ def _late(trajectory: Trajectory) -> Iterable[tuple[int, BoolArray]]:
         first, last = max(piece.start, 1), min(piece.stop, len(made))
         due = np.stack([clock.times(np.arange(first - 1, last - 1)) for clock in clocks], axis=1)
         yield first, made[first:last] - due > experiment.step_length * 1e9
-        release(made)
 
 
 def _missing(trajectory: Trajectory) -> Iterable[tuple[int, BoolArray]]:
