@@ -20,6 +20,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from ament_index_python.packages import get_package_share_directory
 
 PACKAGE = Path(__file__).parents[1]
 
@@ -39,3 +40,13 @@ def test_launch_file(file: Path) -> None:
 def test_parameter_file() -> None:
     document = yaml.safe_load((PACKAGE / "config" / "nodes.yaml").read_text(encoding="utf-8"))
     assert all(set(section) == {"ros__parameters"} for section in document.values())
+
+
+def test_examples() -> None:
+    """The files themselves are installed, not a link that leads nowhere."""
+    installed = Path(get_package_share_directory("msg_agents_bringup")) / "experiments"
+    assert not installed.is_symlink()
+    assert {file.name for file in installed.iterdir()} == {
+        file.name for file in (PACKAGE / "experiments").glob("*.yaml")
+    }
+    assert (installed / "line_ring.yaml").is_file()
