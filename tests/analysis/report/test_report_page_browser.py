@@ -176,11 +176,17 @@ FAINT = """() => {
 }"""
 
 
-def test_screens_of_all_kinds(browser: Any, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def disagrees(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a run that disagrees."""
+    path = tmp_path_factory.mktemp("disagrees") / "report.html"
+    write_report(*_disagreeing(), path)
+    return path
+
+
+def test_screens_of_all_kinds(browser: Any, disagrees: Path) -> None:
     """On large and small screens, light and dark, nothing is cut or faint; the keyboard reaches all controls."""
-    comparison, trajectory = _disagreeing()
-    path = tmp_path / "report.html"
-    write_report(comparison, trajectory, path)
+    path = disagrees
     page, log = _open(browser, path)
     for one in page.locator("details").all():
         one.evaluate("one => one.open = true")
@@ -219,13 +225,10 @@ def test_screens_of_all_kinds(browser: Any, tmp_path: Path) -> None:
     page.close()
 
 
-def test_a_finger_scrolls_the_page(browser: Any, tmp_path: Path) -> None:
+def test_a_finger_scrolls_the_page(browser: Any, disagrees: Path) -> None:
     """Only the frame of the overview is moved by it, until a tool is chosen."""
-    trajectory = _trajectory(3)
-    path = tmp_path / "report.html"
-    write_report(compare(trajectory), trajectory, path)
     page = browser.new_page(viewport={"width": 390, "height": 800}, has_touch=True, is_mobile=True)
-    page.goto(path.as_uri())
+    page.goto(disagrees.as_uri())
     page.wait_for_selector("body[data-ready=yes]")
     actions = page.evaluate(
         """() => [...Bokeh.index.roots].filter((view) => view.canvas_view).map((view) => [
@@ -233,8 +236,8 @@ def test_a_finger_scrolls_the_page(browser: Any, tmp_path: Path) -> None:
             getComputedStyle(view.canvas_view.shadow_el.querySelector(".bk-events")).touchAction])"""
     )
     assert sorted(map(tuple, actions)) == [*[(False, "auto")] * (len(actions) - 1), (True, "pan-y")]
-    page.click("#closer")
-    page.click("#closer")
+    for button in ("#whole", "#closer", "#closer"):
+        page.click(button)
     overview = page.locator("#trajectories .plot").first
     overview.scroll_into_view_if_needed()
     box = overview.bounding_box()
