@@ -22,6 +22,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.model.run.graph_path import Sojourn, sojourns
 from msg_analysis.model.step.step_model import first_graph
 
@@ -73,7 +74,8 @@ class StepRates:
 class Presence:
     """Which agents make no new steps, and since when."""
 
-    def __init__(self) -> None:
+    def __init__(self, names: Sequence[str] | None) -> None:
+        self._names = names
         self._steps: list[int] = []
         self._moved: list[float] = []  # when each made its newest step [s]
         self.gone: set[int] = set()  # agents (from 0) whose process has ended, until a new one makes a step
@@ -88,7 +90,7 @@ class Presence:
             self._steps[agent], self._moved[agent] = steps[agent], now
         returned = sorted(self.gone.intersection(back))
         self.gone = self.gone.difference(back).union(ended)
-        return [f"agent {agent + 1} is back" for agent in returned if agent not in self.gone]
+        return [f"{agent_text(agent + 1, self._names)} is back" for agent in returned if agent not in self.gone]
 
     def ages(self) -> list[float]:
         """Seconds since each agent has made its newest step."""
@@ -156,7 +158,7 @@ class SnapshotSource:
 
     def __init__(self, experiment: ValidExperiment) -> None:
         self._steps = experiment.steps
-        self._sojourns, self._rates, self._presence = SojournFinder(experiment), StepRates(), Presence()
+        self._sojourns, self._rates, self._presence = SojournFinder(experiment), StepRates(), Presence(experiment.names)
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._refused: dict[str, int] = {}
         self._reached = -1
