@@ -384,4 +384,7 @@ def test_every_kind(browser: Any, tmp_path: Path, make: Any, words: list[str]) -
     text = page.inner_text("body")
     for word in words:
         assert word in text
+    page.set_viewport_size({"width": 390, "height": 900})
+    page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    assert page.evaluate(CUT) == []
     page.close()
