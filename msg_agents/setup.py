@@ -39,7 +39,7 @@ setup(
     ],
     python_requires=">=3.11",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "discovery/*.xml", "discovery/fast_dds_3/*.xml", "watching/pages/*.html"]},
+    package_data={PACKAGE: ["py.typed", "discovery/*.xml", "discovery/fast_dds_3/*.xml", "watching/pages/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -207,8 +207,7 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, web: WebServer, host: str, port: int, family: socket.AddressFamily) -> None:
         self.address_family = family
         self.web = web
-        page = resources.files("msg_agents.watching") / "pages" / "live.html"
-        self.page = page.read_bytes()
+        self.page = _whole_page()
         self.names: set[str] | None = None  # allowed in the Host header; None: any
         # When they were made [s]; None once their request has arrived
         self._connections: dict[socket.socket, float | None] = {}
@@ -258,6 +257,15 @@ class _Server(ThreadingHTTPServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore browsers that disconnect."""
+
+
+def _whole_page() -> bytes:
+    """The page with its style and its script in it."""
+    pages = resources.files("msg_agents.watching") / "pages"
+    page = (pages / "live.html").read_bytes()
+    for name in ("live.css", "live.js"):
+        page = page.replace(f"{{{name}}}".encode(), b"\n" + (pages / name).read_bytes())
+    return page
 
 
 def _hang_up(connection: socket.socket) -> None:
