@@ -16,6 +16,37 @@ ARGUMENTS = (
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 NO_CHROMIUM = "no Chromium: install it (Debian: apt-get install chromium)"
 WAIT = 60_000  # ms
+# Elements that the window cuts at its left or right; tables may scroll within their own boxes.
+CUT = """() => [...document.querySelectorAll("body *")].filter((one) => {
+    const box = one.getBoundingClientRect();
+    return box.width > 0 && !one.closest(".hidden") && (box.left < -0.5 || box.right > innerWidth + 0.5);
+}).map((one) => one.outerHTML.slice(0, 200))"""
+# Texts whose contrast to their background is below that of WCAG 2.2, level AA.
+FAINT = """() => {
+    const numbers = (colour) => (colour.match(/[0-9.]+/g) || []).map(Number);
+    const part = (value) => (value <= 0.04045 * 255 ? value / 255 / 12.92 : ((value / 255 + 0.055) / 1.055) ** 2.4);
+    const light = ([r, g, b]) => 0.2126 * part(r) + 0.7152 * part(g) + 0.0722 * part(b);
+    const behind = (one) => {
+        for (let place = one; place; place = place.parentElement) {
+            const found = numbers(getComputedStyle(place).backgroundColor);
+            if (found.length === 3 || found[3] === 1) return found;
+        }
+        return [255, 255, 255];
+    };
+    const faint = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+    for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+        const one = node.parentElement, style = getComputedStyle(one);
+        const unseen = one.closest("script, style, option, .hidden, .bk-Root");
+        if (!node.data.trim() || !one.checkVisibility() || unseen) continue;
+        const colour = numbers(one.closest("svg") ? style.fill : style.color);
+        const outlined = style.paintOrder.startsWith("stroke") && style.stroke !== "none";
+        const ground = outlined ? numbers(style.stroke) : behind(one);
+        const [high, low] = [light(colour), light(ground)].sort((a, b) => b - a);
+        const size = parseFloat(style.fontSize), large = size >= 24 || (size >= 18.66 && style.fontWeight >= 700);
+        if ((high + 0.05) / (low + 0.05) < (large ? 3 : 4.5)) faint.push([node.data.trim(), colour.join()]);
+    }
+    return faint;
+}"""
 
 
 class Log:

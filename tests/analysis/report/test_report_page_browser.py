@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import Log, chromium
+from browser import CUT, FAINT, Log, chromium
 from PIL import Image
 
 from msg_analysis.inference.verdict.compare import compare
@@ -145,35 +145,6 @@ def test_agents_by_name(browser: Any, tmp_path: Path) -> None:
     assert page.locator("main b, svg b", has_text="Ulm").count() == 0
     assert log.complaints == []
     page.close()
-
-
-CUT = """() => [...document.querySelectorAll("body *")].filter((one) => {
-    const box = one.getBoundingClientRect();
-    return box.width > 0 && !one.closest(".hidden") && (box.left < -0.5 || box.right > innerWidth + 0.5);
-}).map((one) => one.outerHTML.slice(0, 200))"""
-# Texts whose contrast to their background is below that of WCAG 2.2, level AA.
-FAINT = """() => {
-    const numbers = (colour) => (colour.match(/[0-9.]+/g) || []).map(Number);
-    const part = (value) => (value <= 0.04045 * 255 ? value / 255 / 12.92 : ((value / 255 + 0.055) / 1.055) ** 2.4);
-    const light = ([r, g, b]) => 0.2126 * part(r) + 0.7152 * part(g) + 0.0722 * part(b);
-    const behind = (one) => {
-        for (let place = one; place; place = place.parentElement) {
-            const found = numbers(getComputedStyle(place).backgroundColor);
-            if (found.length === 3 || found[3] === 1) return found;
-        }
-        return [255, 255, 255];
-    };
-    const faint = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
-    for (let node = walker.nextNode(); node; node = walker.nextNode()) {
-        const one = node.parentElement, style = getComputedStyle(one);
-        if (!node.data.trim() || !one.checkVisibility() || one.closest("script, style, .hidden, .bk-Root")) continue;
-        const colour = numbers(one.closest("svg") ? style.fill : style.color);
-        const [high, low] = [light(colour), light(behind(one))].sort((a, b) => b - a);
-        const size = parseFloat(style.fontSize), large = size >= 24 || (size >= 18.66 && style.fontWeight >= 700);
-        if ((high + 0.05) / (low + 0.05) < (large ? 3 : 4.5)) faint.push([node.data.trim(), colour.join()]);
-    }
-    return faint;
-}"""
 
 
 @pytest.fixture(scope="module")

@@ -161,7 +161,7 @@ function show(data) {
     const step = data.steps.length ? data.steps[agent] : null;
     const age = data.ages.length && step !== null && step >= 0 ? data.ages[agent] : null;
     const fresh = gone.has(agent) ? "gone" : age === null ? null : finished(agent) ? "done" : away(agent) ? `${age.toFixed(1)} s ago` : "now";
-    const cells = { step: step !== null && step >= 0 ? step : null, "last step": fresh, value: data.values ? number(data.values[agent]) : null,
+    const cells = { step: step !== null && step >= 0 ? step : null, "last step": fresh, value: data.values ? number(data.values[agent], 3) : null,
       late: millis(data.lateness ? data.lateness[agent] : null), error: node ? number(node.measured) + (half === null ? "" : ` ± ${number(half, 2)}`) : null, predicted: node ? number(node.predicted) : null, z: node ? signed(node.z) : null };
     columns().slice(1).forEach((name, place) => { row.cells[place + 1].textContent = cells[name] === null || cells[name] === undefined ? "–" : cells[name]; });
     row.classList.toggle("far", Boolean(node && Math.abs(node.z) > 4));
