@@ -24,7 +24,7 @@ LINE_RING = ROOT / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
 def test_what_the_page_says(tmp_path: Path) -> None:
     """In a process of its own, as a reader's script is; the run agrees with probability 0.99, and its seed is fixed."""
     page = (ROOT / "docs/python.md").read_text(encoding="utf-8")
-    _, code = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    _, code, *_ = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     text = LINE_RING.read_text()
     (tmp_path / "line_ring.yaml").write_text(re.sub(r"duration: \S+", "duration: 20", text))
     (tmp_path / "runs").mkdir()

@@ -194,7 +194,7 @@ def run(
     changes = {"seed": seed, "duration": duration, "pace": pace, "speed": speed, "processes": processes}
     what = load_with_overrides(experiment, changes)
     with page(web, web_host) as served:
-        with RunView(what, served) as view:
+        with RunView(what, served, tells_domain=not as_json) as view:
             if served is not None:
                 announce(served, web_host, view.note)
             result = run_network(

@@ -43,10 +43,10 @@ LINES = 10.0  # s between two lines where there is no terminal
 class RunView(View):
     """Shows a run in all these ways; a context."""
 
-    def __init__(self, experiment: ValidExperiment, web: WebServer | None = None) -> None:
+    def __init__(self, experiment: ValidExperiment, web: WebServer | None = None, *, tells_domain: bool = True) -> None:
         from msg_analysis.common.text.safe_console import SafeConsole
 
-        self._experiment = experiment
+        self._experiment, self._tells_domain = experiment, tells_domain
         self._console = SafeConsole(stderr=True)
         self.display = Display(self._console, web, panel=self._console.is_terminal, transient=True)
         self._source = SnapshotSource(experiment)
@@ -77,7 +77,8 @@ class RunView(View):
 
     def joined(self, domain: int) -> None:
         """Say where the run is, for whoever wants to watch it."""
-        self.note(f"ROS_DOMAIN_ID {domain}: to watch the run, msg-agents live --domain {domain}")
+        if self._tells_domain:
+            self.note(f"ROS_DOMAIN_ID {domain}: to watch the run, msg-agents live --domain {domain}")
 
     def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
         """Follow the run: its processes have been started. Without ``checkpoints`` its errors are not followed."""
