@@ -13,7 +13,7 @@ import click
 import pytest
 import yaml
 from click.testing import CliRunner
-from pages import EXPERIMENTS, PAGES, ROOT, Shown, blocks, console, experiments, missing, typed
+from pages import EXPERIMENTS, PAGES, PRINTING, ROOT, Shown, blocks, console, experiments, missing, typed
 
 from msg_agents.cli.main import main as agents
 from msg_analysis.api import Experiment
@@ -23,7 +23,6 @@ from msg_analysis.twin.simulate import simulate
 
 PROGRAMS: dict[str, click.Group] = {"msg-agents": agents, "msg-analysis": analysis}
 NEEDS_NETWORK = ("msg-agents check", "msg-analysis compare runs/loud")  # shown by tests/integration/test_docs.py
-PRINTING = [page for page in PAGES if page.stem in {"README", "index", "quickstart", "tutorial", "examples", "leaders"}]
 
 
 def name(page: Path) -> str:
@@ -144,12 +143,13 @@ def test_what_is_printed(page: Path, shown: Shown, workplace: Path) -> None:
     assert missing(shown.lines, output) == []
 
 
-@pytest.mark.parametrize("name", ["quickstart", "leaders", "messages", "python"])
+@pytest.mark.parametrize("name", ["quickstart", "leaders", "messages", "python", "commands"])
 def test_python_runs(name: str, workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With a short bag of the name that the page gives to it, and one to salvage."""
+    """With a short bag of the name that the page gives to it, one to salvage, and tables of it."""
     printed("msg-analysis simulate line_ring.yaml --duration 10 --out line_ring_twin")
     shutil.copytree("line_ring_twin", "torn_bag")
+    printed("msg-analysis export line_ring_twin --parquet --out line_ring_export")
     for block in blocks(ROOT / f"docs/{name}.md", "python"):
         if "import conclude, run_network" not in block:  # tests/integration/test_python.py runs that
             exec(compile(block, name, "exec"), {})
-    assert ("agrees" in capsys.readouterr().out) == (name != "leaders")
+    assert ("agrees" in capsys.readouterr().out) == (name not in {"leaders", "commands"})

@@ -12,7 +12,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 from browser import Log, chromium
-from pages import ROOT
+from pages import EXPERIMENTS, ROOT, blocks
 
 LOADS = {"img": "src", "script": "src", "iframe": "src", "source": "src", "link": "href"}
 
@@ -89,6 +89,51 @@ def test_equations_are_drawn(site: Path) -> None:
         text = page.read_text(encoding="utf-8")
         assert "arithmatex" not in text
         assert "$$" not in text
+
+
+def test_graphs_of_the_examples(site: Path) -> None:
+    """In the table and below the headings; two examples have the graphs of those beside them."""
+    text = (site / "examples.html").read_text(encoding="utf-8")
+    assert "<!-- graphs" not in text
+    named = re.findall(r"<!-- graphs: (\w+) -->", (ROOT / "docs/examples.md").read_text(encoding="utf-8"))
+    assert {file.stem for file in EXPERIMENTS.glob("*.yaml")} - set(named) == {"fast_switching", "most_certain"}
+    assert all(named.count(name) == 2 for name in named)
+    drawn = re.findall(r'<svg [^>]*aria-label="(\w+): (\d+) links".*?</svg><figcaption>(\w+)</figcaption>', text)
+    assert drawn.count(("line", "4", "line")) == drawn.count(("ring", "5", "ring")) == 6
+    assert drawn.count(("square", "180", "square")) == 2  # 10 times 10: 2 times 10 times 9
+    colours = (site / "assets/graph_colours.css").read_text(encoding="utf-8")
+    assert all(colours.count(f"{used}:") == 2 for used in set(re.findall(r"--graph-\d", text)))  # light and dark
+
+
+def test_example_report(site: Path) -> None:
+    """In its page and in its own tab: by the commands of the page, in its scheme, drawn without a complaint."""
+    report = site / "reports/line_ring.html"
+    commands = next(blocks(ROOT / "docs/example_report.md", "sh")).splitlines()
+    assert f"<code>{' &amp;&amp; '.join(commands)}</code>" in report.read_text(encoding="utf-8")
+    with chromium() as browser:
+        page = browser.new_page(
+            viewport={"width": 1280, "height": 900}, color_scheme="null"
+        )  # not emulated, as that wins in frames
+        log = Log(page)
+        page.goto((site / "example_report.html").as_uri())
+        page.locator("iframe.report").scroll_into_view_if_needed()
+        inside = page.frame_locator("iframe.report")
+        inside.locator("body[data-ready=yes]").wait_for()
+        assert inside.locator(".verdict strong").inner_text() == "✓ The run agrees with the prediction."
+        assert inside.locator(".plot canvas").count() > 5
+        page.locator("label[for=__palette_1]").click()
+        follows = """() => new Promise((done) => {
+            const dark = matchMedia("(prefers-color-scheme: dark)");
+            dark.matches ? done(true) : dark.addEventListener("change", () => done(dark.matches));
+        })"""
+        assert inside.locator("body").evaluate(follows)
+        with page.expect_popup() as opened:
+            page.locator("a.md-button").click()
+        alone = opened.value
+        alone.wait_for_selector("body[data-ready=yes]")
+        assert alone.url == report.as_uri()
+    assert [url for url in log.requests if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
+    assert log.complaints == []
 
 
 def test_in_a_browser(site: Path, pages: dict[Path, Links]) -> None:

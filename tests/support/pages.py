@@ -12,6 +12,8 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PRINTING = [page for page in PAGES if page.stem in {"README", "index", "quickstart", "tutorial", "examples", "leaders"}]
+"""Pages whose terminals are compared with what the commands print."""
 EXPERIMENTS = ROOT / "analysis/msg_analysis/examples/experiments"
 FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^\n)((?:^ {4,}\S.*\n|^\n(?= {4}))+)", re.MULTILINE)

@@ -95,6 +95,8 @@ def render(
     strangers: Sequence[Mapping[str, Any]] = (),  # refused messages: node, topic, reason, count
     events: Sequence[Mapping[str, Any]] = (),  # of processes and refused messages: kind, step, node, words
     wall_time: float | None = None,  # [s] that the run took, if known
+    host: str | None = None,  # where the report is written and by which command; None: here, and by this one
+    command: str | None = None,
 ) -> str:
     """The report as HTML text."""
     document = comparison.to_json()
@@ -163,7 +165,7 @@ def render(
         graph_facts=graph_facts(experiment),
         chain=network_drawings.chain_drawing(experiment, accused),
         yaml=yaml.safe_dump(experiment.to_document(), sort_keys=False, allow_unicode=True, default_flow_style=None),
-        host=platform.node() or "unnamed host",
+        host=host or platform.node() or "unnamed host",
         tests=[
             test | {"name": with_names(test["name"], experiment.names)}
             for test in document["tests"]
@@ -174,7 +176,7 @@ def render(
         nodes_open=experiment.agents <= _OPEN_TABLE,
         names=names,
         transitions=document["switching"]["counts"] is not None and 1 < len(names) <= _SMALL_CHAIN,
-        command=shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        command=command or shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         written=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
 
