@@ -301,7 +301,7 @@ def test_salvage_of_nothing(bag: Path, tmp_path: Path) -> None:
         result = call("salvage", path, tmp_path / "out")
         assert (result.exit_code, result.stdout) == (2, "")
         assert reason in result.stderr
-        assert {file.name for file in tmp_path.iterdir()} == {"head.mcap", "text"}
+        assert {file.name for file in tmp_path.iterdir()} == {"head.mcap"}
 
 
 def test_schema_is_the_committed_file() -> None:

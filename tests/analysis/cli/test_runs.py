@@ -64,7 +64,8 @@ def test_runs() -> None:
     assert len(wide) == len(narrow)  # a line for each run, with what there is room for
     assert {"predicted", "z"} < set(wide[2].split())
     assert not {"predicted", "z"} & set(narrow[2].split())
-    assert any("pair_20261128_120000" in line and "2026-11-28 12:00" in line and "agrees" in line for line in narrow)
+    for name, lines in (("pair_20261128_120000", wide), ("pair_…120000", narrow)):
+        assert any(name in line and "2026-11-28 12:00" in line and "agrees" in line for line in lines)
     assert "none of 3 runs" in invoke("runs", "--seed", "9").stdout
     document = json.loads(invoke("runs", "--verdict", "agrees", "--json").stdout)
     assert (document["folder"], document["total"]) == ("runs", 3)

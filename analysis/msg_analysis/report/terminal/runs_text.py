@@ -31,6 +31,7 @@ from msg_analysis.runs.run_list import RunEntry
 _STYLES = {"agrees": "green", "disagrees": "bold red", "incomplete": "yellow"}
 
 
+_LEAST_NAME = 12  # characters of a folder's name that are shown
 _OPTIONAL = ("predicted", "z", "± (95 %)")  # left out in this order where the terminal is too narrow
 
 
@@ -54,13 +55,15 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
         ]
         for run in runs
     ]
-    columns = dict(zip(heads, zip(*rows, strict=True), strict=True))
+    columns: dict[str, Sequence[str]] = dict(zip(heads, zip(*rows, strict=True), strict=True))
     if all(Path(run.folder).name.startswith(f"{run.name}_{run.date:%Y%m%d_%H%M}") for run in runs):
         del columns["experiment"], columns["date"]  # the names of the folders have them
     columns = {head: cells for head, cells in columns.items() if set(cells) != {"-"}}
     for head in _OPTIONAL:
         if _width(columns) > console.width:
             columns.pop(head, None)
+    room = console.width - _width(columns) + _widest(columns["run"])
+    columns["run"] = [_cut(name, max(room, _LEAST_NAME)) for name in columns["run"]]
     table = number_table(console, f"Runs in {folder}", *columns)
     for run, cells in zip(runs, zip(*columns.values(), strict=True), strict=True):
         style = _STYLES.get(run.verdict or "", "dim" if run.verdict is None else "")
@@ -80,4 +83,14 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
 
 
 def _width(columns: Mapping[str, Sequence[str]]) -> int:
-    return 1 + sum(MARGIN + max(map(cell_len, (head, *cells))) for head, cells in columns.items())
+    return 1 + sum(MARGIN + _widest((head, *cells)) for head, cells in columns.items())
+
+
+def _widest(cells: Sequence[str]) -> int:
+    return max(map(cell_len, cells))
+
+
+def _cut(name: str, width: int) -> str:
+    """The name without its middle where it is longer: folders differ at their ends."""
+    left = width // 2 - 1
+    return name if cell_len(name) <= width else f"{name[:left]}…{name[left + 1 - width :]}"
