@@ -46,7 +46,6 @@ TESTED = {  # and where
     r"msg-agents doctor --network": "tests/integration/test_random_networks.py",
     r"msg-agents doctor --qos": "tests/integration/test_qos.py",
     r"msg-analysis sweep (rates|rates_and_loss)\.yaml": "tests/analysis/cli/test_sweep.py",
-    r"msg-analysis predict bad\.yaml": "tests/analysis/cli/test_cli.py",
     r"msg-analysis figures 3": "tests/analysis/paper/test_paper.py",
     r"python docs/cyclone_dds/cyclone_agent\.py": "tests/integration/test_cyclone.py",
     r"\.venv/bin/python benchmarks/errata\.py": "tests/analysis/paper/test_errata.py",
@@ -103,7 +102,19 @@ def test_lists() -> None:
 
 
 DURATION = "20"
-SHOWN = {shown.command: shown.lines for shown in console(ROOT / "docs/commands.md") if " diff " in shown.command}
+SHOWN = {  # what is printed is on the page
+    shown.command: shown.lines
+    for name in ("commands", "experiment")
+    for shown in console(ROOT / f"docs/{name}.md")
+    if shown.command.startswith(("msg-analysis diff ", "msg-analysis predict bad.yaml"))
+}
+BAD = """
+name: bad
+graphs: {line: {path: [1, 2, 3, 4, 5]}, ring: {cycle: [1, 2, 3, 4, 5]}}
+switching: {generator: [[-0.6, 0.5], [0.5, -0.5]]}
+noise: {proces: 1}
+run: {dt: 0.6, duration: 400.3}
+"""
 BAGS = {  # by the seeds of the runs in them
     "1": ["runs/line_ring_1", "runs/line_ring_20261120_093900", "BAG", "bag", "mine", "try", "line_ring_twin"],
     "13": ["runs/line_ring_2", "runs/line_ring_20261120_150900", "BAG2"],
@@ -136,6 +147,7 @@ def test_command_runs(command: str, twins: Path, tmp_path: Path, monkeypatch: py
     monkeypatch.chdir(tmp_path)
     shutil.copytree(EXPERIMENTS, tmp_path, dirs_exist_ok=True)
     (tmp_path / "star_ring.yaml").write_text(experiments(ROOT / "docs/tutorial.md")["star_ring"])
+    (tmp_path / "bad.yaml").write_text(BAD)
     program, *arguments = shlex.split(re.sub(r"--duration \d+", f"--duration {DURATION}", command.partition(" > ")[0]))
     made = [after for word, after in pairwise(arguments) if word == "--out"]
     if arguments[0] != "new":
@@ -148,6 +160,6 @@ def test_command_runs(command: str, twins: Path, tmp_path: Path, monkeypatch: py
         shutil.copy(file, tmp_path)
     arguments = [match for word in arguments for match in ([*map(str, Path().glob(word))] if "*" in word else [word])]
     result = CliRunner().invoke(OURS[program], arguments, prog_name=program)
-    assert result.exit_code == 0, result.output
-    assert result.stdout
-    assert missing(SHOWN.get(command, []), result.stdout) == []
+    assert result.exit_code == (2 if "bad.yaml" in command else 0), result.output
+    assert result.output
+    assert missing(SHOWN.get(command, []), result.output) == []
