@@ -84,8 +84,8 @@ def sweep(
 ) -> None:
     """Predict, simulate or run an experiment at many values of its keys, as described in the file SWEEP.
 
-    Results are kept: after an interruption, the same command continues. Tables (Parquet, CSV, JSON) and a figure are
-    written next to them.
+    Results are kept: after an interruption, the same command continues. Tables (Parquet, CSV, JSON), a figure and
+    an interactive page are written next to them.
 
     Exit code 0: success, 1: some run disagrees with its prediction, all runs judged together, 3: some point has no
     result.
@@ -106,7 +106,8 @@ def sweep(
 
         plan = load_sweep(sweep_file, checked)
     from msg_analysis.report.figures.sweep_figure import write_figure
-    from msg_analysis.report.terminal.sweep_text import describe_sweep, print_sweep
+    from msg_analysis.report.html.sweep_page import write_sweep_page
+    from msg_analysis.report.terminal.sweep_text import describe_sweep, print_sweep, summary
     from msg_analysis.sweep.conduct import judge_sweep
     from msg_analysis.sweep.figure_series import picture
     from msg_analysis.sweep.jobs.network_run import options
@@ -134,6 +135,7 @@ def sweep(
             files = write_tables(rows, document, directory)
             shown = picture(plan, rows, column)
             files += write_figure(shown, f"{plan.name}: {plan.kind}", directory)
+            files.append(write_sweep_page(plan, rows, column, summary(document), judgement.verdict, directory))
         except OSError as error:
             raise InputError(f"{error.filename or directory}: cannot be written: {error.strerror}") from error
     if as_json:

@@ -27,6 +27,7 @@ from typing import Any
 from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.problems import show
+from msg_analysis.sweep.axis_names import key_words
 from msg_analysis.sweep.plan import Sweep
 from msg_analysis.sweep.table import Row, column_names, is_number
 
@@ -43,14 +44,25 @@ class Place:
     high: float | None
     predicted: float | None  # mean of the exact expectations of what is measured
     reference: float | None  # of a predicted value: the same in continuous time
+    reason: str | None = None  # why there is no value
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
     """Places along the axis."""
 
-    label: str  # values of the other keys, in words; empty where there are none
+    values: tuple[tuple[str, Any], ...]  # of the other keys that have several
     places: tuple[Place, ...]  # in the order of the axis
+
+    @property
+    def label(self) -> str:
+        """Keys and values; empty where there are none."""
+        return ", ".join(f"{key} = {value_text(value)}" for key, value in self.values)
+
+    @property
+    def words(self) -> str:
+        """The same with the keys in words."""
+        return ", ".join(f"{key_words(key)} = {value_text(value)}" for key, value in self.values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +75,22 @@ class Picture:
     measured: bool  # whether there are intervals
     series: tuple[Series, ...]  # one for each combination of values of the other keys
 
+    @property
+    def numeric(self) -> bool:
+        """Whether all values along the axis are numbers."""
+        return all(is_number(place.x) for series in self.series for place in series.places)
 
-def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None) -> Picture:
+
+def several_values(sweep: Sweep) -> list[str]:
+    """The keys with several values, in the order of the file."""
+    return [key for key, values in sweep.spec.over.items() if len(values) > 1]
+
+
+def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None, along: str | None = None) -> Picture:
     """Choose what to draw of ``rows_of``; InputError where there is no such column of numbers.
 
-    ``column`` may be the beginning of a name: ``system_error`` stands for what is measured or predicted of it.
+    ``along``: the key along the axis, by default the first one with several values. ``column`` may be the beginning of
+    a name: ``system_error`` stands for what is measured or predicted of it.
     """
     wanted = column or DEFAULT_COLUMN
     names = _columns(rows, wanted)
@@ -76,15 +99,18 @@ def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None) -> Pic
             names["value"] = wanted
         else:
             raise InputError(f"--column {wanted}: not a column of numbers: expected one of {_offer(rows)}")
-    along = next((key for key, values in sweep.spec.over.items() if len(values) > 1), sweep.keys[0])
-    others = [key for key in sweep.keys if key != along] if sweep.spec.combine == "grid" else []
-    groups: dict[str, dict[str, list[Row]]] = {}
+    several = several_values(sweep)
+    along = along or next(iter(several), sweep.keys[0])
+    others = [key for key in several if key != along] if sweep.spec.combine == "grid" else []
+    groups: dict[tuple[str, ...], dict[str, list[Row]]] = {}
+    values: dict[tuple[str, ...], tuple[tuple[str, Any], ...]] = {}
     for row in rows:
-        label = ", ".join(f"{key} = {value_text(row[key])}" for key in others if len(sweep.spec.over[key]) > 1)
-        groups.setdefault(label, {}).setdefault(show(row[along]), []).append(row)
+        group = tuple(show(row[key]) for key in others)
+        values.setdefault(group, tuple((key, row[key]) for key in others))
+        groups.setdefault(group, {}).setdefault(show(row[along]), []).append(row)
     found = tuple(
-        Series(label, tuple(_place(along, rows_here, names) for rows_here in places.values()))
-        for label, places in groups.items()
+        Series(values[group], tuple(_place(along, rows_here, names) for rows_here in places.values()))
+        for group, places in groups.items()
     )
     return Picture(along, wanted, _logarithmic(sweep, along), names["error"] is not None, found)
 
@@ -131,6 +157,7 @@ def _place(along: str, rows: Sequence[Row], names: Mapping[str, str | None]) -> 
         high=None if value is None or half is None else value + half,
         predicted=_mean(rows, names["predicted"]),
         reference=_mean(rows, names["reference"]),
+        reason=next((row["reason"] for row in rows if row.get("reason")), None) if value is None else None,
     )
 
 

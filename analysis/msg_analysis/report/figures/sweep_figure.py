@@ -30,8 +30,11 @@ from msg_analysis.common.files import write_whole
 from msg_analysis.model.experiment.problems import show
 from msg_analysis.report.figures.matplotlib_style import STYLE, plain, rendered
 from msg_analysis.report.figures.palette import BLACK, DARK_GREY, MODE_COLOURS
+from msg_analysis.report.figures.sideways import shifted
+from msg_analysis.sweep.axis_names import axis_name, column_words
 from msg_analysis.sweep.figure_series import Picture, Place, Series
 from msg_analysis.theory.prediction import LAW_NAMES
+from msg_analysis.types import FloatArray
 
 FORMATS = ("svg", "png")
 _DPI = 150
@@ -53,34 +56,48 @@ def draw(picture: Picture, title: str) -> Figure:
     figure = Figure(figsize=_SIZE, layout="constrained")
     axes = figure.subplots()
     labels = list(dict.fromkeys(show(place.x) for series in picture.series for place in series.places))
-    numbers = all(_is_number(place.x) for series in picture.series for place in series.places)
-    colours = _colours(len(picture.series))
-    for number, (series, colour) in enumerate(zip(picture.series, colours, strict=True)):
-        x = np.array([float(place.x) if numbers else labels.index(show(place.x)) for place in series.places])
-        _draw_series(axes, picture, series, x, colour, _MARKERS[number % len(_MARKERS)])
+    numbers = picture.numeric
+    count = len(picture.series)
+    colours = _colours(count)
+    along = [
+        np.array([float(place.x) if numbers else labels.index(show(place.x)) for place in series.places])
+        for series in picture.series
+    ]
+    every, logarithmic = np.concatenate(along), numbers and picture.logarithmic
+    for number, (series, x, colour) in enumerate(zip(picture.series, along, colours, strict=True)):
+        beside = shifted(x, every, number, count, logarithmic=logarithmic)
+        _draw_series(axes, picture, series, x, beside, colour, _MARKERS[number % len(_MARKERS)])
     if not numbers:
         axes.set_xticks(range(len(labels)), [plain(label) for label in labels])
         axes.set_xlim(-0.5, len(labels) - 0.5)
     elif picture.logarithmic:
         axes.set_xscale("log")
     _mark_failures(axes, picture, labels, numbers)
-    axes.set(xlabel=picture.x, ylabel=picture.y)
+    axes.set(xlabel=plain(axis_name(picture.x)), ylabel=plain(column_words(picture.y)))
     axes.set_title(plain(title), loc="left")
     axes.margins(y=0.08)
     _legend(figure, axes, picture, colours)
     return figure
 
 
-def _draw_series(axes: Axes, picture: Picture, series: Series, x: Any, colour: Any, marker: str) -> None:
+def _draw_series(
+    axes: Axes,
+    picture: Picture,
+    series: Series,
+    x: FloatArray,
+    beside: FloatArray,  # the same, shifted sideways for intervals
+    colour: Any,
+    marker: str,
+) -> None:
     order = np.argsort(x, kind="stable")
     values, predicted, reference = (_column(series.places, key)[order] for key in ("value", "predicted", "reference"))
-    x = x[order]
+    x, beside = x[order], beside[order]
     if picture.measured:
         low, high = (_column(series.places, key)[order] for key in ("low", "high"))
         axes.plot(x, predicted, color=colour, lw=1.2, alpha=0.8)
         bars = np.abs(np.array([values - low, high - values]))
         axes.errorbar(
-            x, values, bars, fmt=marker, ms=4.5, color=colour, mec="white", mew=0.5, elinewidth=1.1, capsize=2.5
+            beside, values, bars, fmt=marker, ms=4.5, color=colour, mec="white", mew=0.5, elinewidth=1.1, capsize=2.5
         )
         return
     few = len(x) <= 40
@@ -114,7 +131,7 @@ def _legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[Any]
     if len(picture.series) > 1:
         chosen = np.unique(np.linspace(0, len(picture.series) - 1, _NAMED).round().astype(int))
         handles = [Line2D([], [], color=colours[i], marker=_MARKERS[i % len(_MARKERS)], ms=4.5, lw=1.2) for i in chosen]
-        names = [plain(picture.series[i].label) for i in chosen]
+        names = [plain(picture.series[i].words) for i in chosen]
         axes.legend(handles, names, loc="upper left", bbox_to_anchor=(1.0, 1.02), borderaxespad=0.4)
 
 
@@ -126,7 +143,3 @@ def _colours(count: int) -> list[Any]:
 
 def _column(places: Sequence[Place], key: str) -> Any:
     return np.array([getattr(place, key) for place in places], dtype=float)  # None: nan
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)

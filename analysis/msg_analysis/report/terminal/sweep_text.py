@@ -68,10 +68,11 @@ def print_sweep(sweep: Sweep, document: dict[str, Any], picture: Picture, consol
     for row in [row for row in document["points"] if row.get("verdict") == "disagrees"][:ROWS]:
         why = row.get("blame") or row.get("least")
         console.print(Text(f"point {row['point']} disagrees with its prediction (p = {p_text(row['p_holm'])}): {why}"))
-    console.print(Text(_summary(document)))
+    console.print(Text(summary(document)))
 
 
-def _summary(document: dict[str, Any]) -> str:
+def summary(document: dict[str, Any]) -> str:
+    """How many points, and what came of them; ``document`` of ``describe_sweep``."""
     count = len(document["points"])
     what = {"predict": "predictions", "simulate": "runs simulated", "network": "networks run"}[document["kind"]]
     text = f"{count} {what}"

@@ -44,6 +44,10 @@ HEAT = ("#b35806", "#f1a340", "#f7f7f7", "#998ec3", "#542788")
 """Of matrices, from the lowest to the highest number, with zero in the middle."""
 DARK_HEAT = ("#ffb454", "#8a5a1e", "#1b2029", "#5a4c97", "#b9a8ff")
 
+SCALE = ("#f7f7f7", "#c9bdf0", "#8a78d0")
+"""Of results, from the lowest to the highest; black numbers are read on all of them, and white ones in the dark."""
+DARK_SCALE = ("#1b2029", "#3d3578", "#6450c0")
+
 
 def graph_colour(mode: int) -> str:
     """Colour of a graph, from 0; repeats after eight."""

@@ -29,7 +29,7 @@
         model.data = { ...model.data, ...Object.fromEntries(painted) };
       }
     }
-    if (model.type === "LinearColorMapper" && model.tags.length > 0) {
+    if (/^(Linear|Log)ColorMapper$/.test(model.type) && model.tags.length > 0) {
       const [palette] = model.tags;
       model.tags = [model.palette];
       model.palette = palette;
