@@ -43,6 +43,7 @@ PROGRAMS = {
 }
 PREPARED = (
     "msg_agents.cli.replay",
+    "msg_agents.cli.watching",
     "msg_agents.doctor.examination",
     "msg_agents.nodes.replay.player",
     "msg_agents.nodes.watching.live",

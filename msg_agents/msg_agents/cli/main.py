@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 import click
 
 import msg_agents
-from msg_agents.cli import begin, nodes, replay
+from msg_agents.cli import begin, nodes, replay, watching
 from msg_agents.cli.doctor import doctor
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.web_options import WebCommand, announce, page, web_options
@@ -376,7 +376,7 @@ for _command in (
     nodes.switcher,
     nodes.recorder,
     replay.play,
-    replay.live,
-    replay.markers,
+    watching.live,
+    watching.markers,
 ):
     main.add_command(_command)

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import click
@@ -29,8 +30,9 @@ from msg_agents.nodes.ros.node_parameters import (
     name_of,
     options_of,
 )
-from msg_agents.processes.environment import check_domain, tolerate_warnings
+from msg_agents.processes.environment import LAST_DOMAIN, check_domain, tolerate_warnings
 from msg_agents.processes.lifeline import hold_lock
+from msg_agents.terminal.interruption import exit_on_signals
 from msg_analysis.cli.options import PATH
 
 
@@ -101,3 +103,15 @@ def split_arguments(args: list[str]) -> tuple[list[str], list[str]]:
         ros += ours[start:end]
         ours = ours[:start] + ours[end:]
     return ours, ros
+
+
+domain_option = click.option(
+    "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Overrides ROS_DOMAIN_ID of the environment."
+)
+
+
+def enter(domain: int | None) -> None:
+    """Set the ROS domain, and let SIGTERM and SIGHUP end the process in order."""
+    if domain is not None:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+    exit_on_signals()

@@ -31,7 +31,7 @@ _KEYS = re.compile(rb"\x1b[\[O][A-D]|[^\x1b]", re.DOTALL)
 _NAMES = {b" ": "space", b"s": "step", b"\n": "step"} | {
     b"\x1b" + kind + letter: name
     for kind in (b"[", b"O")
-    for letter, name in ((b"A", "up"), (b"B", "down"), (b"C", "step"))
+    for letter, name in ((b"A", "up"), (b"B", "down"), (b"C", "forward"))
 }
 
 
@@ -86,9 +86,10 @@ class Keyboard:
         self._saved = []
 
     def wait(self, seconds: float) -> list[str]:
-        """Wait at most so many seconds for keys: ``space``, ``step`` (right arrow, s, enter), ``up``, ``down``.
+        """Wait at most so many seconds for keys: ``space``, ``step``, ``forward``, ``up``, ``down``.
 
-        Returns as soon as anything is typed; other keys are left out.
+        ``step`` is s or enter, ``forward`` the right arrow. Other keys are left out. Returns as soon as anything is
+        typed.
         """
         if not self._saved:
             self.listen()  # it may have been started in the background

@@ -56,6 +56,7 @@ ACK_NOTE_DELAY = 5.0  # s for readers to acknowledge the end before a note; the 
 BLOCKED_AFTER = 0.05  # s to publish one message, from which on a reader is holding the player back
 FINAL_BEFORE = 0.05  # s; an error that comes sooner is final: a slow reader blocks for 100 ms
 RATE_STEP = 1.1
+SEEK_SHARE = 0.05  # of the played part, by one key
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,6 +144,7 @@ class Player(LeanNode):
         check_definitions(self, self._writers, bag.topics)
         self._ticker = self.publisher_of(CLOCK) if options.clock else None
         self._time = BagClock(self._first, options.rate, paused=options.paused)
+        self._sought = self._first  # messages of topics that are not latched are left out before this time [ns]
         self._steps = 0  # messages to be played one by one
         self._began = self._shown = self._looked = self._ticked = 0.0
         self._awake = time.monotonic()  # when it was last known not to be stopped
@@ -172,6 +174,7 @@ class Player(LeanNode):
             skip = 0
             if not self._options.loop:
                 break
+            self._sought = self._first
             self._time.jump(self._first)
         self._wait_for_acknowledgements()
 
@@ -208,9 +211,11 @@ class Player(LeanNode):
             if latched and early:
                 early -= 1
                 continue
-            if message.time < self._first and not latched:
+            if message.time < self._sought and not latched:
                 continue
             self._wait_for(message)
+            if message.time < self._sought and not latched:  # a key meanwhile
+                continue
             before = time.monotonic()
             self._send(message)
             took = time.monotonic() - before
@@ -240,7 +245,7 @@ class Player(LeanNode):
 
     def _wait_for(self, message: Message) -> None:
         """Wait until a message is due; handle signals, keyboard, ``/clock`` and progress meanwhile."""
-        while True:
+        while message.time >= self._sought:
             now = time.monotonic()
             wait = self._time.until(message.time)
             if wait <= 0 and now < self._looked + CHECK_PERIOD and (self._ticker is None or now < self._next_tick()):
@@ -286,8 +291,18 @@ class Player(LeanNode):
             elif key == "step":
                 self._time.pause(True, next_time)
                 self._steps += 1
+            elif key == "forward":
+                self._seek(next_time)
             else:
                 self._time.change_rate(RATE_STEP if key == "up" else 1 / RATE_STEP, next_time)
+
+    def _seek(self, next_time: int) -> None:
+        """Go forward by a share of what is played. Latched messages on the way are all published, at once."""
+        if not self.played.begun:
+            return
+        here = max(self._time.now(next_time), self._sought)
+        self._sought = min(here + round(SEEK_SHARE * (self._last - self._first)), self._last)
+        self._time.jump(self._sought)
 
     def _report(self, here: int) -> None:
         played = self.played
