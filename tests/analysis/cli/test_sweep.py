@@ -93,7 +93,7 @@ def test_tables_hold_what_theory_says_and_nothing_is_done_again(tmp_path: Path, 
     assert code == 0, stderr
     document = json.loads(stdout)
     assert (document["done"], document["failed"], document["kept"], document["verdict"]) == (10, 0, 0, None)
-    names = ["results.parquet", "results.csv", "results.json", "figure.svg", "figure.png"]
+    names = ["results.parquet", "results.csv", "results.json", "figure.svg", "figure.png", "sweep.html"]
     assert [Path(name).name for name in document["files"]] == names
     with (out / "results.csv").open() as stream:
         rows = list(csv.DictReader(stream))

@@ -28,6 +28,11 @@ def test_contrast(dark: bool) -> None:
         assert _contrast(seen[colour], page) >= 3.0, colour
 
 
+def test_numbers_are_read_on_the_scale() -> None:
+    for scale, ink in ((colours.SCALE, colours.BLACK), (colours.DARK_SCALE, colours.DARK[colours.BLACK])):
+        assert min(_contrast(colour, ink) for colour in scale) >= 4.5
+
+
 def test_every_colour_has_its_own_in_the_dark() -> None:
     assert len(set(colours.DARK.values())) == len(colours.DARK)
     assert {*colours.LINES, *colours.GRAPHS, colours.INK, colours.GREY, colours.PALE} <= set(colours.DARK)
