@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from browser import Log, chromium
+from browser import CUT, FAINT, Log, chromium
 
 from msg_analysis.report.figures.sideways import shifted
 from msg_analysis.report.html.sweep_page import write_sweep_page
@@ -63,13 +63,17 @@ def test_keys_and_pointer(tmp_path: Path, keys: int) -> None:
             page.check("#along input >> nth=1")
             page.wait_for_selector("[data-name=lines_1_0]")
             assert not page.is_visible("[data-name=lines_0_0]")
+            for width in (390, 1280):
+                page.set_viewport_size({"width": width, "height": 800})
+                assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+                for scheme in ("light", "dark"):
+                    page.emulate_media(color_scheme=scheme)
+                    assert page.evaluate(CUT) == []
+                    assert page.evaluate(FAINT) == []
             page.locator("[data-name=map_0_0]").scroll_into_view_if_needed()
             box = page.locator("[data-name=map_0_0]").bounding_box()
             page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
             page.locator(".bk-Tooltip", has_text="loss of messages").first.wait_for()
-            for width in (390, 1280):
-                page.set_viewport_size({"width": width, "height": 800})
-                assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
             assert "<i>broke</i>" in page.inner_text(".verdict")
         assert log.complaints == []
         assert log.requests == [path.as_uri()]
