@@ -77,7 +77,7 @@ class RunView(View):
 
     def joined(self, domain: int) -> None:
         """Say where the run is, for whoever wants to watch it."""
-        if self._tells_domain:
+        if self._tells_domain or self.display.panel:
             self.note(f"ROS_DOMAIN_ID {domain}: to watch the run, msg-agents live --domain {domain}")
 
     def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
