@@ -67,4 +67,4 @@ def test_the_older_variable_for_this_machine_does_not_reach_the_nodes(
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", value)
     environment = node_environment(0)
     assert "ROS_LOCALHOST_ONLY" not in environment
-    assert environment[OLD].endswith("loopback.xml") or environment[NEW].endswith("loopback.xml")
+    assert environment[NEW].endswith("loopback.xml")
