@@ -150,10 +150,8 @@ def test_page_of_a_run_in_time_and_two_browsers(network: Any, page: Any) -> None
     assert run.returncode == 3
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_page_of_agents_that_stop_and_go(network: Any, page: Any, scheme: str) -> None:
+def test_page_of_agents_that_stop_and_go(network: Any, page: Any) -> None:
     """A stopped agent turns grey and its silence is told; a killed one is an event, and its return. On a phone, too."""
-    page.emulate_media(color_scheme=scheme)
     page.set_viewport_size({"width": 390, "height": 800})
     run = network.start("run", _long(network), "--out", network.directory / "runs", "--web", "0")
     log = _follow(page, _address(run))
@@ -172,8 +170,10 @@ def test_page_of_agents_that_stop_and_go(network: Any, page: Any, scheme: str) -
     page.get_by_role("button", name="agent 2").press("Enter")
     page.locator("#agent-keys [aria-pressed=false]").wait_for()
     assert page.evaluate("document.documentElement.scrollWidth") == 390
-    assert page.evaluate(CUT) == []
-    assert page.evaluate(FAINT) == []
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        assert page.evaluate(CUT) == []
+        assert page.evaluate(FAINT) == []
     run.send_signal(signal.SIGINT)
     page.wait_for_selector("body[data-over=yes]")
     assert log.complaints == []
