@@ -24,7 +24,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 import yaml
 from bokeh.document import Document
@@ -56,6 +55,7 @@ from msg_analysis.report.documents.comparison_words import (
 from msg_analysis.report.documents.explanation import explain, graph_facts
 from msg_analysis.report.html import network_drawings, run_heading
 from msg_analysis.report.html.interval_bars import interval_bars, plus_minus
+from msg_analysis.report.html.page_templates import page_template
 from msg_analysis.report.html.plots import colours, error_plots, switching_plots, trajectory_plots
 from msg_analysis.report.html.plots.accused import Accused
 from msg_analysis.report.html.plots.covariance_plots import covariances
@@ -101,14 +101,7 @@ def render(
     """The report as HTML text."""
     document = comparison.to_json()
     experiment = trajectory.record.experiment
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("msg_analysis.report.html"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"number": _number, "p": _p, "named": _namer(experiment)}
+    filters: dict[str, Callable[..., Any]] = {"number": _number, "p": _p, "named": _namer(experiment)}
     names = [graph.name for graph in experiment.graph_list]
     accused = Accused.of(document["blame"])
     happened, more_events = run_events(trajectory, events)
@@ -119,7 +112,7 @@ def render(
             figures.add_root(model)
     script, divs = components(models)
     timing = document["timing"]
-    return environment.get_template("report.html.j2").render(
+    return page_template("report.html.j2", filters).render(
         document=document,
         title=run_heading.page_title(comparison),
         run_facts=run_heading.run_facts(comparison, wall_time),

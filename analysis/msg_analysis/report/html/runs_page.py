@@ -26,14 +26,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import jinja2
-
 from msg_analysis.bags.record_head import record_document
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.common.text.number_words import half_width_text, number_text, z_text
 from msg_analysis.errors import InputError
 from msg_analysis.inference.verdict.law_identity import flat
+from msg_analysis.report.html.page_templates import page_template
 from msg_analysis.runs.run_list import RunEntry
 
 _LONGEST = 200  # characters of a value; of a longer one also a digest, so that it is seen to differ
@@ -51,18 +50,11 @@ def write_runs_page(runs: Sequence[RunEntry], folder: Path, path: Path) -> None:
 
 def render_runs(runs: Sequence[RunEntry], folder: Path, place: Path) -> str:
     """The page as HTML text; ``place``: the folder it will be in, to which its links are relative."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("msg_analysis.report.html"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     newest_first = sorted(runs, key=lambda run: run.date, reverse=True)
     shared = _Shared()
     rows = [_row(run, place, shared) for run in newest_first]
     words = Counter(run.verdict or run.status for run in runs)
-    return environment.get_template("runs.html.j2").render(
+    return page_template("runs.html.j2").render(
         folder=folder.absolute().name or str(folder),
         rows=rows,
         counts=words.most_common(),

@@ -20,7 +20,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 from bokeh.document import Document
 from bokeh.embed import components
 from bokeh.models import UIElement
@@ -29,6 +28,7 @@ from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text.number_words import half_width_text, number_text
+from msg_analysis.report.html.page_templates import page_template
 from msg_analysis.report.html.plots import colours, sweep_plots
 from msg_analysis.sweep.axis_names import axis_name, column_words, key_words
 from msg_analysis.sweep.figure_series import Picture, picture, several_values, value_text
@@ -53,13 +53,6 @@ def render_sweep(
     verdict: str | None,  # of all runs together; None where nothing is compared
 ) -> str:
     """The page as HTML text."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("msg_analysis.report.html"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     keys = several_values(sweep) or [sweep.keys[0]]
     pictures = {key: picture(sweep, rows, column, key) for key in keys}
     first = pictures[keys[0]]
@@ -72,7 +65,7 @@ def render_sweep(
             figures.add_root(model)
     script, divs = components(models)
     places = [(series, place) for series in first.series for place in series.places]
-    return environment.get_template("sweep.html.j2").render(
+    return page_template("sweep.html.j2").render(
         sweep=sweep,
         column=column_words(first.y),
         measured=first.measured,
