@@ -71,6 +71,11 @@ def states_of(trajectory: Trajectory, agent: int) -> list[list[int]]:
     return [[k, modes[k], zlib.crc32(value.tobytes())] for k, value in enumerate(values)]
 
 
+def once(states: list[list[int]]) -> list[list[int]]:
+    """Without those that came again: on a busy machine an agent that waits for 5 s asks its peers for their states."""
+    return [list(state) for state in dict.fromkeys(map(tuple, states))]
+
+
 @pytest.mark.parametrize("pause", [0.0, 0.001], ids=["fast", "slow"])
 def test_a_reader_that_was_there_first_gets_everything(network: Any, pause: float) -> None:
     """A slow one holds the run back, and nothing is lost."""
@@ -82,7 +87,7 @@ def test_a_reader_that_was_there_first_gets_everything(network: Any, pause: floa
     assert result.strangers == []
     equal_to_the_twin(result.trajectory)
     for agent in range(5):
-        assert found[f"agent_{agent + 1}/state"] == states_of(result.trajectory, agent)
+        assert once(found[f"agent_{agent + 1}/state"]) == states_of(result.trajectory, agent)
     (record,) = found["experiment"]
     assert json.loads(record)["run"] == str(result.trajectory.record.run)
     assert [sequence for sequence, _, _ in found["graph"]] == list(range(len(found["graph"])))
