@@ -69,7 +69,7 @@ def test_a_stopped_agent_is_named(network: Any) -> None:
             monitor.wait()
     assert result["restarts"] == result["strangers"] == []
     ((step, words),) = complaint
-    assert words in (f"step {step} of agent 2", "agents too far behind: 2")
+    assert words in (f"step {step} of agent 2", "too far behind: agent 2")
     assert result["notes"] == []
     assert re.match(rf"note: no step for \d+ s: .*agent_1: at step {step}, waiting for {words}", note)
     assert note.endswith("; no report from agent_2\n")

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -75,12 +76,15 @@ class Moments:
         how they were computed; None for the static baseline
     law
         of the run's steps: "synchronous", or "sequential" in real time; None for other laws
+    names
+        of the agents, for tables; None where they have only numbers
     """
 
     covariance: FloatArray
     by_mode: FloatArray | None = None
     solver: SolverReport | None = None
     law: StepLaw | None = None
+    names: Sequence[str] | None = None
 
     def __repr__(self) -> str:
         return f"<Moments of {len(self.covariance)} agents: system error {self.system_error:.6g}>"
@@ -89,7 +93,7 @@ class Moments:
         errors, certainty = self.node_errors, self.node_certainty
         rows = [("**system**", number_text(self.system_error), number_text(self.system_certainty))]
         shown = range(min(len(errors), SHOWN_AGENTS))
-        rows += [(f"agent {i + 1}", number_text(errors[i]), number_text(certainty[i])) for i in shown]
+        rows += [(agent_text(i + 1, self.names), number_text(errors[i]), number_text(certainty[i])) for i in shown]
         rows += [("...", "", "")] * (len(shown) < len(errors))
         return markdown_table(("", "mean-square error", "certainty"), rows)
 
@@ -195,7 +199,7 @@ class Prediction:
         """
         if self.paper is None or not all(_holds_together(self.experiment, mode) for mode in range(self.step.modes)):
             return None
-        return _static(self.paper)
+        return _static(self.paper, self.experiment.names)
 
     def laws(self) -> dict[str, Moments]:
         """Those moments that there are, by the name that texts give them."""
@@ -268,11 +272,11 @@ def predict(experiment: ValidExperiment, step: StepModel | None = None) -> Predi
         if experiment.time == "continuous" and not experiment.steps_only:
             paper = systems.continuous(experiment)
             exact = MomentSolver(paper)
-            continuous = _moments(exact, exact.steady())
+            continuous = _moments(exact, exact.steady(), experiment.names)
         else:
             paper = systems.emulated(step, experiment.problem)
     solver, steady = _steady(step, build_run_model(experiment, step), experiment.problem)
-    emulated = dataclasses.replace(_moments(solver, steady), law=step_law(experiment))
+    emulated = dataclasses.replace(_moments(solver, steady, experiment.names), law=step_law(experiment))
     return Prediction(experiment, step, solver, steady, emulated, continuous, paper)
 
 
@@ -333,12 +337,12 @@ def _safe_step(step: StepModel) -> float:
     return float(step.dt / pull[:, ~step.grounded].max())
 
 
-def _moments(solver: MomentSolver, steady: FloatArray) -> Moments:
+def _moments(solver: MomentSolver, steady: FloatArray, names: Sequence[str] | None) -> Moments:
     system = solver.system
-    return Moments(system.lifted(steady.sum(axis=0)), system.lifted(steady), solver.report)
+    return Moments(system.lifted(steady.sum(axis=0)), system.lifted(steady), solver.report, names=names)
 
 
-def _static(system: JumpSystem) -> Moments | None:
+def _static(system: JumpSystem, names: Sequence[str] | None) -> Moments | None:
     covariance = np.zeros((len(system.lift), len(system.lift)))
     for mode, share in enumerate(system.stationary):
         alone = systems.held(system, mode)
@@ -346,7 +350,7 @@ def _static(system: JumpSystem) -> Moments | None:
             covariance += share * alone.lifted(MomentSolver(alone).steady()[0])
         except InputError:  # a connected graph whose connection is lost to rounding
             return None
-    return Moments(covariance)
+    return Moments(covariance, names=names)
 
 
 def _holds_together(experiment: ValidExperiment, mode: int) -> bool:

@@ -192,7 +192,7 @@ class Synchronizer(AgentInputs[Value]):
         if missing:
             return f"step {self.step} of " + ", ".join(f"agent {j + 1}" for j in missing)
         if behind := self._behind():
-            return "agents too far behind: " + ", ".join(f"{j + 1}" for j in behind)
+            return "too far behind: " + ", ".join(f"agent {j + 1}" for j in behind)
         return "nothing"
 
     def lacking(self) -> list[int]:

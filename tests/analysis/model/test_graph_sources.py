@@ -220,3 +220,29 @@ def test_files_that_are_not_there_or_not_text(tmp_path: Path) -> None:
 def test_a_graph_with_a_mistake(graphs: dict[str, Any], others: dict[str, Any], words: str) -> None:
     (line,) = mistakes(graphs, **others)
     assert line.startswith(words)
+
+
+def _ring_from(graphml: str) -> dict[str, Any]:
+    return {"name": "good", "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"graphml": graphml}}} | {
+        "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]}
+    }
+
+
+@pytest.mark.parametrize("content", ["not xml", "<xml/>", "<graphml><graph/></graphml>", ""])
+def test_graphml_that_is_none(tmp_path: Path, content: str) -> None:
+    (tmp_path / "net.graphml").write_text(content)
+    with pytest.raises(ExperimentError, match=r"graphs\.ring\.graphml: .*net\.graphml"):
+        ValidExperiment.parse(_ring_from("net.graphml"), directory=tmp_path)
+
+
+def test_graphml_without_an_end() -> None:
+    with pytest.raises(ExperimentError, match=r"graphs\.ring\.graphml: /dev/zero: cannot be read: longer than 64 MB"):
+        ValidExperiment.parse(_ring_from("/dev/zero"))
+
+
+def test_graphml_weights_must_be_positive(tmp_path: Path) -> None:
+    graph = nx.Graph()
+    graph.add_edge(1, 2, weight=-1.0)
+    nx.write_graphml(graph, tmp_path / "net.graphml")
+    with pytest.raises(ExperimentError, match=r"weight -1\.0 of 1 - 2: expected a weight > 0"):
+        ValidExperiment.parse(_ring_from("net.graphml"), directory=tmp_path)

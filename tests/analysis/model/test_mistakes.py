@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -371,28 +370,6 @@ def test_text_names_the_source_and_lists_the_problems() -> None:
 def test_keys_that_are_no_text() -> None:
     with pytest.raises(ExperimentError, match="experiment: key 1: expected a text"):
         ValidExperiment.parse({**GOOD, 1: 2})
-
-
-@pytest.mark.parametrize("content", ["not xml", "<xml/>", "<graphml><graph/></graphml>", ""])
-def test_graphml_that_is_none(tmp_path: Path, content: str) -> None:
-    (tmp_path / "net.graphml").write_text(content)
-    with pytest.raises(ExperimentError, match=r"graphs\.ring\.graphml: .*net\.graphml"):
-        ValidExperiment.parse(changed({"graphs.ring": {"graphml": "net.graphml"}}), directory=tmp_path)
-
-
-def test_graphml_without_an_end() -> None:
-    with pytest.raises(ExperimentError, match=r"graphs\.ring\.graphml: /dev/zero: cannot be read: longer than 64 MB"):
-        ValidExperiment.parse(changed({"graphs.ring": {"graphml": "/dev/zero"}}))
-
-
-def test_graphml_weights_must_be_positive(tmp_path: Path) -> None:
-    import networkx as nx
-
-    graph = nx.Graph()
-    graph.add_edge(1, 2, weight=-1.0)
-    nx.write_graphml(graph, tmp_path / "net.graphml")
-    with pytest.raises(ExperimentError, match=r"weight -1\.0 of 1 - 2: expected a weight > 0"):
-        ValidExperiment.parse(changed({"graphs.ring": {"graphml": "net.graphml"}}), directory=tmp_path)
 
 
 def test_memory_is_compared_with_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:

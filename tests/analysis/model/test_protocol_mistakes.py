@@ -135,6 +135,23 @@ def test_mistakes_of_protocols(kind: Any, expected: str, offer: Callable[..., No
     assert f": protocol mine (pack 1.2), {expected}" in str(caught.value)
 
 
+def test_agents_with_names(offer: Callable[..., None]) -> None:
+    """They are named, not numbered."""
+    names = ["Ulm", "Bonn", "Kiel", "Bad Ems", "Hof"]
+    for kind, expected in (
+        (declares(CLIQUE), "graph line: weights: agent Ulm uses agent Kiel with 0.2, expected 0"),
+        (declares(2 * np.eye(5)), "weights: row of agent Ulm sums to 2"),
+        (type("Many", (EulerSteps,), {"states": 0}), "agent Ulm: states: 0"),
+    ):
+        offer(("mine", kind))
+        with pytest.raises(ExperimentError) as caught:
+            experiment({"name": "mine"}, names=names)
+        assert expected in str(caught.value)
+    offer(("mine", steps(lambda k, state: 1 / (k - 17) + state)))
+    with pytest.raises(InputError, match="agent Kiel, step 17: ZeroDivisionError"):
+        simulate(experiment({"name": "mine"}, names=names))
+
+
 @pytest.mark.parametrize(
     ("step", "expected"),
     [

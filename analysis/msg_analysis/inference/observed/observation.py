@@ -24,6 +24,7 @@ import numpy as np
 
 from msg_analysis.common.large_arrays import BLOCK_NUMBERS, pieces, release
 from msg_analysis.common.long_work import tell
+from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.errors import InputError
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.step_model import StepModel
@@ -144,9 +145,8 @@ def _known_steps(trajectory: Trajectory) -> int:
     unknown = np.argwhere((trajectory.agent_modes[1 : steps + 1] < 0) | (trajectory.made[1 : steps + 1] < 0))
     if len(unknown):
         step, agent = unknown[0].tolist()
-        raise InputError(
-            f"agent {agent + 1}: graph or time of step {step} missing: expected in the log of a run in real time"
-        )
+        named = agent_text(agent + 1, trajectory.record.experiment.names)
+        raise InputError(f"{named}: graph or time of step {step} missing: expected in the log of a run in real time")
     newest = trajectory.used[:steps].max(axis=(1, 2), initial=-1)
     while (beyond := newest[:steps] > steps).any():  # only where the run is not complete
         steps = int(np.argmax(beyond))

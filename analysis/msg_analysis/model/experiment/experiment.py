@@ -171,7 +171,7 @@ class ValidExperiment:
 
     def _with_protocol(self, protocol: ChosenProtocol, recorded: ProtocolInfo | None) -> Self:
         """The same with a protocol that knows its network."""
-        bound, found = protocol_binding.bind(protocol, self._network(), self.run, recorded)
+        bound, found = protocol_binding.bind(protocol, self._network(), self.run, self.names, recorded)
         experiment = replace(self, protocol=bound)
         size = experiment.agents, len(self.graph_list), experiment.steps, experiment.width
         found += memory.memory_problems(*size, 0, experiment.truth)

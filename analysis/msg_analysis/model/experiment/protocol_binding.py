@@ -20,7 +20,7 @@ Whatever a protocol raises or returns wrongly becomes an error that names the pr
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
+from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.problems import problem, show, translate
 from msg_analysis.model.experiment.validation import wrong_sums
@@ -88,6 +89,7 @@ class ChosenProtocol:
     parameters: BaseModel | None = None  # None if ``absent``
     absent: str | None = None  # why it cannot be used here, for messages; None if it can
     network: Network | None = field(default=None, repr=False)  # set by ``bind``
+    names: Sequence[str] | None = field(default=None, repr=False)  # of the agents, for messages; set by ``bind``
 
     @property
     def linear(self) -> bool:
@@ -141,11 +143,12 @@ class ChosenProtocol:
         if deaf.any():
             i, j = (int(index) + 1 for index in np.argwhere(deaf)[0])
             raise ProtocolError(
-                f"{self.info}, {where}: weights: agent {i} uses agent {j} with {weights[i - 1, j - 1]:g}, expected 0, "
-                "since it does not hear it in this graph"
+                f"{self.info}, {where}: weights: {agent_text(i, self.names)} uses {agent_text(j, self.names)} with "
+                f"{weights[i - 1, j - 1]:g}, expected 0, since it does not hear it in this graph"
             )
         for i, total in wrong_sums(weights, 1.0):
-            raise ProtocolError(f"{self.info}, {where}: weights: row of agent {i + 1} sums to {total:.12g}, expected 1")
+            row = f"row of {agent_text(i + 1, self.names)}"
+            raise ProtocolError(f"{self.info}, {where}: weights: {row} sums to {total:.12g}, expected 1")
 
     def guard(self, where: str, call: Callable[[], Result]) -> Result:
         """The result of a call of the protocol's code; what it raises becomes a ProtocolError that says ``where``.
@@ -192,7 +195,7 @@ class AgentProtocol:
     def __init__(self, chosen: ChosenProtocol, agent: int) -> None:
         if chosen.absent or chosen.network is None:
             raise InputError(chosen.absent or "")
-        self._guard, self._agent = chosen.guard, f"agent {agent + 1}"
+        self._guard, self._agent = chosen.guard, agent_text(agent + 1, chosen.names)
         kind, network, parameters = chosen.kind, chosen.network, chosen.parameters
         made = chosen.guard(self._agent, lambda: kind(network, parameters, agent))  # type: ignore[misc,call-arg]
         assert isinstance(made, Protocol)
@@ -301,12 +304,16 @@ def _package(point: EntryPoint) -> str:
 
 
 def bind(
-    chosen: ChosenProtocol, network: Network, run: RunSpec, recorded: ProtocolInfo | None = None
+    chosen: ChosenProtocol,
+    network: Network,
+    run: RunSpec,
+    names: Sequence[str] | None = None,  # of the agents
+    recorded: ProtocolInfo | None = None,  # as in ``find``
 ) -> tuple[ChosenProtocol, list[str]]:
-    """The same protocol with its network, and what does not fit together; ``recorded`` as in ``find``."""
+    """The same protocol with its network, and what does not fit together."""
     if chosen.absent:
         return chosen, []
-    bound, found = _bind(chosen, network, run)
+    bound, found = _bind(replace(chosen, names=names), network, run)
     if recorded is None:
         return bound, found
     if found:

@@ -29,7 +29,7 @@ import numpy as np
 import scipy.sparse.csgraph
 
 from msg_analysis.common.blas_threads import few_blas_threads
-from msg_analysis.common.text.agent_names import agent_name
+from msg_analysis.common.text.agent_names import agent_name, with_names
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import InputError
@@ -308,7 +308,7 @@ def select_leaders(
     problem = LeaderProblem(experiment, resolve_law(experiment, law), gain)
     sets = math.comb(experiment.agents, count)
     chosen_method = method if method != "auto" else "exhaustive" if sets <= AUTO_SETS else "swap"
-    search = LeaderSearch(problem, watch)
+    search = LeaderSearch(problem, lambda stage, *rest: watch(with_names(stage, experiment.names), *rest))
     order: list[int] = []
     bound: float | None = None
     if chosen_method == "exhaustive":
