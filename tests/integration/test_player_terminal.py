@@ -77,6 +77,32 @@ def test_forward(network: Any, twin_bag: Path, plain: Any, terminal: Any) -> Non
     assert contents(file) == {"/agent_3/state": recorded["/agent_3/state"][45:], "/graph": recorded["/graph"]}
 
 
+def test_to_a_typed_time(network: Any, twin_bag: Path, plain: Any, terminal: Any) -> None:
+    """Forward only; what is no time, or before or past what is left, is said, and nothing happens."""
+    recorded = contents(mcap(twin_bag))
+    file = network.directory / "plain.mcap"
+    first = plain(file, {"/agent_3/state": 301 - 250, "/graph": len(recorded["/graph"])})
+    screen = terminal(
+        *(PROGRAM, "play", twin_bag, "--paused", "--rate", "max", "--await", "plain"),
+        *("--topics", "/agent_3/state", "--topics", "/graph"),
+    )
+    screen.wait_for("paused")
+    for typed, said in (
+        (b"1.2.5\n", "1.2.5: expected a time in seconds"),
+        (b"150\n", "150 s: expected a time up to 15 s"),
+        (b"12.7\x7f5", "go to 12.5 s"),
+        (b"\n", "12.5/15.0 s"),
+        (b"3\n", "3 s: there is no way back from 12.5 s: start again with --start-offset 3"),
+    ):
+        screen.type(typed)
+        screen.wait_for(said)
+    screen.type(b" ")
+    assert first.wait(timeout=60) == 0
+    screen.wait_for("messages played")
+    assert screen.process.wait(timeout=30) == 0
+    assert contents(file) == {"/agent_3/state": recorded["/agent_3/state"][250:], "/graph": recorded["/graph"]}
+
+
 def test_the_terminal_is_left_as_it_was(twin_bag: Path, terminal: Any) -> None:
     """Whatever ends the player; the bag alone never does."""
     screens = {

@@ -150,8 +150,8 @@ def play(
 
     No message is lost: the player waits for slow readers.
 
-    On a terminal, space pauses and continues, s plays one message, the right arrow goes forward by 5 %, up and down
-    change the rate.
+    On a terminal, space pauses and continues, s plays one message, the right arrow goes forward by 5 %, a number and
+    enter to that time in seconds, up and down change the rate.
     """
     from msg_agents.nodes.replay.player import PlayOptions
     from msg_agents.nodes.replay.player import play as play_bag
@@ -188,7 +188,7 @@ def play(
         print_json({"messages": played.messages, "seconds": played.seconds, "held_back": played.held_back})
 
 
-KEYS = "space: pause  s: one message  right: 5 % forward  up, down: rate"
+KEYS = "space: pause  s: one message  right: 5 % forward  number, enter: to that time  up, down: rate"
 
 
 class PlayBar:
@@ -243,6 +243,8 @@ class PlayBar:
         state = f"{played.now:.1f}/{played.length:.1f} s  {pace}{', paused' if played.paused else ''}"
         if not played.begun:
             state = "waiting for readers"
+        elif played.typed:
+            state += f"  go to {played.typed} s"
         self._progress.update(self._task, completed=played.now, total=played.length, state=state, refresh=True)
 
     def note(self, line: str) -> None:

@@ -28,11 +28,12 @@ from types import TracebackType
 from typing import Any, Self
 
 _KEYS = re.compile(rb"\x1b[\[O][A-D]|[^\x1b]", re.DOTALL)
-_NAMES = {b" ": "space", b"s": "step", b"\n": "step"} | {
+_NAMES = {b" ": "space", b"s": "step", b"\n": "enter", b"\x7f": "back", b"\b": "back"} | {
     b"\x1b" + kind + letter: name
     for kind in (b"[", b"O")
     for letter, name in ((b"A", "up"), (b"B", "down"), (b"C", "forward"))
 }
+_NAMES |= {digit.encode(): digit for digit in "0123456789."}
 
 
 class Keyboard:
@@ -86,10 +87,10 @@ class Keyboard:
         self._saved = []
 
     def wait(self, seconds: float) -> list[str]:
-        """Wait at most so many seconds for keys: ``space``, ``step``, ``forward``, ``up``, ``down``.
+        """Wait at most so many seconds for keys: ``space``, ``step``, ``enter``, ``back``, arrows, digits, a point.
 
-        ``step`` is s or enter, ``forward`` the right arrow. Other keys are left out. Returns as soon as anything is
-        typed.
+        ``step`` is s, ``back`` backspace; the arrows are ``forward``, ``up``, ``down``. Others are left out. Returns as
+        soon as anything is typed.
         """
         if not self._saved:
             self.listen()  # it may have been started in the background

@@ -57,6 +57,7 @@ BLOCKED_AFTER = 0.05  # s to publish one message, from which on a reader is hold
 FINAL_BEFORE = 0.05  # s; an error that comes sooner is final: a slow reader blocks for 100 ms
 RATE_STEP = 1.1
 SEEK_SHARE = 0.05  # of the played part, by one key
+MOST_TYPED = 12  # characters of a time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +89,7 @@ class Played:
     length: float = 0.0  # s of the whole bag
     rate: float = 1.0  # s of the bag per second
     paused: bool = False
+    typed: str = ""  # a time to go to that is being typed
     begun: bool = False  # whether the required readers were there
 
 
@@ -288,21 +290,43 @@ class Player(LeanNode):
         for key in keys:
             if key == "space":
                 self._time.pause(not self._time.paused, next_time)
-            elif key == "step":
+            elif key == "enter" and self.played.typed:
+                self._go_to(self.played.typed, next_time)
+            elif key in ("step", "enter"):
                 self._time.pause(True, next_time)
                 self._steps += 1
             elif key == "forward":
-                self._seek(next_time)
-            else:
+                self._seek(self._here(next_time) + round(SEEK_SHARE * (self._last - self._first)))
+            elif key in ("up", "down"):
                 self._time.change_rate(RATE_STEP if key == "up" else 1 / RATE_STEP, next_time)
+            else:  # of a time
+                typed = self.played.typed
+                self.played.typed = typed[:-1] if key == "back" else (typed + key)[:MOST_TYPED]
 
-    def _seek(self, next_time: int) -> None:
-        """Go forward by a share of what is played. Latched messages on the way are all published, at once."""
-        if not self.played.begun:
+    def _here(self, next_time: int) -> int:
+        return max(self._time.now(next_time), self._sought)
+
+    def _go_to(self, typed: str, next_time: int) -> None:
+        """Go forward to a time that was typed [s from the start of the bag]; there is no way back."""
+        self.played.typed = ""
+        here, end = ((each - self._bag.start) / SECOND for each in (self._here(next_time), self._last))
+        try:
+            wanted = float(typed)
+        except ValueError:
+            self._on_note(f"{typed}: expected a time in seconds, such as 12.5")
             return
-        here = max(self._time.now(next_time), self._sought)
-        self._sought = min(here + round(SEEK_SHARE * (self._last - self._first)), self._last)
-        self._time.jump(self._sought)
+        if here <= wanted <= end:
+            self._seek(self._bag.start + round(wanted * SECOND))
+        elif wanted > end:
+            self._on_note(f"{typed} s: expected a time up to {end:g} s, where the bag ends")
+        else:
+            self._on_note(f"{typed} s: there is no way back from {here:g} s: start again with --start-offset {typed}")
+
+    def _seek(self, when: int) -> None:
+        """Go forward to a time of the bag [ns]. Latched messages on the way are all published, at once."""
+        if self.played.begun:
+            self._sought = min(when, self._last)
+            self._time.jump(self._sought)
 
     def _report(self, here: int) -> None:
         played = self.played
