@@ -17,6 +17,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+
+from msg_analysis.common.text.agent_names import agent_text
 
 _KEYS = {
     "agents": "number of agents",
@@ -44,7 +47,7 @@ _KEYS = {
     "time": "time",
 }
 _COLUMNS = {
-    "node_errors": "error of agent {}",
+    "node_errors": "error of {}",
     "rate": "decay rate",
     "seconds": "computing time [s]",
     "system_certainty": "system certainty",
@@ -53,30 +56,30 @@ _COLUMNS = {
 _LAWS = {"continuous": "continuous time", "discrete": "discrete time", "emulated": "with steps", "static": "one graph"}
 
 
-def key_words(key: str) -> str:
-    """A key in words, such as "step length dt"; the key itself if it has none."""
+def key_words(key: str, names: Sequence[str] | None = None) -> str:
+    """A key in words, such as "step length dt"; the key itself if it has none. ``names``: of the agents."""
     if key in _KEYS:
         return _KEYS[key]
     if found := re.fullmatch(r"noise\.process\[(\d+)\]", key):
-        return f"process noise of agent {found[1]}"
+        return f"process noise of {agent_text(int(found[1]), names)}"
     if found := re.fullmatch(r"switching\.rates\.([^.]+)\.([^.]+)", key):
         return f"switching rate from {found[1]} to {found[2]}"
     return key
 
 
-def axis_name(key: str) -> str:
+def axis_name(key: str, names: Sequence[str] | None = None) -> str:
     """A key in words, with the key in brackets, such as "step length dt [run.dt]"."""
-    words = key_words(key)
+    words = key_words(key, names)
     return words if words == key else f"{words} [{key}]"
 
 
-def column_words(column: str) -> str:
+def column_words(column: str, names: Sequence[str] | None = None) -> str:
     """A column in words, such as "error of agent 3"; the column itself if it has none."""
     law, _, rest = column.partition(".")
     if law in _LAWS and rest:
-        return f"{column_words(rest)}, {_LAWS[law]}"
+        return f"{column_words(rest, names)}, {_LAWS[law]}"
     found = re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", column)
     words = _COLUMNS.get(found[1]) if found else None
     if found is None or words is None or ("{}" in words) != (found[2] is not None):
         return column
-    return words.format(found[2])
+    return words.format(agent_text(int(found[2]), names)) if found[2] else words

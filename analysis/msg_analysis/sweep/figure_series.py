@@ -20,7 +20,7 @@ Repetitions are taken together: the mean, and the 95 % interval of the mean.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,11 +59,6 @@ class Series:
         """Keys and values; empty where there are none."""
         return ", ".join(f"{key} = {value_text(value)}" for key, value in self.values)
 
-    @property
-    def words(self) -> str:
-        """The same with the keys in words."""
-        return ", ".join(f"{key_words(key)} = {value_text(value)}" for key, value in self.values)
-
 
 @dataclass(frozen=True, slots=True)
 class Picture:
@@ -74,6 +69,11 @@ class Picture:
     logarithmic: bool  # the axis of x
     measured: bool  # whether there are intervals
     series: tuple[Series, ...]  # one for each combination of values of the other keys
+    names: Sequence[str] | None = None  # of the agents, if all points have the same
+
+    def words(self, values: Iterable[tuple[str, Any]]) -> str:
+        """Keys in words, with their values; empty where there are none."""
+        return ", ".join(f"{key_words(key, self.names)} = {value_text(value)}" for key, value in values)
 
     @property
     def numeric(self) -> bool:
@@ -112,7 +112,7 @@ def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None, along:
         Series(values[group], tuple(_place(along, rows_here, names) for rows_here in places.values()))
         for group, places in groups.items()
     )
-    return Picture(along, wanted, _logarithmic(sweep, along), names["error"] is not None, found)
+    return Picture(along, wanted, _logarithmic(sweep, along), names["error"] is not None, found, sweep.names)
 
 
 def value_text(value: Any) -> str:

@@ -61,6 +61,7 @@ class Sweep:
     spec: SweepSpec
     experiment: str  # name of the experiment
     points: tuple[Point, ...]  # in the order of the file: first key slowest, repetitions fastest
+    names: Sequence[str] | None = None  # of the agents, if all points have the same
 
     @property
     def kind(self) -> JobKind:
@@ -136,7 +137,7 @@ def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path,
     combinations = list(_combinations(spec))
     wrong: dict[str, list[int]] = {}  # line: indices of the combinations that have it
     points: list[Point] = []
-    name = ""
+    name, named = "", set()
     for number, values in enumerate(combinations):
         document: Mapping[str, Any] = base
         try:
@@ -152,11 +153,13 @@ def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path,
             wrong.setdefault(line, []).append(number)
         if not wrong:
             name = experiment.name
+            named.add(tuple(experiment.names or ()))
             points += _runs(spec, values, experiment)
         checked(number + 1, len(combinations))
     if wrong:
         raise ExperimentError(str(path), _grouped(wrong, combinations))
-    return Sweep(path.stem, spec, name, tuple(points))
+    (names,) = named if len(named) == 1 else [()]
+    return Sweep(path.stem, spec, name, tuple(points), names or None)
 
 
 def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: ValidExperiment) -> Iterator[Point]:

@@ -334,6 +334,7 @@ def host(
     from msg_agents.running.run_folder import workshop
     from msg_agents.running.runner import run_network
     from msg_agents.watching.run_view import RunView
+    from msg_analysis.common.text.agent_names import agent_name
     from msg_analysis.model.experiment.problems import show
 
     interruption = _interruption()
@@ -344,7 +345,7 @@ def host(
         click.echo(places.profile(what), nl=False)
         return
     share = places.share(name or this_host(), discovery_timeout=discovery_timeout, patience=patience)
-    mine = show([agent + 1 for agent in share.agents])
+    mine = show([agent_name(agent + 1, what.names) if what.names else agent + 1 for agent in share.agents])
     with workshop() as folder, RunView(what) as view:
         also = " and the recorder" if share.home else ""
         view.note(f"this host runs agents {mine}{also} in ROS_DOMAIN_ID {places.domain}")

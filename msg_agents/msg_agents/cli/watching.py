@@ -114,6 +114,7 @@ def live(
                 timeout=timeout,
                 on_report=view.show,
                 on_note=print_note,
+                on_event=view.note,
                 on_look=display.check,
             )
         if found is not None:
@@ -138,6 +139,15 @@ class LiveView:
     def __init__(self, display: Display, print_line: Callable[[str], None] | None) -> None:
         self._display, self._print_line = display, print_line
         self._source: SnapshotSource | None = None
+        self._notes: list[str] = []  # of the time before the first report
+
+    def note(self, line: str) -> None:
+        """Print a note about the network; on the page it is an event."""
+        print_note(line)
+        if self._source is None:
+            self._notes.append(line)
+        else:
+            self._source.happened(line)
 
     def show(self, watched: Watched, rate: float) -> None:
         """Show the newest report; ``rate`` in steps per second."""
@@ -148,6 +158,8 @@ class LiveView:
         if self._source is None:
             self._source = SnapshotSource(experiment)
             self._display.begin(experiment)
+            for line in self._notes:
+                self._source.happened(line)
         self._display.draw(self._source.snapshot(watched.steps, report), experiment)
         if self._print_line is not None:
             self._print_line(live_line(report, watched.record, rate))

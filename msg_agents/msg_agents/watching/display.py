@@ -39,6 +39,7 @@ class Display:
 
         self.panel = panel
         self._console, self._web = console, web
+        self._document: dict[str, Any] | None = None  # the newest on the page
         # No thread: ``draw`` refreshes it.
         self._live = Live(console=console, auto_refresh=False, transient=transient, vertical_overflow="crop")
         self._jobs = JobControl(before=self._live.stop, after=lambda: self._live.start(refresh=True))
@@ -77,7 +78,8 @@ class Display:
             size = self._console.size
             self._live.update(panel_of(snapshot, experiment, width=size.width, height=size.height), refresh=True)
         if self._web is not None:
-            self._web.show(snapshot_document(snapshot))
+            self._document = snapshot_document(snapshot, self._document)
+            self._web.show(self._document)
 
     def end(self, words: dict[str, Any], report: Path | None = None) -> None:
         """Tell the page how the run ended: "text", and "verdict" or None; it gets the report, too."""

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ from msg_analysis.model.run.graph_path import Sojourn, sojourns
 from msg_analysis.model.step.step_model import first_graph
 
 if TYPE_CHECKING:
+    from msg_analysis.inference.online.recent_steps import Recent
     from msg_analysis.inference.online.running_errors import LiveReport
     from msg_analysis.model.experiment.experiment import ValidExperiment
 
@@ -227,8 +228,11 @@ def run_description(experiment: ValidExperiment) -> dict[str, Any]:
     }
 
 
-def snapshot_document(snapshot: Snapshot) -> dict[str, Any]:
-    """A snapshot for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1."""
+def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """A snapshot for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1.
+
+    While there are no new states, the "trace" is that of the document ``before``.
+    """
     report, sojourn = snapshot.report, snapshot.sojourn
     recent = report.recent if report else None
     return {
@@ -242,16 +246,22 @@ def snapshot_document(snapshot: Snapshot) -> dict[str, Any]:
         "nodes": [node.to_json() for node in report.nodes] if report else None,
         "values": None if recent is None else recent.states[-1].tolist(),
         "values_step": None if recent is None else int(recent.steps[-1]),
-        "trace": None
-        if recent is None
-        else {
-            "steps": recent.steps.tolist(),
-            "agents": [[float(f"{x:.4g}") for x in column] for column in recent.states.T[:MOST_TRACED].tolist()],
-            "sojourns": [[each.mode, each.first_step, each.last_step] for each in snapshot.path],
-        },
+        "trace": None if recent is None else _trace(snapshot, recent, before and before["trace"]),
         "lateness": report.lateness if report else None,
         "ages": [round(age, 2) for age in snapshot.ages] if len(snapshot.ages) > 1 else [],
         "gone": sorted(snapshot.gone),
         "events": [[event.step, event.text] for event in snapshot.events],
         "note": snapshot.note,
+    }
+
+
+def _trace(snapshot: Snapshot, recent: Recent, before: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """The newest states of the first agents, in four digits, with the graphs; ``before`` if the steps are the same."""
+    steps = recent.steps.tolist()
+    if before is not None and before["steps"] == steps:
+        return before
+    return {
+        "steps": steps,
+        "agents": [[float(f"{x:.4g}") for x in column] for column in recent.states.T[:MOST_TRACED].tolist()],
+        "sojourns": [[each.mode, each.first_step, each.last_step] for each in snapshot.path],
     }

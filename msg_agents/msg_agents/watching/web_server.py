@@ -29,6 +29,7 @@ import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -70,6 +71,8 @@ class WebServer:
         self._number = 0  # of the newest change
         self._setting: dict[str, Any] | None = None
         self._moment: dict[str, Any] | None = None
+        self._trace: Mapping[str, Any] | None = None  # the newest states
+        self._trace_sent, self._traces = "", 0  # the same as text, and how many there have been
         self._ending: dict[str, Any] | None = None
         self._history: deque[list[float | None]] = deque(maxlen=HISTORY)
         self._browsers: dict[_Handler, None] = {}  # in the order in which they came
@@ -107,7 +110,10 @@ class WebServer:
         """Show the current state of the run, given by ``snapshot.snapshot_document``."""
         system = moment["system"] or {}
         with self._changed:
-            self._moment = finite(moment)
+            trace = moment.get("trace")
+            if trace is not None and trace is not self._trace:  # of many numbers: once, while they stay the same
+                self._trace, self._trace_sent, self._traces = trace, json.dumps(finite(trace)), self._traces + 1
+            self._moment = finite({key: value for key, value in moment.items() if key != "trace"})
             if system.get("measured") is not None and (
                 not self._history or self._history[-1][0] != moment["values_step"]
             ):
@@ -168,7 +174,7 @@ class WebServer:
             self._browsers[handler] = None
         try:
             handler.start_events()
-            told, number = set[str](), -1
+            told, number = dict[str, int](), -1
             while True:
                 with self._changed:
                     self._changed.wait_for(lambda: self._number != number, ALIVE)  # noqa: B023  called here and now
@@ -185,16 +191,20 @@ class WebServer:
                 self._browsers.pop(handler, None)
                 self._changed.notify_all()
 
-    def _events(self, told: set[str]) -> list[tuple[str, Any]]:
-        events: list[tuple[str, Any]] = []
+    def _events(self, told: dict[str, int]) -> list[tuple[str, str]]:
+        """What a browser has not been told, as JSON; ``told``: the numbers of what it has."""
+        events: list[tuple[str, str]] = []
         if self._setting is not None and "setting" not in told:
-            told.add("setting")
-            events += [("setting", self._setting), ("history", list(self._history))]
+            told["setting"] = 1
+            events += [("setting", json.dumps(self._setting)), ("history", json.dumps(list(self._history)))]
         if self._moment is not None and "setting" in told:
-            events.append(("moment", self._moment))
+            if self._traces != told.get("trace", 0):
+                told["trace"] = self._traces
+                events.append(("trace", self._trace_sent))
+            events.append(("moment", json.dumps(self._moment)))
         if self._ending is not None:
-            told.add("end")
-            events.append(("end", self._ending))
+            told["end"] = 1
+            events.append(("end", json.dumps(self._ending)))
         return events
 
 
@@ -260,11 +270,12 @@ class _Server(ThreadingHTTPServer):
 
 
 def _whole_page() -> bytes:
-    """The page with its style and its script in it."""
+    """The page with its style and its scripts in it."""
     pages = resources.files("msg_agents.watching") / "pages"
+    shared = resources.files("msg_analysis.report.html") / "templates"
     page = (pages / "live.html").read_bytes()
-    for name in ("live.css", "live.js"):
-        page = page.replace(f"{{{name}}}".encode(), b"\n" + (pages / name).read_bytes())
+    for file in (pages / "live.css", shared / "svg.js", pages / "live.js"):
+        page = page.replace(f"{{{file.name}}}".encode(), b"\n" + file.read_bytes())
     return page
 
 
@@ -320,9 +331,9 @@ class _Handler(BaseHTTPRequestHandler):
         self._head(HTTPStatus.OK, "text/event-stream; charset=utf-8")
         self.end_headers()
 
-    def send_events(self, events: list[tuple[str, Any]]) -> bool:
-        """Send events, or a comment if there are none; False if the browser did not take them."""
-        text = "".join(f"event: {name}\ndata: {json.dumps(data)}\n\n" for name, data in events) or ": still here\n\n"
+    def send_events(self, events: list[tuple[str, str]]) -> bool:
+        """Send events, in JSON, or a comment if there are none; False if the browser did not take them."""
+        text = "".join(f"event: {name}\ndata: {data}\n\n" for name, data in events) or ": still here\n\n"
         try:
             self.wfile.write(text.encode())
             self.wfile.flush()

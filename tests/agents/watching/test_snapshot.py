@@ -62,6 +62,21 @@ def test_the_states_for_the_page_have_the_graphs_of_their_steps() -> None:
     assert [graph[step] for step in trace["steps"]] == trajectory.modes[900 - WINDOW : 900].tolist()
 
 
+def test_states_are_formatted_when_there_are_new_ones() -> None:
+    ours = experiment()
+    trajectory = simulate(ours)
+    estimate = LiveEstimate(trajectory.record)
+    source, document = SnapshotSource(ours), None
+    for first, last, new in ((0, 10, True), (10, 10, False), (10, 11, True), (11, 11, False)):
+        step = slice(first, last)
+        after = trajectory.states[first + 1 : last + 1]
+        if new:
+            estimate.add_whole(np.arange(first, last), trajectory.modes[step], trajectory.states[step], after)
+        before, document = document, snapshot_document(source.snapshot([last] * 5, estimate.report()), document)
+        assert document["trace"]["steps"] == [*range(last)]
+        assert (before is None or document["trace"] is not before["trace"]) == new
+
+
 def test_refused_messages_are_an_event_once_for_each_reason() -> None:
     source = SnapshotSource(experiment())
     for count in (1, 2, 3):

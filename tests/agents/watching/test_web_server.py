@@ -99,6 +99,23 @@ def test_only_under_our_own_name(idle: WebServer, host: str, status: int) -> Non
     assert _get(idle, "/", Host=host).status == status
 
 
+def test_states_are_sent_when_there_are_new_ones(web: WebServer) -> None:
+    """Before the moment of which they are the newest; a browser that comes late gets them, too."""
+    early = Events(web)
+    web.begin({"name": "net"})
+    trace, newer = {"steps": [1], "agents": [[0.5, float("inf")]]}, {"steps": [1, 2], "agents": [[0.5, 1.0]]}
+    moments = [MOMENT | {"reached": number, "trace": each} for number, each in enumerate((trace, trace, newer, newer))]
+    found = [early.next(), early.next()]
+    for moment in moments:
+        web.show(moment)
+        while (event := early.next()) and event[0] != "moment":
+            found.append(event)
+        assert event == ("moment", {key: value for key, value in moment.items() if key != "trace"})
+    assert found[2:] == [("trace", {"steps": [1], "agents": [[0.5, None]]}), ("trace", newer)]
+    late = Events(web)
+    assert [late.next() for _ in range(4)][2] == ("trace", newer)
+
+
 def test_events(web: WebServer) -> None:
     """Who comes early waits; who comes late gets what was, with the history."""
     early = Events(web)

@@ -181,7 +181,7 @@ def test_incomplete(tmp_path: Path, first_gap: int) -> None:
 
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports of which only the texts are looked at."""
-    monkeypatch.setattr(report_page, "components", lambda models: ("", dict.fromkeys(models, "")))
+    monkeypatch.setattr(report_page, "pack", lambda models: (dict.fromkeys(models, ""), ""))
 
 
 def test_what_became_of_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,9 +52,17 @@ def _open(browser: Any, path: Path) -> tuple[Any, Log]:
     return page, log
 
 
+def _draw_all(page: Any) -> None:
+    """Also the figures that are not near the visible part of the page."""
+    page.evaluate("window.drawAll()")
+    page.wait_for_selector("body[data-ready=yes]")
+
+
 def _check(page: Any, log: Log, path: Path) -> None:
     assert log.complaints == []
     assert log.requests == [path.as_uri()]
+    _draw_all(page)
+    assert page.locator(".figure:empty").count() == 0
     # Every figure has been drawn: not all of its pixels are white.
     blank = page.evaluate(
         """() => [...window.Bokeh.index.roots].filter((view) => view.el.closest(".plot")).filter((view) => {
@@ -191,7 +199,7 @@ def test_screens_of_all_kinds(browser: Any, disagrees: Path) -> None:
     while page.evaluate("document.activeElement !== document.body"):
         reached.add(page.evaluate("document.activeElement.id || document.activeElement.textContent"))
         page.keyboard.press("Tab")
-    controls = page.locator("a, button, input, summary").all()
+    controls = page.locator("a, button, input, select, summary").all()
     assert {one.get_attribute("id") or one.text_content() for one in controls} <= reached
     page.close()
 
@@ -201,6 +209,7 @@ def test_a_finger_scrolls_the_page(browser: Any, disagrees: Path) -> None:
     page = browser.new_page(viewport={"width": 390, "height": 800}, has_touch=True, is_mobile=True)
     page.goto(disagrees.as_uri())
     page.wait_for_selector("body[data-ready=yes]")
+    _draw_all(page)
     actions = page.evaluate(
         """() => [...Bokeh.index.roots].filter((view) => view.canvas_view).map((view) => [
             view.model.toolbar.tools.some((tool) => tool.type == "RangeTool"),
@@ -285,6 +294,62 @@ def test_trajectories(browser: Any, tmp_path: Path) -> None:
     assert drawn("events", "words") == ["agent_2: killed"]
     page.click("#show-none")
     settled("model('states').data.agent.length == 0")
+    assert log.complaints == []
+    page.close()
+
+
+def test_figures_are_drawn_when_they_are_near(browser: Any, tmp_path: Path) -> None:
+    """Those far below are not, until they are printed: on paper there are all."""
+    trajectory = _trajectory(5)
+    path = tmp_path / "report.html"
+    write_report(compare(trajectory), trajectory, path)
+    page, log = _open(browser, path)
+    figures, drawn = page.locator(".figure").count(), page.locator(".figure:not(:empty)").count()
+    assert 4 <= drawn < figures - 4
+    page.locator("#innovations").scroll_into_view_if_needed()
+    page.locator("[aria-label^='Variance of the innovations'] .figure:not(:empty)").wait_for()
+    assert page.locator(".figure:empty").count() > 0
+    page.evaluate(
+        """() => window.addEventListener("beforeprint", () => {
+            window.pictured = document.querySelectorAll(".plot.pictured img").length;
+        })"""
+    )
+    page.pdf(format="A4")
+    assert page.evaluate("window.pictured") == figures
+    assert log.complaints == []
+    page.close()
+
+
+@pytest.mark.parametrize(("agents", "duration"), [(5, 200), (100, 50)])
+def test_replicas(browser: Any, tmp_path: Path, agents: int, duration: float) -> None:
+    """Each that has room can be chosen with the keyboard; its values are those of the run, to 16 bits of their span."""
+    trajectory = _trajectory(agents, duration=duration, replicas=16, start="zero")
+    path = tmp_path / "report.html"
+    write_report(compare(trajectory), trajectory, path)
+    assert path.stat().st_size < 3_000_000
+    page, log = _open(browser, path)
+    offered = page.locator("#replica option").all_inner_texts()
+    assert len(offered) == (16 if agents == 5 else 4)
+    caption = page.locator("#trajectories figcaption")
+    assert ("as many as have room in 1 MB" in caption.inner_text()) == (agents == 100)
+    page.click("#whole")
+    page.focus("#replica")
+    for number in (2, 3):
+        page.keyboard.press("ArrowDown")
+        page.locator("#this-replica", has_text=str(number)).wait_for()
+        states = trajectory.values[:, :, number - 1]
+        span = float(states.max() - states.min())
+        page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        drawn = page.evaluate("Bokeh.documents[0].get_model_by_name('states').data")
+        for place, agent in enumerate(drawn["agent"]):
+            column = states[:, int(agent.removeprefix("agent ")) - 1]
+            ys = np.array(drawn["ys"][place])
+            assert abs(ys.max() - column.max()) < span / 65_000
+            assert abs(ys.min() - column.min()) < span / 65_000
+        overview = page.evaluate("Bokeh.documents[0].get_model_by_name('overview').data")
+        assert abs(max(overview["high"]) - states.max()) < span / 65_000
+    width = int(re.findall(r"every (\d+) steps", caption.inner_text())[0]) if agents == 100 else 1
+    assert width == -(-(len(trajectory.values)) // 306) if agents == 100 else "every" in caption.inner_text()
     assert log.complaints == []
     page.close()
 

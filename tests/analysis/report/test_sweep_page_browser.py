@@ -71,6 +71,8 @@ def test_keys_and_pointer(tmp_path: Path, keys: int) -> None:
                     assert page.evaluate(CUT) == []
                     assert page.evaluate(FAINT) == []
             page.locator("[data-name=map_0_0]").scroll_into_view_if_needed()
+            page.locator("[data-name=map_0_0] .figure:not(:empty)").wait_for()
+            page.wait_for_selector("body[data-ready=yes]")
             box = page.locator("[data-name=map_0_0]").bounding_box()
             page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
             page.locator(".bk-Tooltip", has_text="loss of messages").first.wait_for()

@@ -7,7 +7,7 @@ import pytest
 
 from msg_analysis.common import large_arrays
 from msg_analysis.report.html.plots import thinned_run
-from msg_analysis.report.html.plots.thinned_run import envelope, thin
+from msg_analysis.report.html.plots.thinned_run import envelope, thin, thin_together
 
 
 @pytest.fixture
@@ -34,6 +34,20 @@ def test_bins(states: np.ndarray, block: int, monkeypatch: pytest.MonkeyPatch) -
     low, high = envelope(found.values)
     assert np.allclose(low, [values[first : first + 9].min() for first in range(0, 103, 9)])
     assert np.allclose(high, [values[first : first + 9].max() for first in range(0, 103, 9)])
+
+
+@pytest.mark.parametrize("block", [100, 10**6])
+@pytest.mark.parametrize("numbers", [100, 10**4])
+def test_several_replicas(states: np.ndarray, block: int, numbers: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each as if it were thinned alone."""
+    monkeypatch.setattr(thinned_run, "BLOCK_NUMBERS", block)
+    together = thin_together(states, slice(1, 3), 0.25, numbers)
+    for found, replica in zip(together, (1, 2), strict=True):
+        alone = thin(states, replica, 0.25, numbers)
+        assert found.width == alone.width
+        for name in ("values", "deviations", "centre", "error"):
+            for one, other in zip(getattr(found, name), getattr(alone, name), strict=True):
+                np.testing.assert_array_equal(one, other)
 
 
 def test_short_runs_are_kept_whole(states: np.ndarray) -> None:

@@ -73,7 +73,7 @@ def draw(picture: Picture, title: str) -> Figure:
     elif picture.logarithmic:
         axes.set_xscale("log")
     _mark_failures(axes, picture, labels, numbers)
-    axes.set(xlabel=plain(axis_name(picture.x)), ylabel=plain(column_words(picture.y)))
+    axes.set(xlabel=plain(axis_name(picture.x, picture.names)), ylabel=plain(column_words(picture.y, picture.names)))
     axes.set_title(plain(title), loc="left")
     axes.margins(y=0.08)
     _legend(figure, axes, picture, colours)
@@ -131,7 +131,7 @@ def _legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[Any]
     if len(picture.series) > 1:
         chosen = np.unique(np.linspace(0, len(picture.series) - 1, _NAMED).round().astype(int))
         handles = [Line2D([], [], color=colours[i], marker=_MARKERS[i % len(_MARKERS)], ms=4.5, lw=1.2) for i in chosen]
-        names = [plain(picture.series[i].words) for i in chosen]
+        names = [plain(picture.words(picture.series[i].values)) for i in chosen]
         axes.legend(handles, names, loc="upper left", bbox_to_anchor=(1.0, 1.02), borderaxespad=0.4)
 
 

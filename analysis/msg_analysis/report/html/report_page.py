@@ -26,11 +26,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from bokeh.document import Document
-from bokeh.embed import components
 from bokeh.models import UIElement
-from bokeh.resources import Resources
-from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text.agent_names import with_names
@@ -55,6 +51,7 @@ from msg_analysis.report.documents.comparison_words import (
 from msg_analysis.report.documents.explanation import explain, graph_facts
 from msg_analysis.report.html import network_drawings, run_heading
 from msg_analysis.report.html.interval_bars import interval_bars, plus_minus
+from msg_analysis.report.html.packed_figures import pack
 from msg_analysis.report.html.page_templates import page_template
 from msg_analysis.report.html.plots import colours, error_plots, switching_plots, trajectory_plots
 from msg_analysis.report.html.plots.accused import Accused
@@ -105,12 +102,8 @@ def render(
     names = [graph.name for graph in experiment.graph_list]
     accused = Accused.of(document["blame"])
     happened, more_events = run_events(trajectory, events)
-    models, sojourns = _models(document, comparison, trajectory, accused, happened)
-    figures = Document()
-    with figures.models.freeze():  # otherwise every figure is gone through again for each one added
-        for model in models.values():
-            figures.add_root(model)
-    script, divs = components(models)
+    models, drawn = _models(document, comparison, trajectory, accused, happened)
+    places, packed = pack(models)
     timing = document["timing"]
     return page_template("report.html.j2", filters).render(
         document=document,
@@ -137,22 +130,20 @@ def render(
         agents=agent_errors(document),
         experiment=experiment,
         versions=trajectory.record.versions,
-        plots={name: Markup(div) for name, div in divs.items()},
-        script=Markup(script),
-        library=Markup(Resources(mode="inline", components=["bokeh"]).js_raw[0]),
+        plots=places,
+        packed=packed,
         first_agents=_first_agents(document, accused.involved),
         line_colours=colours.LINES,
         graph_colours=colours.GRAPHS,
         dark=colours.DARK,
         most_lines=error_plots.MOST_LINES,
-        sojourns=sojourns[1],
-        shown_sojourns=sojourns[0],
+        drawn=drawn,
         shown=_shown_agents(experiment.agents, accused.involved),
         accused=accused,
         events=happened,
         more_events=more_events,
         step_length=experiment.step_length,
-        replica=trajectory_plots.REPLICA + 1,
+        room=trajectory_plots.OTHER_REPLICAS,
         explained=explain(experiment),
         drawings=network_drawings.graph_drawings(experiment, accused),
         graph_facts=graph_facts(experiment),
@@ -180,8 +171,8 @@ def _models(
     trajectory: Trajectory,
     accused: Accused,
     events: Sequence[Event],
-) -> tuple[dict[str, UIElement], tuple[int, int]]:
-    """The figures that exist, by name; sojourns in the figure of the active graph, and in the run."""
+) -> tuple[dict[str, UIElement], trajectory_plots.Drawn]:
+    """The figures that exist, by name, and what of the run is in those of the trajectories."""
     experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
     predicted = document["system_error"]["predicted"]
@@ -197,8 +188,8 @@ def _models(
     }
     if len(comparison.running["time"]) > 1:
         models["running"] = error_plots.convergence(comparison.running, predicted)
-    drawn, sojourns = trajectory_plots.trajectory_plots(trajectory, predicted, events)
-    models |= drawn
+    figures, drawn = trajectory_plots.trajectory_plots(trajectory, predicted, events)
+    models |= figures
     known = trajectory.modes[:steps]
     if len(known):
         names = [graph.name for graph in experiment.graph_list]
@@ -217,7 +208,7 @@ def _models(
     if document["timing"]:
         models["lateness"] = error_plots.lateness(document["timing"])
         models["staleness"] = error_plots.staleness(document["timing"])
-    return {name: model for name, model in models.items() if model is not None}, sojourns
+    return {name: model for name, model in models.items() if model is not None}, drawn
 
 
 def _shown_agents(agents: int, accused: Sequence[int]) -> list[int]:

@@ -20,14 +20,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bokeh.document import Document
-from bokeh.embed import components
 from bokeh.models import UIElement
-from bokeh.resources import Resources
-from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text.number_words import half_width_text, number_text
+from msg_analysis.report.html.packed_figures import pack
 from msg_analysis.report.html.page_templates import page_template
 from msg_analysis.report.html.plots import colours, sweep_plots
 from msg_analysis.sweep.axis_names import axis_name, column_words, key_words
@@ -59,17 +56,14 @@ def render_sweep(
     models: dict[str, UIElement] = {}
     lines = {key: _figures(models, shown, "lines", number) for number, (key, shown) in enumerate(pictures.items())}
     maps = _figures(models, first, "map", 0) if first.series[0].values else []
-    figures = Document()
-    with figures.models.freeze():
-        for model in models.values():
-            figures.add_root(model)
-    script, divs = components(models)
+    plots, packed = pack(models)
     places = [(series, place) for series in first.series for place in series.places]
     return page_template("sweep.html.j2").render(
         sweep=sweep,
-        column=column_words(first.y),
+        column=column_words(first.y, sweep.names),
         measured=first.measured,
         referred=any(place.reference is not None for _, place in places),
+        dashed=any(sweep_plots.dashed(shown) for shown in pictures.values()),
         summary=summary,
         verdict=verdict,
         lines=lines,
@@ -78,8 +72,8 @@ def render_sweep(
         line_colours=colours.LINES,
         by_factors=sweep_plots.by_factors(first),
         maps=maps,
-        axis_names={key: axis_name(key) for key in keys},
-        values=[_values(key, sweep.spec.over[key]) for key in sweep.keys],
+        axis_names={key: axis_name(key, sweep.names) for key in keys},
+        values=[(axis_name(key, sweep.names), _values(sweep.spec.over[key])) for key in sweep.keys],
         first=first,
         second=first.series[0].values[0][0] if first.series[0].values else None,
         hidden_panels=max(0, len(sweep_plots.panels(first)) - sweep_plots.MOST_PANELS),
@@ -90,14 +84,13 @@ def render_sweep(
         ),
         most_lines=sweep_plots.MOST_LINES,
         most_panels=sweep_plots.MOST_PANELS,
-        heads=[key_words(key) for key in (first.x, *(key for key, _ in first.series[0].values))],
+        heads=[key_words(key, sweep.names) for key in (first.x, *(key for key, _ in first.series[0].values))],
         table=[_row(first, series.values, place) for series, place in places],
         table_open=len(places) <= _OPEN_TABLE,
         failures=list(dict.fromkeys(f"point {row['point']}: {row['reason']}" for row in rows if row.get("reason"))),
         dark=colours.DARK,
-        plots={name: Markup(div) for name, div in divs.items()},
-        script=Markup(script),
-        library=Markup(Resources(mode="inline", components=["bokeh"]).js_raw[0]),
+        plots=plots,
+        packed=packed,
     )
 
 
@@ -112,12 +105,10 @@ def _figures(models: dict[str, UIElement], shown: Picture, kind: str, number: in
     return found
 
 
-def _values(key: str, values: Sequence[Any]) -> tuple[str, str]:
-    """A key and its values, in words."""
+def _values(values: Sequence[Any]) -> str:
+    """The values of a key, in words."""
     words = [value_text(value) for value in values]
-    if len(words) > 8:
-        return axis_name(key), f"{len(words)} values, {words[0]} to {words[-1]}"
-    return axis_name(key), ", ".join(words)
+    return f"{len(words)} values, {words[0]} to {words[-1]}" if len(words) > 8 else ", ".join(words)
 
 
 def _row(shown: Picture, values: Sequence[tuple[str, Any]], place: Any) -> Mapping[str, Any]:

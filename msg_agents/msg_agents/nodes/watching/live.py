@@ -155,7 +155,8 @@ def watch(
     record: RunRecord | None = None,  # None: of the topic ``experiment``
     timeout: float | None = None,  # s to wait for a network; None: no limit
     on_report: Callable[[Watched, float], None] = lambda *_: None,
-    on_note: Callable[[str], None] = lambda _: None,
+    on_note: Callable[[str], None] = lambda _: None,  # while there is no network
+    on_event: Callable[[str], None] = lambda _: None,  # about the network
     on_look: Callable[[], None] = lambda: None,  # called a few times a second
 ) -> Watched | None:
     """Watch a network until it is over or a signal ends it; what was seen, or None without a network.
@@ -164,7 +165,7 @@ def watch(
     prediction fails.
     """
     node = run_watcher(
-        lambda: Live(reliable=reliable, record=record, on_report=on_report, on_note=on_note),
+        lambda: Live(reliable=reliable, record=record, on_report=on_report, on_note=on_event),
         timeout=timeout,
         on_note=on_note,
         on_look=on_look,

@@ -1,7 +1,6 @@
 "use strict";
-const HALF = 1.96, SVG = "http://www.w3.org/2000/svg", COLOURS = 8, DASHES = ["", "6 3", "2 3"];
-const at = (id) => document.getElementById(id);
-let setting = null, points = [], balls = [], links = new Map(), rows = [], scale = 0, over = false, newest = null, off = new Set(), happened = [];
+const HALF = 1.96, COLOURS = 8, DASHES = ["", "6 3", "2 3"];
+let setting = null, points = [], balls = [], links = new Map(), rows = [], scale = 0, over = false, newest = null, recent = null, off = new Set(), happened = [];
 
 const number = (value, digits = 4) => value === null || value === undefined ? "–" : Number(value).toPrecision(digits);
 const signed = (value) => value === null || value === undefined ? "–" : (value < 0 ? "−" : "+") + Math.abs(value).toFixed(2);
@@ -12,13 +11,6 @@ function lasting(seconds) {
   if (seconds === null) return "–";
   const whole = Math.ceil(seconds), rest = String(whole % 60).padStart(2, "0");
   return whole >= 3600 ? `${Math.floor(whole / 3600)}:${String(Math.floor(whole / 60) % 60).padStart(2, "0")}:${rest}` : `${Math.floor(whole / 60)}:${rest}`;
-}
-function element(kind, attributes, parent, text) {
-  const made = document.createElementNS(SVG, kind);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  if (text !== undefined) made.textContent = text;
-  parent.append(made);
-  return made;
 }
 // A drawing with as many units as it has pixels, so that its text is never small; null while it is hidden.
 function canvas(id, height) {
@@ -40,7 +32,7 @@ function columns() {
 }
 
 function begin(data) {
-  setting = data; points = []; links = new Map(); scale = 0; newest = null; off = new Set(); happened = [];
+  setting = data; points = []; links = new Map(); scale = 0; newest = null; recent = null; off = new Set(); happened = [];
   at("name").textContent = `${data.name}: ${data.agents} agents, ${data.pace === "realtime" ? "real time" : data.pace}`;
   document.title = `${data.name}: live`;
   at("middle").textContent = data.reference === null ? "the mean" : `the reference ${data.reference}`;
@@ -185,8 +177,8 @@ function show(data) {
 function draw() { chart(); trace(); }
 
 function trace() {
-  if (!newest || !newest.trace) return;
-  const { steps, agents, sojourns } = newest.trace;
+  if (!newest || !recent) return;
+  const { steps, agents, sojourns } = recent;
   keys(agents.length);
   const drawn = canvas("trace", 260);
   if (!drawn) return;
@@ -227,12 +219,11 @@ function trace() {
   element("text", { x: (left + right) / 2, y: height - 14, "text-anchor": "middle" }, box, `${number((last - first) * setting.dt, 3)} units of time`);
 }
 
-// Lines at round values: 1, 2 or 5 times a power of ten apart.
+// Lines at round values.
 function scaleOf(box, low, high, y, left, right) {
-  const rough = (high - low) / 6 || 1, power = 10 ** Math.floor(Math.log10(rough));
-  const apart = [1, 2, 5, 10].map((part) => part * power).find((part) => part >= rough * 0.999), digits = Math.max(0, -Math.floor(Math.log10(apart) + 1e-9));
-  for (let place = Math.ceil(low / apart - 1e-9); place * apart <= high + 1e-9 * apart; place += 1) {
-    const value = place * apart, text = Math.abs(value) >= 1e5 || digits > 5 ? number(value, 3) : value.toFixed(digits);
+  const { values, decimals } = ticks(low, high, 6);
+  for (const value of values) {
+    const text = Math.abs(value) >= 1e5 || decimals > 5 ? number(value, 3) : value.toFixed(decimals);
     element("line", { x1: left, x2: right, y1: y(value), y2: y(value), class: "grid" }, box);
     element("text", { x: left - 5, y: y(value), "text-anchor": "end", "dominant-baseline": "central" }, box, text);
   }
@@ -288,6 +279,7 @@ async function keep(path) {
 const events = new EventSource("events");
 events.addEventListener("setting", (event) => begin(JSON.parse(event.data)));
 events.addEventListener("history", (event) => { points = JSON.parse(event.data); chart(); });
+events.addEventListener("trace", (event) => { recent = JSON.parse(event.data); });
 events.addEventListener("moment", (event) => show(JSON.parse(event.data)));
 events.addEventListener("end", (event) => {
   const { text, verdict, report } = JSON.parse(event.data);

@@ -78,7 +78,7 @@ def key_of_lines(picture: Picture) -> tuple[str, list[str]] | None:
     chosen = _some(panels(picture)[0].series)
     if not chosen[0].values:
         return None
-    return key_words(chosen[0].values[0][0]), [value_text(series.values[0][1]) for series in chosen]
+    return key_words(chosen[0].values[0][0], picture.names), [value_text(series.values[0][1]) for series in chosen]
 
 
 def panels(picture: Picture) -> list[Panel]:
@@ -86,7 +86,7 @@ def panels(picture: Picture) -> list[Panel]:
     found: dict[tuple[str, ...], list[Series]] = {}
     for series in picture.series:
         found.setdefault(tuple(show(value) for _, value in series.values[1:]), []).append(series)
-    return [Panel(_words(group[0].values[1:]), tuple(group)) for group in found.values()]
+    return [Panel(picture.words(group[0].values[1:]), tuple(group)) for group in found.values()]
 
 
 def lines(picture: Picture, panel: Panel, name: str) -> UIElement:
@@ -98,7 +98,7 @@ def lines(picture: Picture, panel: Panel, name: str) -> UIElement:
     every = np.concatenate(along)
     drawn = [shifted(x, every, i, len(chosen), logarithmic=logarithmic) for i, x in enumerate(along)]
     plot = new_figure(330, x_axis_type="log" if logarithmic else "linear", x_range=_reach(every, drawn, logarithmic))
-    _name_axes(plot, axis_name(picture.x), column_words(picture.y))
+    _name_axes(plot, axis_name(picture.x, picture.names), column_words(picture.y, picture.names))
     if not picture.numeric:
         _name_values(plot.xaxis, [shorten(label, 12) for label in labels])
         plot.xgrid.grid_line_color = None
@@ -134,13 +134,13 @@ def lines(picture: Picture, panel: Panel, name: str) -> UIElement:
         points["x"] += data["beside"].tolist()
         points["value"] += [value if known else low for value, known in zip(data["value"].tolist(), there, strict=True)]
         points["words"] += words
-    rows = [(key_words(picture.x), "@known"), ("measured" if picture.measured else column_words(picture.y), "@shown")]
+    rows = [(key_words(picture.x, picture.names), "@known"), (_result_words(picture), "@shown")]
     if picture.measured:
         rows.append(("predicted", "@expected"))
     elif any(place.reference is not None for series in chosen for place in series.places):
         rows.append((LAW_NAMES["continuous"], "@expected"))
     if chosen[0].values:
-        rows.insert(0, (key_words(chosen[0].values[0][0]), "@second"))
+        rows.insert(0, (key_words(chosen[0].values[0][0], picture.names), "@second"))
     plot.add_tools(HoverTool(renderers=hovered, tooltips=rows))
     plot.y_range = Range1d(low, high)
     _add_focus(plot, points, name)
@@ -167,6 +167,14 @@ def _series(plot: Any, picture: Picture, source: ColumnDataSource, number: int) 
         marker=marker,
         size=7,
         color=colour,
+    )
+
+
+def dashed(picture: Picture) -> bool:
+    """Whether a figure has a dashed line: of a reference at two places of a line that is drawn, or more."""
+    drawn = [series for panel in panels(picture)[:MOST_PANELS] for series in _some(panel.series)]
+    return not picture.measured and any(
+        sum(place.reference is not None for place in series.places) > 1 for series in drawn
     )
 
 
@@ -209,7 +217,7 @@ def heat_map(picture: Picture, panel: Panel, name: str) -> UIElement:
         x_range=Range1d(-0.5, len(columns) - 0.5), y_range=Range1d(-0.5, len(down) - 0.5),
     )  # fmt: skip
     plot.grid.grid_line_color = None
-    _name_axes(plot, axis_name(picture.x), axis_name(second).replace(" [", "\n["))
+    _name_axes(plot, axis_name(picture.x, picture.names), axis_name(second, picture.names).replace(" [", "\n["))
     _name_values(plot.xaxis, [across[column] for column in columns])
     _name_values(plot.yaxis, [_short(series.values[0][1]) for series in panel.series])
     source = ColumnDataSource(cells)
@@ -228,8 +236,8 @@ def heat_map(picture: Picture, panel: Panel, name: str) -> UIElement:
             "x", "y", "text", source=source, text_color=BLACK, text_align="center", text_baseline="middle",
             text_font={"value": SANS}, text_font_size="11px",
         )  # fmt: skip
-    rows = [(key_words(picture.x), "@along"), (key_words(second), "@second")]
-    rows.append(("measured" if picture.measured else column_words(picture.y), "@shown"))
+    rows = [(key_words(picture.x, picture.names), "@along"), (key_words(second, picture.names), "@second")]
+    rows.append((_result_words(picture), "@shown"))
     if picture.measured:
         rows.append(("predicted", "@expected"))
     plot.add_tools(HoverTool(renderers=[drawn], tooltips=rows))
@@ -305,8 +313,8 @@ def _column(places: Sequence[Place], key: str) -> FloatArray:
     return np.array([getattr(place, key) for place in places], dtype=float)  # None: nan
 
 
-def _words(values: Sequence[tuple[str, Any]]) -> str:
-    return ", ".join(f"{key_words(key)} = {value_text(value)}" for key, value in values)
+def _result_words(picture: Picture) -> str:
+    return "measured" if picture.measured else column_words(picture.y, picture.names)
 
 
 def _value_words(place: Place) -> str:
@@ -318,7 +326,7 @@ def _value_words(place: Place) -> str:
 
 def _place_words(picture: Picture, series: Series, place: Place) -> str:
     """All of a point in one line."""
-    text = f"{_words([(picture.x, place.x), *series.values])}: {_value_words(place)}"
+    text = f"{picture.words([(picture.x, place.x), *series.values])}: {_value_words(place)}"
     if picture.measured and place.predicted is not None:
         text += f", predicted {number_text(place.predicted)}"
     if place.reference is not None:

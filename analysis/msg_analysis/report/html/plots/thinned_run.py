@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One replica of a run, thinned to a fixed size: smallest and largest value of each interval of steps."""
+"""Replicas of a run, thinned to a fixed size: smallest and largest value of each interval of steps."""
 
 from __future__ import annotations
 
@@ -49,24 +49,40 @@ def thin(
     numbers: int = NUMBERS,
 ) -> Thinned:
     """Thin one replica; the memory needed does not depend on the length of the run."""
+    return thin_together(states, slice(replica, replica + 1), reference, numbers)[0]
+
+
+def thin_together(
+    states: FloatArray,  # as in ``thin``
+    replicas: slice,
+    reference: float | None,
+    numbers: int,  # of each replica, at most about
+) -> list[Thinned]:
+    """Thin several replicas, each to the same width, while the states are read once."""
     count, agents = states.shape[:2]
+    several = len(range(states.shape[2])[replicas])
     width = max(1, math.ceil(2 * count * agents / numbers)) if count * agents > numbers else 1
     bins = math.ceil(count / width)
-    low, high = ({key: np.empty((bins, agents if key < 2 else 1), np.float32) for key in range(4)} for _ in range(2))
+    low, high = (
+        [np.empty((several, bins, agents if key < 2 else 1), np.float32) for key in range(4)] for _ in range(2)
+    )
     length = width * max(1, BLOCK_NUMBERS // max(1, width * states[:1].size))  # steps that are looked at together
     for first in range(0, count, length):
-        piece = np.clip(states[first : first + length, :, replica], -_LARGEST, _LARGEST)
-        centre = piece.mean(axis=1, keepdims=True) if reference is None else np.full((len(piece), 1), reference)
+        piece = np.clip(states[first : first + length, :, replicas], -_LARGEST, _LARGEST)
+        centre = piece.mean(axis=1, keepdims=True) if reference is None else np.full_like(piece[:, :1], reference)
         deviations = piece - centre
         error = np.minimum(np.square(deviations).sum(axis=1, keepdims=True), _LARGEST)
         starts = np.arange(0, len(piece), width)
         place = slice(first // width, first // width + len(starts))
         for key, series in enumerate((piece, deviations, centre, error)):
-            low[key][place] = np.fmin.reduceat(series, starts, axis=0)
-            high[key][place] = np.fmax.reduceat(series, starts, axis=0)
+            low[key][:, place] = np.moveaxis(np.fmin.reduceat(series, starts, axis=0), 2, 0)
+            high[key][:, place] = np.moveaxis(np.fmax.reduceat(series, starts, axis=0), 2, 0)
         release(states)
-    pairs = [(low[key], low[key] if width == 1 else high[key]) for key in range(4)]
-    return Thinned(width, *pairs)
+    pairs = [
+        [(one, one if width == 1 else other) for one, other in zip(*both, strict=True)]
+        for both in zip(low, high, strict=True)
+    ]
+    return [Thinned(width, *of_replica) for of_replica in zip(*pairs, strict=True)]
 
 
 def envelope(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:

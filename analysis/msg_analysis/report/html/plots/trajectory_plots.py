@@ -12,11 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""States, active graph and error of one replica on one time axis; the page's script fills in what is visible."""
+"""States, active graph and error of a replica on one time axis; the page's script fills in what is visible."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, PlainText, Range1d, RangeTool, UIElement
@@ -36,13 +38,14 @@ from msg_analysis.report.html.plots.colours import (
 )
 from msg_analysis.report.html.plots.plot_style import new_figure
 from msg_analysis.report.html.plots.run_events import KINDS, Event
-from msg_analysis.report.html.plots.thinned_run import Thinned, envelope, thin
+from msg_analysis.report.html.plots.thinned_run import NUMBERS, Thinned, envelope, thin, thin_together
 from msg_analysis.types import FloatArray, IntArray
 
-REPLICA = 0  # which is drawn, from 0
+OTHER_REPLICAS = 1_000_000  # bytes of the page for the replicas after the first
 MOST_SOJOURNS = 20_000  # of a run, that are drawn
 _WHOLE, _FIRST_SOJOURNS = 1500, 30  # steps of a run that is seen whole at first; sojourns visible at first of others
-_OVERVIEW = 400  # bins
+_LEAST_BINS = 250  # of a replica after the first, if the run has as many steps
+_UNKNOWN = 65_535  # stands for NaN among whole numbers of 16 bits
 _LEFT, _RIGHT = 76, 14  # pixels beside every figure: equal, so that they have one time axis
 _SIDES = {"min_border_left": _LEFT, "min_border_right": _RIGHT}
 _EVENT_STYLE = {
@@ -55,22 +58,35 @@ _EVENT_STYLE = {
 _TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
 
 
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """What of a run is in the figures."""
+
+    sojourns: int = 0
+    all_sojourns: int = 0  # of the run
+    replicas: int = 0
+
+
 def trajectory_plots(
     trajectory: Trajectory, predicted: float | None, events: Sequence[Event] = ()
-) -> tuple[dict[str, UIElement], tuple[int, int]]:
-    """The figures by name, empty for a run without states; with them, how many sojourns are drawn and are known."""
+) -> tuple[dict[str, UIElement], Drawn]:
+    """The figures by name, empty for a run without states, and what is in them."""
     experiment = trajectory.record.experiment
     states, modes, dt = trajectory.values, trajectory.modes, experiment.step_length
     if len(states) < 2 or not len(modes):
-        return {}, (0, 0)
+        return {}, Drawn()
     reference = None if experiment.problem == "consensus" else experiment.reference
-    thinned = thin(states, REPLICA, reference)
+    first = thin(states, 0, reference)
+    replicas, numbers = _room(*states.shape)
+    others = thin_together(states, slice(1, replicas), reference, numbers) if replicas > 1 else []
     names = [graph.name for graph in experiment.graph_list]
     starts = np.flatnonzero(np.diff(modes, prepend=-2))
     time = Range1d(*_first_view(starts, len(modes), events, dt), bounds=(0.0, float(len(modes) * dt)), name="time")
     shown = min(len(starts), MOST_SOJOURNS)
     end = int(starts[shown]) if shown < len(starts) else len(modes)
-    data = _data(thinned, experiment.agents, dt)
+    data = _data(first, experiment.agents, dt)
+    for number, thinned in enumerate(others, start=2):
+        data += _coded(thinned, experiment.agents, dt, number)
     data.append(
         _source("sojourns", start=np.append(starts[:shown], end) * dt, graph=np.append(modes[starts[:shown]], -1))
     )
@@ -80,9 +96,17 @@ def trajectory_plots(
         **({"events": _events(time, events, dt)} if events else {}),
         "path": _active_graph(time, names),
         "errors": _error(time, predicted),
-        "overview": _overview(time, thinned, float(len(modes) * dt)),
+        "overview": _overview(time, float(len(modes) * dt)),
     }
-    return figures, (shown, len(starts))
+    return figures, Drawn(shown, len(starts), replicas)
+
+
+def _room(count: int, agents: int, replicas: int) -> tuple[int, int]:
+    """How many replicas have room, the first included; to how many values of the agents the others are thinned."""
+    bin_size = (4 * agents + 8) * 2 * 4 / 3  # bytes: lowest and highest values of 16 bits, as text in base64
+    others = min(int(OTHER_REPLICAS / (bin_size * min(count, _LEAST_BINS))), replicas - 1)
+    bins = OTHER_REPLICAS / (bin_size * max(others, 1))
+    return 1 + others, min(int(2 * agents * bins), NUMBERS)
 
 
 def _first_view(starts: IntArray, steps: int, events: Sequence[Event], dt: float) -> tuple[float, float]:
@@ -102,26 +126,43 @@ def _source(label: str, **columns: object) -> ColumnDataSource:
 
 def _data(thinned: Thinned, agents: int, dt: float) -> list[ColumnDataSource]:
     """What the script draws from: agent by agent, and bin by bin."""
-    (low, high), (below, above) = thinned.values, thinned.deviations
-    columns = {"low": low, "deviation_low": below}
-    if thinned.width > 1:
-        columns |= {"high": high, "deviation_high": above}
-    band, spread = envelope(thinned.values), envelope(thinned.deviations)
+    by_agent, by_bin = _columns(thinned)
     return [
-        _source("thinned_agents", **{key: array.T.ravel() for key, array in columns.items()}),
-        _source(
-            "thinned_bins",
-            centre_low=thinned.centre[0][:, 0],
-            centre_high=thinned.centre[1][:, 0],
-            error_low=thinned.error[0][:, 0],
-            error_high=thinned.error[1][:, 0],
-            band_low=band[0],
-            band_high=band[1],
-            spread_low=spread[0],
-            spread_high=spread[1],
-        ),
-        _source("thinned_scale", width=[thinned.width], dt=[dt], agents=[agents]),
+        _source("thinned_agents_1", **by_agent),
+        _source("thinned_bins_1", **by_bin),
+        _source("thinned_scale_1", width=[thinned.width], dt=[dt], agents=[agents]),
     ]
+
+
+def _columns(thinned: Thinned) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    (low, high), (below, above) = thinned.values, thinned.deviations
+    by_agent = {"low": low, "deviation_low": below}
+    if thinned.width > 1:
+        by_agent |= {"high": high, "deviation_high": above}
+    pairs = {
+        "centre": (thinned.centre[0][:, 0], thinned.centre[1][:, 0]),
+        "error": (thinned.error[0][:, 0], thinned.error[1][:, 0]),
+        "band": envelope(thinned.values),
+        "spread": envelope(thinned.deviations),
+    }
+    by_bin = {f"{name}_{end}": pair[at] for name, pair in pairs.items() for at, end in enumerate(("low", "high"))}
+    return {name: array.T.ravel() for name, array in by_agent.items()}, by_bin
+
+
+def _coded(thinned: Thinned, agents: int, dt: float, number: int) -> list[ColumnDataSource]:
+    """The same in whole numbers of 16 bits, for a replica after the first; the scale has what one means."""
+    scale: dict[str, Any] = {"width": [thinned.width], "dt": [dt], "agents": [agents]}
+    coded = []
+    for label, columns in zip(("agents", "bins"), _columns(thinned), strict=True):
+        whole = {}
+        for name, column in columns.items():
+            known = column[~np.isnan(column)]
+            low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+            unit = (high - low) / (_UNKNOWN - 1) or 1.0
+            whole[name] = np.nan_to_num(np.rint((column - low) / unit), nan=_UNKNOWN).astype(np.uint16)
+            scale |= {f"{name}_from": [low], f"{name}_unit": [unit]}
+        coded.append(_source(f"thinned_{label}_{number}", **whole))
+    return [*coded, _source(f"thinned_scale_{number}", **scale)]
 
 
 def _states(time: Range1d, data: list[ColumnDataSource]) -> UIElement:
@@ -207,14 +248,13 @@ def _error(time: Range1d, predicted: float | None) -> UIElement:
     return plot
 
 
-def _overview(time: Range1d, thinned: Thinned, end: float) -> UIElement:
+def _overview(time: Range1d, end: float) -> UIElement:
     """The whole run, small, with the visible part as a frame that can be moved."""
-    low, high = (_fewer(part, least) for part, least in zip(envelope(thinned.values), (True, False), strict=True))
-    x = np.linspace(0.0, end, len(low))
     plot = new_figure(64, "", x_range=Range1d(0.0, end), toolbar_location=None, **_SIDES)
-    plot.varea(x, low, high, color=SKY, alpha=0.8)
-    plot.line(x, low, color=BLUE, line_width=0.7)
-    plot.line(x, high, color=BLUE, line_width=0.7)
+    source = _source("overview", x=[], low=[], high=[])
+    plot.varea("x", "low", "high", source=source, color=SKY, alpha=0.8)
+    plot.line("x", "low", source=source, color=BLUE, line_width=0.7)
+    plot.line("x", "high", source=source, color=BLUE, line_width=0.7)
     plot.yaxis.visible = False
     plot.ygrid.grid_line_color = None
     tool = RangeTool(x_range=time)
@@ -222,9 +262,3 @@ def _overview(time: Range1d, thinned: Thinned, end: float) -> UIElement:
     tool.overlay.line_color, tool.overlay.line_width = BLUE, 2
     plot.add_tools(tool)
     return plot
-
-
-def _fewer(values: FloatArray, lowest: bool) -> FloatArray:
-    """At most ``_OVERVIEW`` numbers."""
-    starts = np.unique(np.linspace(0, len(values), min(len(values), _OVERVIEW), endpoint=False).astype(np.int64))
-    return np.asarray((np.fmin if lowest else np.fmax).reduceat(values, starts))

@@ -11,19 +11,20 @@
   };
 
   // A finger on a figure scrolls the page, until a tool is chosen; sideways it moves the frame of the overview.
-  window.leaveScrolling = (shown) => {
-    for (const one of shown.all_models) if (["BoxZoomTool", "PanTool"].includes(one.type)) one.active = false;
-    for (const view of window.Bokeh.index.roots) {
-      if (view.canvas_view && view.model.toolbar.tools.some((tool) => tool.type === "RangeTool")) {
-        view.canvas_view.touch_action.replace(".bk-events { touch-action: pan-y; }");
-      }
+  window.leaveScrolling = (view) => {
+    if (!view.canvas_view) return;
+    const { tools } = view.model.toolbar;
+    for (const one of tools) if (["BoxZoomTool", "PanTool"].includes(one.type)) one.active = false;
+    if (tools.some((one) => one.type === "RangeTool")) {
+      view.canvas_view.touch_action.replace(".bk-events { touch-action: pan-y; }");
     }
   };
 
   // On paper nothing can be opened, and figures, which keep the width of the screen, would be cut: pictures are not.
   let closed = [], pictures = [];
-  // Between two listeners, the plots take over the colours for white pages.
+  // Between two listeners, the plots take over the colours for white pages, and those not yet seen are drawn.
   window.addEventListener("beforeprint", () => window.paintPaper());
+  window.addEventListener("beforeprint", () => window.drawAll());
   window.addEventListener("beforeprint", () => {
     closed = [...document.querySelectorAll("details:not([open])")];
     closed.forEach((one) => { one.open = true; });

@@ -71,9 +71,7 @@
     busy = false;
   }
 
-  function start() {
-    const shown = window.Bokeh && window.Bokeh.documents[0];
-    if (!shown) return setTimeout(start, 20);
+  window.withFigures((shown) => {
     window.paintPreferred();
     model = (name) => shown.get_model_by_name(name);
     const nodes = model("nodes");
@@ -85,14 +83,8 @@
     });
     choose([]);
     window.fitWidth(shown);
-    if (window.matchMedia("(pointer: coarse)").matches) window.leaveScrolling(shown);
     window.addEventListener("resize", () => window.fitWidth(shown));
-    document.body.dataset.started = "yes";
-    if (document.getElementById("trajectories")) return;  // its script says when it has drawn
-    const drawn = () => { document.body.dataset.ready = "yes"; };
-    if (shown.is_idle) drawn();
-    else shown.idle.connect(drawn);
-  }
+  });
 
   field.addEventListener("input", () => {
     const { agents, wrong } = window.parseAgents(field.value, rows.length);
@@ -100,6 +92,4 @@
     else said.textContent = `${wrong}: expected numbers from 1 to ${rows.length}, such as 3, 10-14`;
   });
   document.getElementById("all-agents").addEventListener("click", () => { field.value = ""; choose([]); });
-
-  start();
 })();

@@ -1,7 +1,5 @@
 "use strict";
 {
-  const SVG = "http://www.w3.org/2000/svg";
-  const at = (id) => document.getElementById(id);
   const data = JSON.parse(at("data").textContent), runs = data.runs;
   const body = at("runs").tBodies[0], rows = [...body.rows];
   let shown = [], points = [], active = -1, pair = [];
@@ -9,13 +7,6 @@
   const number = (value, digits = 4) => value === null ? "–" : String(Number(value.toPrecision(digits))).replace("-", "−");
   const signed = (value, digits = 3) => (value > 0 ? "+" : "") + number(value, digits);
   const interval = (run) => number(run.measured, 5) + (run.standard_error === null ? "" : ` ± ${number(data.half * run.standard_error, 2)}`);
-  function element(kind, attributes, parent, text) {
-    const made = document.createElementNS(SVG, kind);
-    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-    if (text !== undefined) made.textContent = text;
-    parent.append(made);
-    return made;
-  }
   function node(kind, parent, text, attributes = {}) {
     const made = document.createElement(kind);
     for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -63,13 +54,6 @@
     for (const place of shown) if (runs[place].measured !== null) counts.set(runs[place].name, (counts.get(runs[place].name) || 0) + 1);
     return [...counts].sort((a, b) => b[1] - a[1])[0]?.[0];
   }
-  function ticks(low, high, count) {
-    const rough = (high - low) / count, size = 10 ** Math.floor(Math.log10(rough));
-    const step = [1, 2, 5, 10].map((part) => part * size).find((part) => part >= rough);
-    const found = [];
-    for (let value = Math.ceil(low / step) * step; value <= high + step * 1e-9; value += step) found.push(Number(value.toPrecision(12)));
-    return found;
-  }
   function draw() {
     const name = experiment(), box = at("plot");
     points = shown.filter((place) => runs[place].name === name && runs[place].measured !== null)
@@ -90,7 +74,7 @@
     low -= margin; high += margin;
     const x = (place) => left + (place + 0.5) / points.length * (width - left - right);
     const y = (value) => top + (high - value) / (high - low) * (height - top - bottom);
-    for (const value of ticks(low, high, 5)) {
+    for (const value of ticks(low, high, 5).values) {
       element("line", { class: "grid", x1: left, x2: width - right, y1: y(value), y2: y(value) }, svg);
       element("text", { x: left - 8, y: y(value) + 4, "text-anchor": "end" }, svg, number(value));
     }

@@ -56,17 +56,10 @@
     fitValues(shown);
   }
 
-  function start() {
-    const shown = window.Bokeh && window.Bokeh.documents[0];
-    if (!shown) return setTimeout(start, 20);
+  window.withFigures((shown) => {
     window.paintPreferred();
     model = (name) => shown.get_model_by_name(name);
     fit(shown);
-    if (window.matchMedia("(pointer: coarse)").matches) window.leaveScrolling(shown);
     window.addEventListener("resize", () => fit(shown));
-    const drawn = () => { document.body.dataset.ready = "yes"; };
-    if (shown.is_idle) drawn();
-    else shown.idle.connect(drawn);
-  }
-  start();
+  });
 })();

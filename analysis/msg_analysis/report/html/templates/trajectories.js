@@ -6,13 +6,29 @@
   const COLOURS = JSON.parse(document.body.dataset.colours);
   const FIRST = JSON.parse(document.body.dataset.shown), ACCUSED = new Set(JSON.parse(document.body.dataset.accused));
   const DASHES = ["solid", "dashed", "dotted", "dotdash"];
-  const MOST_STRIPS = 1500, MOST_BUTTONS = 120;
+  const MOST_STRIPS = 1500, MOST_BUTTONS = 120, OVERVIEW = 400, UNKNOWN = 65535;
   const from = document.getElementById("from"), to = document.getElementById("to");
   const field = document.getElementById("shown-agents"), buttons = document.getElementById("agent-buttons");
-  let model, scale, agents, time, bins, on, planned = false;
+  const replica = document.getElementById("replica");  // null: there is one
+  let model, scale, agents, time, bins, run, on, planned = false;
 
   const column = (source, name) => model(source).data[name];
   const bin = (value) => value / (scale.width * scale.dt);
+
+  // The columns of a replica; those after the first are in whole numbers of 16 bits.
+  const runs = new Map();
+  function columnsOf(number) {
+    if (!runs.has(number)) {
+      const data = (label) => model(`thinned_${label}_${number}`).data, size = data("scale"), columns = {};
+      for (const label of ["agents", "bins"]) for (const [name, whole] of Object.entries(data(label))) {
+        const [unit] = size[`${name}_unit`] || [], [from] = size[`${name}_from`] || [];
+        columns[name] = unit === undefined ? whole :
+          Float32Array.from(whole, (value) => (value === UNKNOWN ? NaN : from + value * unit));
+      }
+      runs.set(number, { columns, width: size.width[0], dt: size.dt[0], agents: size.agents[0] });
+    }
+    return runs.get(number);
+  }
 
   // The bins [first, last) of a series as a line of at most about two points per pixel.
   function line(low, high, offset, first, last, pixels) {
@@ -52,7 +68,7 @@
 
   function drawStates(first, last, pixels) {
     const deviation = document.getElementById("deviation").checked, part = deviation ? "deviation_" : "";
-    const data = model("thinned_agents").data, low = data[`${part}low`], high = data[`${part}high`] || low;
+    const low = run[`${part}low`], high = run[`${part}high`] || low;
     const chosen = [...on].sort((a, b) => ACCUSED.has(a) - ACCUSED.has(b) || a - b);  // the accused on top
     const lines = chosen.map((agent) => line(low, high, (agent - 1) * bins, first, last, pixels));
     model("states").data = {
@@ -63,15 +79,14 @@
     };
     const found = [Infinity, -Infinity];
     for (const [, ys] of lines) extremes(ys, found);
-    const middle = deviation ? [[], []] :
-      line(column("thinned_bins", "centre_low"), column("thinned_bins", "centre_high"), 0, first, last, pixels);
+    const middle = deviation ? [[], []] : line(run.centre_low, run.centre_high, 0, first, last, pixels);
     if (deviation) middle[0].push(time.start, time.end), middle[1].push(0, 0);
     model("centre").data = { x: middle[0], y: middle[1] };
     extremes(middle[1], found);
     const band = { x: [], low: [], high: [] };
     if (on.size < agents) {
       const name = deviation ? "spread" : "band";
-      const bottom = column("thinned_bins", `${name}_low`), top = column("thinned_bins", `${name}_high`);
+      const bottom = run[`${name}_low`], top = run[`${name}_high`];
       const step = Math.max(1, Math.ceil((last - first) / pixels));
       for (let start = first; start < last; start += step) {
         band.x.push((start + step / 2) * scale.width * scale.dt);
@@ -87,7 +102,7 @@
   }
 
   function drawError(first, last, pixels) {
-    const [x, y] = line(column("thinned_bins", "error_low"), column("thinned_bins", "error_high"), 0, first, last, pixels);
+    const [x, y] = line(run.error_low, run.error_high, 0, first, last, pixels);
     model("error").data = { x, y };
     const predicted = model("predicted");
     range(model("error_range"), extremes(predicted ? predicted.data_source.data.y : [], extremes(y, [0, 0])), 0);
@@ -201,24 +216,36 @@
     }
   }
 
-  function start() {
-    const shown = window.Bokeh && window.Bokeh.documents[0];
-    if (!shown || !document.body.dataset.started) return setTimeout(start, 20);
+  function chooseReplica(number) {
+    scale = columnsOf(number);
+    run = scale.columns;
+    agents = scale.agents;
+    bins = run.error_low.length;
+    document.getElementById("this-replica").textContent = number;
+    document.getElementById("thinned").textContent =
+      scale.width > 1 ? ` Smallest and largest value of every ${scale.width} steps.` : "";
+    const points = Math.min(bins, OVERVIEW), x = Array.from({ length: points }, (_, i) => (i / (points - 1)) * time.bounds[1]);
+    const piece = (ends, i) => ends.slice(Math.floor((i * bins) / points), Math.floor(((i + 1) * bins) / points));
+    const most = (ends, which) => x.map((_, i) => extremes(piece(ends, i), [Infinity, -Infinity])[which])
+      .map((value) => (Number.isFinite(value) ? value : NaN));
+    model("overview").data = { x, low: most(run.band_low, 0), high: most(run.band_high, 1) };
+  }
+
+  window.withFigures((shown) => {
     model = (name) => shown.get_model_by_name(name);
-    const found = model("thinned_scale").data;
-    scale = { width: found.width[0], dt: found.dt[0] };
-    agents = found.agents[0];
     time = model("time");
-    bins = column("thinned_bins", "error_low").length;
+    chooseReplica(1);
     for (const key of ["start", "end"]) time.properties[key].change.connect(plan);
     makeButtons();
     show(FIRST);
     draw();
     window.addEventListener("resize", plan);
-    const drawn = () => { document.body.dataset.ready = "yes"; };
-    if (shown.is_idle) drawn();
-    else shown.idle.connect(drawn);
-  }
+  });
+
+  if (replica) replica.addEventListener("change", () => {
+    chooseReplica(Number(replica.value));
+    plan();
+  });
 
   const part = (start, end) => () => {
     const length = time.end - time.start;
@@ -248,5 +275,4 @@
     look(at - length / 3, at + 2 * length / 3);
     box.scrollIntoView();
   });
-  start();
 })();
