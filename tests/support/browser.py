@@ -21,29 +21,50 @@ CUT = """() => [...document.querySelectorAll("body *")].filter((one) => {
     const box = one.getBoundingClientRect();
     return box.width > 0 && !one.closest(".hidden") && (box.left < -0.5 || box.right > innerWidth + 0.5);
 }).map((one) => one.outerHTML.slice(0, 200))"""
-# Texts whose contrast to their background is below that of WCAG 2.2, level AA.
+# The same where boxes scroll on their own, and what is called for waits beside the window.
+CUT_OR_SCROLLED = """() => [...document.querySelectorAll("body *")].filter((one) => {
+    const box = one.getBoundingClientRect();
+    if (box.width === 0 || (box.left >= -0.5 && box.right <= innerWidth + 0.5)) return false;
+    if (!one.checkVisibility({ opacityProperty: true, visibilityProperty: true })) return false;
+    for (let place = one.parentElement; place !== document.body; place = place.parentElement) {
+        const style = getComputedStyle(place);
+        if (/auto|scroll/.test(style.overflowX) || style.position === "fixed") return false;
+    }
+    return getComputedStyle(one).position !== "fixed";
+}).map((one) => one.outerHTML.slice(0, 200))"""
+# Texts whose contrast to their background is below that of WCAG 2.2, level AA, whatever shines through both.
 FAINT = """() => {
     const numbers = (colour) => (colour.match(/[0-9.]+/g) || []).map(Number);
     const part = (value) => (value <= 0.04045 * 255 ? value / 255 / 12.92 : ((value / 255 + 0.055) / 1.055) ** 2.4);
     const light = ([r, g, b]) => 0.2126 * part(r) + 0.7152 * part(g) + 0.0722 * part(b);
+    const over = (front, back, share) => [0, 1, 2].map((i) => share * front[i] + (1 - share) * back[i]);
     const behind = (one) => {
+        const layers = [];
         for (let place = one; place; place = place.parentElement) {
             const found = numbers(getComputedStyle(place).backgroundColor);
-            if (found.length === 3 || found[3] === 1) return found;
+            if (found.length === 3 || found[3] > 0) layers.push(found);
+            if (found.length === 3 || found[3] === 1) break;
         }
-        return [255, 255, 255];
+        return layers.reduceRight((back, front) => over(front, back, front[3] ?? 1), [255, 255, 255]);
+    };
+    const opaque = (one) => {
+        let share = 1;
+        for (let place = one; place; place = place.parentElement) share *= getComputedStyle(place).opacity;
+        return share;
     };
     const faint = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
     for (let node = walker.nextNode(); node; node = walker.nextNode()) {
         const one = node.parentElement, style = getComputedStyle(one);
         const unseen = one.closest("script, style, option, .hidden, .bk-Root");
         if (!node.data.trim() || !one.checkVisibility() || unseen) continue;
-        const colour = numbers(one.closest("svg") ? style.fill : style.color);
+        const drawn = numbers(one.closest("svg") ? style.fill : style.color), share = opaque(one) * (drawn[3] ?? 1);
+        if (share < 0.05) continue;  // shown when it is asked for
         const outlined = style.paintOrder.startsWith("stroke") && style.stroke !== "none";
-        const ground = outlined ? numbers(style.stroke) : behind(one);
+        const ground = outlined ? numbers(style.stroke) : behind(one), colour = over(drawn, ground, share);
         const [high, low] = [light(colour), light(ground)].sort((a, b) => b - a);
         const size = parseFloat(style.fontSize), large = size >= 24 || (size >= 18.66 && style.fontWeight >= 700);
-        if ((high + 0.05) / (low + 0.05) < (large ? 3 : 4.5)) faint.push([node.data.trim(), colour.join()]);
+        if ((high + 0.05) / (low + 0.05) >= (large ? 3 : 4.5)) continue;
+        faint.push([node.data.trim(), colour.map(Math.round).join()]);
     }
     return faint;
 }"""
