@@ -11,7 +11,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from browser import Log, chromium
+from browser import CUT_OR_SCROLLED, FAINT, Log, chromium
 from pages import EXPERIMENTS, ROOT, blocks
 
 LOADS = {"img": "src", "script": "src", "iframe": "src", "source": "src", "link": "href"}
@@ -120,6 +120,8 @@ def test_example_report(site: Path) -> None:
         inside = page.frame_locator("iframe.report")
         inside.locator("body[data-ready=yes]").wait_for()
         assert inside.locator(".verdict strong").inner_text() == "✓ The run agrees with the prediction."
+        inside.locator("body").evaluate("() => window.drawAll()")  # also what is below
+        inside.locator("body[data-ready=yes]").wait_for()
         assert inside.locator(".plot canvas").count() > 5
         page.locator("label[for=__palette_1]").click()
         follows = """() => new Promise((done) => {
@@ -134,6 +136,21 @@ def test_example_report(site: Path) -> None:
         assert alone.url == report.as_uri()
     assert [url for url in log.requests if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
     assert log.complaints == []
+
+
+@pytest.mark.parametrize("scheme", ["default", "slate"])
+def test_texts_can_be_read(site: Path, scheme: str) -> None:
+    """On pages with tables, graphs, code in several languages, equations and the API: no text is faint or cut."""
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 390, "height": 844})
+        for name in ("index", "examples", "commands", "theory", "api", "which_page"):
+            page.goto((site / f"{name}.html").as_uri())
+            page.add_style_tag(content="* { transition: none !important; }")
+            page.evaluate(f"document.body.dataset.mdColorScheme = '{scheme}'")
+            for width in (390, 1280):
+                page.set_viewport_size({"width": width, "height": 844})
+                assert page.evaluate(FAINT) == [], (name, width)
+                assert page.evaluate(CUT_OR_SCROLLED) == [], (name, width)
 
 
 def test_in_a_browser(site: Path, pages: dict[Path, Links]) -> None:
