@@ -41,12 +41,13 @@
         if (!(low[i] >= least)) least = Number.isNaN(low[i]) ? least : low[i];
         if (!(high[i] <= most)) most = Number.isNaN(high[i]) ? most : high[i];
       }
-      const x = (at(start) + at(end - 1)) / 2;
+      const x = (at(start) + at(end - 1)) / 2, before = ys[ys.length - 1];
+      const down = Math.abs(most - before) < Math.abs(least - before);  // the nearer end first: no saw-teeth
       xs.push(x);
-      ys.push(least);
+      ys.push(down ? most : least);
       if (most > least) {
         xs.push(x);
-        ys.push(most);
+        ys.push(down ? least : most);
       }
     }
     return [xs, ys];
