@@ -181,7 +181,7 @@ def one_run(job: tuple[str, int], _stopping: Callable[[], bool]) -> dict[str, An
     true, claimed = (each.with_run(seed=seed) for each in experiment(case))
     record = new_record(claimed)
     trajectory = simulate(true, record=RunRecord(record.run, true, record.start))
-    lost = trajectory.lost if claimed.noise.loss else None  # messages that are ignored are not in the log
+    lost = trajectory.lost if claimed.noise.loss.any else None  # messages that are ignored are not in the log
     comparison = compare(dataclasses.replace(trajectory, record=record, lost=lost))
     return summary(case, comparison)
 

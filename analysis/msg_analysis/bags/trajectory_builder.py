@@ -120,7 +120,7 @@ class Collected:
         self._graphs = len(experiment.graph_list)
         self._realtime = experiment.run.pace == "realtime"
         self._record, self._experiment = record, experiment
-        self._lossy = bool(experiment.noise.loss) or self._realtime
+        self._lossy = experiment.noise.loss.any or self._realtime
         most = self._links.most if self._lossy else 0
         cells = self._shape[0] * self._shape[1]
         # The result has the size that the record states, however little of it the bag holds.

@@ -345,7 +345,7 @@ def _system(experiment: ValidExperiment, law: TransientLaw) -> tuple[JumpSystem,
     noise = experiment.noise
     if experiment.protocol:
         raise InputError(f"--law continuous: {experiment.protocol.info} has steps only: leave --law out")
-    if noise.broadcast or noise.link or noise.loss or noise.delay:
+    if noise.steps_only:
         raise InputError(
             "--law continuous: noise.broadcast, link, loss and delay belong to steps, expected 0: leave --law out"
         )

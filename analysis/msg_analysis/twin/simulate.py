@@ -106,5 +106,5 @@ def _simulate_agents(record: RunRecord) -> Trajectory:
         modes,
         Completeness(expected, expected, 0),
         published=published if experiment.truth else None,
-        lost=lost if experiment.noise.loss else None,
+        lost=lost if experiment.noise.loss.any else None,
     )

@@ -128,7 +128,7 @@ def decode_of_run(kind: type[Message], data: bytes, run: bytes) -> Message | str
 def state_frame(record: RunRecord, *, whole: bool) -> StateFrame:
     """Reads the states of a run: the whole ones, or those that agents publish on the topic ``state``."""
     experiment = record.experiment
-    lists_heard = experiment.noise.loss or experiment.run.pace == "realtime"
+    lists_heard = experiment.noise.loss.any or experiment.run.pace == "realtime"
     width = experiment.width if whole else experiment.run.replicas
     return StateFrame(record.run.bytes, width, experiment.agents - 1 if lists_heard else 0)
 

@@ -46,7 +46,7 @@ class Writers:
         ]
 
     def write(self, last: int) -> None:
-        lossy = self.record.experiment.noise.loss > 0
+        lossy = self.record.experiment.noise.loss.any
         for step in range(self._done + 1, last + 1):
             mode = int(self._trajectory.modes[step - 1]) + 1 if step else 0
             for agent, (file, codec) in enumerate(zip(self._files, self._codecs, strict=True)):

@@ -50,7 +50,7 @@ def test_every_choice_gives_a_valid_file(chosen: Choices, tmp_path: Path) -> Non
     experiment.require_available()
     assert (experiment.agents, experiment.time, experiment.steps) == (chosen.agents, chosen.time, 4000)
     assert experiment.run.seed == chosen.seed
-    assert experiment.spec.noise.loss == chosen.loss
+    assert experiment.spec.noise.loss.default == chosen.loss
     np.testing.assert_allclose(experiment.noise_gain, [chosen.noise * np.eye(chosen.agents)] * len(chosen.graphs))
     for graph, kind in zip(experiment.graph_list, chosen.graphs, strict=True):
         assert graph.name == kind

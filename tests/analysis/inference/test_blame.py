@@ -44,7 +44,7 @@ def run(truth, claimed):
     true, claim = ValidExperiment.parse(truth), ValidExperiment.parse(claimed)
     record = new_record(claim)
     trajectory = simulate(true, record=RunRecord(record.run, true, record.start))
-    lost = trajectory.lost if claim.noise.loss else None
+    lost = trajectory.lost if claim.noise.loss.any else None
     return dataclasses.replace(trajectory, record=record, lost=lost)
 
 

@@ -150,7 +150,7 @@ def simulate_air(experiment, seed):
         x = states[k]
         sent = published[k] = x + noise.broadcast * random.standard_normal(x.shape)
         heard = sent[None] + noise.link * random.standard_normal((m, m, replicas))
-        arrived = random.random((m, m)) >= noise.loss
+        arrived = random.random((m, m)) >= noise.loss.default
         pull = (adjacency[g][:, :, None] * arrived[:, :, None] * (heard - x[:, None])).sum(axis=1)
         process = experiment.noise_gain[g] @ random.standard_normal(x.shape)
         states[k + 1] = x + dt * pull + np.sqrt(dt) * process
@@ -160,7 +160,7 @@ def simulate_air(experiment, seed):
     record = RunRecord(uuid.UUID(int=seed), experiment, states[0])
     count = 2 * states[:, :, 0].size
     complete = Completeness(count, count, 0)
-    return Trajectory(record, states, np.array(modes), complete, None, published, lost if noise.loss else None)
+    return Trajectory(record, states, np.array(modes), complete, None, published, lost if noise.loss.any else None)
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])

@@ -50,7 +50,7 @@ def test_defaults_of_a_minimal_file() -> None:
         "agents": 3,
         "graphs": {"line": {"path": [1, 2, 3]}},
         "switching": {"scale": 1.0, "initial": "stationary"},
-        "noise": {"process": 1.0, "broadcast": 0.0, "link": 0.0, "loss": 0.0, "delay": 0},
+        "noise": {"process": 1.0, "broadcast": 0.0, "link": 0.0, "loss": 0.0, "on_loss": "own", "delay": 0},
         "run": {
             "dt": 0.05,
             "duration": 100.0,

@@ -104,7 +104,7 @@ def squared_deviations(experiment, process, seed):
         if noise.link:
             pull = pull + noise.link * random.standard_normal((NETWORKS, m, m))
         if noise.loss:  # a lost value is replaced by one's own
-            pull = np.where(random.random((NETWORKS, m, m)) >= noise.loss, pull, x[:, :, None])
+            pull = np.where(random.random((NETWORKS, m, m)) >= noise.loss.default, pull, x[:, :, None])
         drawn = random.standard_normal(x.shape)
         moved = np.empty_like(x)
         for g in range(len(weights)):

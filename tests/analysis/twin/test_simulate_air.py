@@ -84,7 +84,7 @@ def test_equals_a_loop_over_numbers_to_the_last_bit(law: str, air: str) -> None:
         return philox(LOSS, i * 2**32 + j, block).random(BLOCK).tolist()
 
     def lost(i: int, j: int, k: int) -> bool:
-        return uniform(i, j, k // BLOCK)[k % BLOCK] < noise.loss
+        return uniform(i, j, k // BLOCK)[k % BLOCK] < noise.loss.default
 
     x = trajectory.states[0].tolist()
     for k, g in enumerate(trajectory.modes.tolist()):
@@ -117,7 +117,7 @@ def test_equals_a_loop_over_numbers_to_the_last_bit(law: str, air: str) -> None:
         x = following
         assert x == trajectory.states[k + 1].tolist(), k
     assert (trajectory.published is None) == (not noise.broadcast)
-    assert (trajectory.lost is None) == (not noise.loss)
+    assert (trajectory.lost is None) == (not noise.loss.any)
 
 
 @pytest.mark.parametrize("resumed", [0, 100, 256, 290])

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -64,6 +64,8 @@ class ValidExperiment:
         the Markov chain that switches between the graphs
     noise_gain
         (n, m, m) F_i; Q_i = F_i F_i^T
+    loss
+        (m, m) probability that a message from agent j (column) to agent i (row) is lost; 0 on the diagonal
     source
         where the experiment came from, for messages
     protocol
@@ -74,6 +76,7 @@ class ValidExperiment:
     graph_list: tuple[Graph, ...]
     chain: MarkovChain
     noise_gain: FloatArray
+    loss: FloatArray
     source: str = "experiment"
     protocol: ChosenProtocol | None = None
 
@@ -164,8 +167,15 @@ class ValidExperiment:
             raise ExperimentError(source, sections.problems)
         assert sections.chain is not None
         assert sections.noise_gain is not None
+        assert sections.loss is not None
         experiment = cls(
-            sections.spec(), sections.graphs, sections.chain, sections.noise_gain, source, sections.protocol
+            spec=sections.spec(),
+            graph_list=sections.graphs,
+            chain=sections.chain,
+            noise_gain=sections.noise_gain,
+            loss=sections.loss,
+            source=source,
+            protocol=sections.protocol,
         )
         return experiment._with_protocol(sections.protocol, recorded) if sections.protocol else experiment
 
@@ -223,26 +233,47 @@ class ValidExperiment:
         purpose
             "run" (simulate it or run a network) or "predict"
         """
-        lines = []
-        if self.run.pace == "realtime":
-            lines += self._unavailable_in_real_time()
-        elif purpose == "run" and self.noise.delay > 0:
-            lines.append(problem("noise.delay", self.noise.delay, "not available in runs yet", "use 0"))
+        lines = self._unpredicted() if purpose == "predict" else self._not_run()
         if self.protocol:
             lines += self.protocol.unavailable(purpose)
         return lines
 
-    def _unavailable_in_real_time(self) -> list[str]:
-        noise = self.noise
-        lines = [
-            problem(f"noise.{key}", value, "not available in real time yet", "use 0, or run.pace: lockstep")
-            for key in ("broadcast", "link", "loss", "delay")
-            if (value := getattr(noise, key))
-        ]
-        if self.protocol and not self.protocol.linear:
-            name = show(self.protocol.info.name)
-            lines.append(problem("protocol.name", name, "in real time expected a linear one", "use run.pace: lockstep"))
+    def _not_run(self) -> list[str]:
+        """What is not available in runs."""
+        if self.run.pace == "realtime":
+            lines = self._only_lockstep(("broadcast", "link", "loss", "delay"))
+            if self.protocol and not self.protocol.linear:
+                name, wanted = show(self.protocol.info.name), "in real time expected a linear one"
+                lines.append(problem("protocol.name", name, wanted, "use run.pace: lockstep"))
+            return lines
+        lines = self._special_losses("not available in runs yet")
+        if self.noise.delay > 0:
+            lines.append(problem("noise.delay", self.noise.delay, "not available in runs yet", "use 0"))
         return lines
+
+    def _unpredicted(self) -> list[str]:
+        """What has no prediction, apart from protocols."""
+        if self.run.pace == "realtime":
+            return self._only_lockstep(("broadcast", "link", "loss", "delay"))
+        return self._special_losses("has no prediction yet")
+
+    def _special_losses(self, why: str) -> list[str]:
+        noise, lines = self.noise, []
+        if noise.holds:
+            lines.append(problem("noise.on_loss", noise.on_loss, why, "use own"))
+        if noise.loss.any and noise.burst is not None:
+            lines.append(problem("noise.burst", noise.burst, why, "remove it"))
+        if noise.loss.any and (noise.loss.edges or noise.loss.arcs):
+            lines.append(problem("noise.loss", "by link", why, "use a number"))
+        return lines
+
+    def _only_lockstep(self, keys: Sequence[str]) -> list[str]:
+        noise = {**self.noise.model_dump(), "loss": self.noise.loss.short() if self.noise.loss.any else 0}
+        return [
+            problem(f"noise.{key}", noise[key], "not available in real time yet", "use 0, or run.pace: lockstep")
+            for key in keys
+            if noise[key]
+        ]
 
     def require_available(self, purpose: Purpose = "run") -> None:
         """Raise an error if the experiment asks for something that this version cannot do.

@@ -28,9 +28,9 @@ from msg_analysis.model.experiment import graph_sources, memory, protocol_bindin
 from msg_analysis.model.experiment.graph_sources import ForeignGraph, GraphError, is_networkx
 from msg_analysis.model.experiment.problems import problem, show, translate
 from msg_analysis.model.experiment.protocol_binding import ChosenProtocol, ProtocolInfo
-from msg_analysis.model.experiment.spec import ExperimentSpec, GraphSpec, RunSpec
+from msg_analysis.model.experiment.spec import ExperimentSpec, GraphSpec, NoiseSpec, RunSpec
 from msg_analysis.model.network.graphs import Graph
-from msg_analysis.model.network.markov_chain import MarkovChain
+from msg_analysis.model.network.markov_chain import MarkovChain, Time
 from msg_analysis.types import FloatArray
 
 
@@ -87,6 +87,7 @@ class Sections:
         self.graphs: tuple[Graph, ...] = ()
         self.chain: MarkovChain | None = None
         self.noise_gain: FloatArray | None = None
+        self.loss: FloatArray | None = None
         self._recorded = recorded
         self.protocol: ChosenProtocol | None = None
 
@@ -120,6 +121,8 @@ class Sections:
         if not self.graphs or not leaders_good:
             return
         self.problems += validation.connection_problems(self.graphs, leaders, self.values["names"])
+        if self.values["noise"] and time:
+            self._resolve_losses(self.values["noise"], time)
         built_in = "protocol" in self.known and self.values["protocol"] is None
         if time == "continuous" and run and built_in:
             gains = validation.leader_gains(leaders, self.agents)
@@ -227,6 +230,17 @@ class Sections:
         self.values["leaders"] = leaders.model_copy(update={"agents": known})
         if unknown:
             self.known.discard("leaders")
+
+    def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
+        """Numbers instead of names in ``noise.loss``, and the probability of every link."""
+        names: list[str] | None = self.values["names"]
+        loss, found = topology.numbered_losses(noise.loss, names)
+        if not found:
+            self.values["noise"] = noise.model_copy(update={"loss": loss})
+            self.loss, found = topology.loss_matrix(loss, self.graphs, time, names)
+        self.problems += found
+        if noise.burst is not None and not found:
+            self.problems += validation.burst_problems(noise.burst, loss)
 
     def _fits(self, run: RunSpec | None) -> bool:
         assert self.agents is not None

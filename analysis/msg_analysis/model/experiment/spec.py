@@ -46,6 +46,8 @@ NAME_PATTERN = r"^\S(.{0,62}\S)?$"
 GraphName = Annotated[str, Field(pattern=NAME_PATTERN)]
 AgentName = Annotated[str, Field(pattern=NAME_PATTERN)]
 Link = tuple[int, int, float]
+LARGEST_BURST = 1e6  # messages: what an agent that restarts has to draw again grows with it
+Probability = Annotated[Number, Field(ge=0, lt=1)]
 Matrix = list[list[Number]]
 NoiseGain = float | list[float] | list[list[float]]
 Purpose = Literal["predict", "run"]
@@ -77,6 +79,30 @@ def _link(value: object) -> Link:
     if not is_number(weight) or weight <= 0:
         raise expected("a weight > 0 as the third entry")
     return (first, second, float(weight))
+
+
+def _lossy_link(value: object) -> tuple[int | str, int | str, float]:
+    wanted = expected("[agent, agent, probability], agents by number or name, 0 <= probability < 1")
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise wanted
+    first, second, probability = value
+    for agent in (first, second):
+        if not (_is_count(agent) or (isinstance(agent, str) and re.match(NAME_PATTERN, agent))):
+            raise wanted
+    if not is_number(probability) or not 0 <= probability < 1:
+        raise wanted
+    return (first, second, float(probability))
+
+
+def _loss(value: object, section: ValidatorFunctionWrapHandler) -> Any:
+    """The section; a number stands for one with nothing but a default."""
+    if isinstance(value, dict | LossSpec):
+        return section(value)
+    if not is_number(value):
+        raise expected("a probability, or keys with probabilities: default, edges, arcs")
+    if not 0 <= value < 1:  # type: ignore[operator]
+        raise expected("a number >= 0" if value < 0 else "a number < 1")  # type: ignore[operator]
+    return section({"default": value})
 
 
 def _process(value: object) -> NoiseGain | dict[str, NoiseGain]:
@@ -237,6 +263,38 @@ class SwitchingSpec(_Section):
     initial: str = Field("stationary", description="'stationary' or a graph's name", examples=["stationary"])
 
 
+LossyLinks = list[
+    Annotated[
+        tuple[int | str, int | str, float],
+        BeforeValidator(_lossy_link, json_schema_input_type=tuple[Label | AgentName, Label | AgentName, Probability]),
+    ]
+]
+
+
+class LossSpec(_Section):
+    """The probability that a message is lost, by link."""
+
+    default: Probability = Field(0.0, description="of all links that are not listed", examples=[0.1])
+    edges: LossyLinks = Field(
+        [], description="of links in both directions: [agent, agent, probability]", examples=[[[1, 2, 0.5]]]
+    )
+    arcs: LossyLinks = Field(
+        [],
+        description="of links in one direction: [1, 2, 0.5] means messages from agent 1 to agent 2",
+        examples=[[[1, 2, 0.5]]],
+    )
+
+    @property
+    def any(self) -> bool:
+        """Whether a message of some link can be lost."""
+        return self.default > 0 or any(probability > 0 for *_, probability in (*self.edges, *self.arcs))
+
+    def short(self) -> Any:
+        """What a file would have: the number alone where all links have the same."""
+        links = {key: found for key in ("edges", "arcs") if (found := getattr(self, key))}
+        return {"default": self.default, **links} if links else self.default
+
+
 _Gain = NonNegative | list[NonNegative] | Matrix
 
 
@@ -254,8 +312,22 @@ class NoiseSpec(_Section):
     )
     broadcast: NonNegative = Field(0.0, description="standard deviation added to each published value", examples=[0.0])
     link: NonNegative = Field(0.0, description="standard deviation added by each receiver", examples=[0.0])
-    loss: Annotated[Number, Field(ge=0, lt=1)] = Field(
-        0.0, description="probability that a directed message is ignored in a step", examples=[0.0]
+    loss: Annotated[
+        LossSpec,
+        WrapValidator(_loss, json_schema_input_type=Probability | LossSpec),
+        PlainSerializer(LossSpec.short, return_type=Any),
+    ] = Field(
+        LossSpec(), description="probability that a directed message is lost; a number, or by link", examples=[0.0]
+    )
+    on_loss: Literal["own", "hold"] = Field(
+        "own",
+        description="what an agent uses in place of a lost value: its own, or the last value that it heard",
+        examples=["hold"],
+    )
+    burst: Annotated[Number, Field(ge=1, le=LARGEST_BURST)] | None = Field(
+        None,
+        description="mean number of messages of a link that are lost in a row; by default losses are independent",
+        examples=[5],
     )
     delay: Annotated[int, Field(strict=True, ge=0, le=LARGEST_COUNT)] = Field(
         0, description="age, in steps, of the values of others that a step uses", examples=[0]
@@ -264,7 +336,12 @@ class NoiseSpec(_Section):
     @property
     def on_air(self) -> bool:
         """Whether there is broadcast noise, link noise or loss between the agents."""
-        return bool(self.broadcast or self.link or self.loss)
+        return bool(self.broadcast or self.link or self.loss.any)
+
+    @property
+    def holds(self) -> bool:
+        """Whether messages can be lost, and the last value heard takes the place of a lost one."""
+        return self.loss.any and self.on_loss == "hold"
 
     @property
     def steps_only(self) -> bool:

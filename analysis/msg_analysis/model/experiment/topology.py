@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From the ways in which the file gives a graph to links and matrices."""
+"""From the ways in which the file gives a graph, or the losses of links, to links and matrices."""
 
 from __future__ import annotations
 
@@ -21,10 +21,13 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
-from msg_analysis.common.text.agent_names import agent_text
+from msg_analysis.common.text.agent_names import agent_name, agent_text
+from msg_analysis.common.text.number_words import listed
 from msg_analysis.model.experiment.problems import problem, show
-from msg_analysis.model.experiment.spec import GraphSpec, Link
-from msg_analysis.model.network.graphs import Graph
+from msg_analysis.model.experiment.spec import GraphSpec, Link, LossSpec
+from msg_analysis.model.network.graphs import Graph, hops
+from msg_analysis.model.network.markov_chain import Time
+from msg_analysis.types import BoolArray, FloatArray
 
 
 def largest_label(spec: GraphSpec) -> int:
@@ -90,3 +93,57 @@ def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
         if spec.arcs is None:
             adjacency[i - 1, j - 1] = weight
     return Graph(name, adjacency)
+
+
+def numbered_losses(loss: LossSpec, names: Sequence[str] | None) -> tuple[LossSpec, list[str]]:
+    """The same with numbers instead of names of agents, and the names that are unknown."""
+    found: list[str] = []
+
+    def number(key: str, agent: int | str) -> int | str:
+        if not isinstance(agent, str):
+            return agent
+        if agent in (names or []):
+            return (names or []).index(agent) + 1
+        wanted = f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
+        found.append(problem(key, show(agent), wanted, "correct it"))
+        return agent
+
+    numbers = {
+        kind: [(number(f"noise.loss.{kind}", i), number(f"noise.loss.{kind}", j), p) for i, j, p in getattr(loss, kind)]
+        for kind in ("edges", "arcs")
+    }
+    return loss.model_copy(update=numbers), found
+
+
+def loss_matrix(
+    loss: LossSpec, graphs: Sequence[Graph], time: Time, names: Sequence[str] | None
+) -> tuple[FloatArray, list[str]]:
+    """(m, m) probability that a message from agent j (column) to agent i (row) is lost, 0 on the diagonal.
+
+    Also the links in ``loss``, which has numbers of agents, that are in no graph or are repeated.
+    """
+    agents, found = graphs[0].agents, []
+    heard = _heard(graphs, time)
+    matrix = np.where(np.eye(agents, dtype=np.bool_), 0.0, loss.default)
+    seen: set[tuple[int, int]] = set()
+    directed = [("arcs", int(i), int(j), p) for i, j, p in loss.arcs]
+    directed += [("edges", *ends, p) for i, j, p in loss.edges for ends in ((int(i), int(j)), (int(j), int(i)))]
+    for kind, i, j, probability in directed:
+        key, ends = f"noise.loss.{kind}", show([i, j] if names is None else [agent_name(a, names) for a in (i, j)])
+        if max(i, j) > agents or not heard[j - 1, i - 1]:
+            wanted = f"expected agents of which {agent_name(j, names)} hears {agent_name(i, names)} in some graph"
+            found.append(problem(key, ends, wanted, "correct it"))
+        elif (i, j) in seen:
+            found.append(problem(key, ends, "expected every link once, in each direction", "remove one"))
+        else:
+            matrix[j - 1, i - 1] = probability
+        seen.add((i, j))
+    return matrix, found
+
+
+def _heard(graphs: Sequence[Graph], time: Time) -> BoolArray:
+    """(m, m) whether agent i can hear agent j in some graph: in discrete time, with exp(-Z), over any number of arcs."""
+    heard = np.any([graph.adjacency > 0 for graph in graphs], axis=0)
+    if time == "discrete":
+        heard = np.any([[hops(graph.adjacency > 0, [i]) > 0 for i in range(graph.agents)] for graph in graphs], axis=0)
+    return np.asarray(heard)

@@ -23,7 +23,7 @@ import numpy as np
 
 from msg_analysis.common.text.agent_names import agent_name, agent_text
 from msg_analysis.model.experiment.problems import problem, show
-from msg_analysis.model.experiment.spec import LeadersSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
+from msg_analysis.model.experiment.spec import LeadersSpec, LossSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
 from msg_analysis.model.network.graphs import Graph, hops
 from msg_analysis.model.network.markov_chain import MarkovChain, Time
 from msg_analysis.types import BoolArray, FloatArray
@@ -250,6 +250,17 @@ def _gain_of(key: str, value: NoiseGain, agents: int) -> tuple[FloatArray, list[
 def _ragged(value: object) -> bool:
     rows = value if isinstance(value, list) else []
     return len({len(row) for row in rows if isinstance(row, list)}) > 1
+
+
+def burst_problems(burst: float, loss: LossSpec) -> list[str]:
+    """Losses so likely that they cannot come in bursts as short as this."""
+    found = []
+    for key, probability in [("", loss.default), *((f" of {i} to {j}", p) for i, j, p in (*loss.edges, *loss.arcs))]:
+        shortest = probability / (1.0 - probability)
+        if burst <= shortest:
+            wanted = f"expected more than p / (1 - p) = {shortest:.6g}, with the loss{key} p = {probability:g}"
+            found.append(problem("noise.burst", burst, wanted, "raise it, or lower noise.loss"))
+    return found
 
 
 def leader_problems(

@@ -88,13 +88,14 @@ class Trajectory:
         (N + 1, m, replicas) what the agents published of their states, NaN where missing; None where that is the states
         themselves
     lost
-        (N, m, D) whether agent i did not get the message of its d-th neighbour, ascending, under the graph of the step
-        k -> k+1 (see ``StepModel.neighbours``); False where the state is missing. D is the largest number of
-        neighbours. None where messages cannot be lost
+        (N, m, D) in lockstep: whether agent i did not get the newest message of its d-th neighbour, ascending, under
+        the graph of the step k -> k+1 (see ``StepModel.neighbours``), that is the one with x_j(max(0, k - delay));
+        False where the state is missing. D is the largest number of neighbours. None where messages cannot be lost
     used
-        (N, m, D) in real time: step of the value of the d-th neighbour, ascending, that was used for x_i(k+1), under
-        the graph ``agent_modes[k + 1, i]``; -1 where nothing had been heard and the agent's own value took its place,
-        where the state is missing, and beyond the last neighbour. None in lockstep
+        (N, m, D) step of the value of the d-th neighbour, ascending, that was used for x_i(k+1), under the graph
+        ``agent_modes[k + 1, i]``; -1 where the agent's own value took its place because the message was lost or nothing
+        had been heard, where the state is missing, and beyond the last neighbour. None in lockstep without delay and
+        without ``on_loss: hold``, where it is k unless the message was lost
     made
         (N + 1, m) in real time: simulated time [ns] at which the state was made, later than that of every value used
         for it; 0 for x(0), -1 where missing. None in lockstep

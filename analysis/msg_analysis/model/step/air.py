@@ -42,7 +42,7 @@ class Air:
 
     def __init__(self, experiment: ValidExperiment) -> None:
         noise = experiment.noise
-        self.broadcast, self.link, self.loss = noise.broadcast, noise.link, noise.loss
+        self.broadcast, self.link, self.loss = noise.broadcast, noise.link, float(experiment.loss.max())
         self._seed = experiment.run.seed
         self._shape = (STEPS_PER_BLOCK, experiment.run.replicas)
         # The step that an agent makes and the step of the state that it publishes may be in two blocks.

@@ -43,7 +43,7 @@ class Wiring:
     chain: MarkovChain  # switches between the graphs
     initial: FloatArray  # (n,) law of g(0)
     dt: float  # simulated time of a step
-    loss: float  # probability that a directed message is ignored in a step
+    loss: float  # largest probability of any link that a message is lost; see ``ValidExperiment.loss``
 
     @property
     def modes(self) -> int:
@@ -106,7 +106,7 @@ class StepModel(Wiring):
     noise_gain: FloatArray
     noise: FloatArray  # (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
     delay: int  # age d, in steps, of the states of others that a step uses
-    # (n, m, m) p (1 - p) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and their spread
+    # (n, m, m) p_ij (1 - p_ij) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and their spread
     # adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
     loss_variance: FloatArray
     grounded: BoolArray  # (m,) True for leaders of infinite gain
@@ -142,7 +142,7 @@ def build_model(experiment: ValidExperiment, matrices: StepMatrices | None = Non
         chain=experiment.chain,
         initial=first_graph(experiment),
         dt=experiment.step_length,
-        loss=experiment.noise.loss,
+        loss=float(experiment.loss.max()),
     )
 
 
@@ -179,12 +179,12 @@ def build_step_model(experiment: ValidExperiment, matrices: StepMatrices | None 
     offsets = reference * (1.0 - weights.sum(axis=2)) if reference else np.zeros(weights.shape[:2])
 
     coupling = weights * ~np.eye(agents, dtype=bool)
-    loss = experiment.noise.loss
+    loss = experiment.loss  # (m, m)
     noise = gain @ gain.transpose(0, 2, 1)
     for mode, a in enumerate(coupling):
-        per_link = np.diag((a**2).sum(axis=1))
-        noise[mode] += (1 - loss) * experiment.noise.link**2 * per_link
-        noise[mode] += experiment.noise.broadcast**2 * ((1 - loss) ** 2 * a @ a.T + loss * (1 - loss) * per_link)
+        kept = (1 - loss) * a
+        noise[mode] += experiment.noise.link**2 * np.diag((kept * a).sum(axis=1))
+        noise[mode] += experiment.noise.broadcast**2 * (kept @ kept.T + np.diag((loss * kept * a).sum(axis=1)))
     lost = loss * coupling
     mean = weights - lost
     mean[:, range(agents), range(agents)] += lost.sum(axis=2)
@@ -196,7 +196,7 @@ def build_step_model(experiment: ValidExperiment, matrices: StepMatrices | None 
         noise_gain=gain,
         noise=noise,
         delay=experiment.noise.delay,
-        loss=loss,
+        loss=float(loss.max()),
         loss_variance=loss * (1 - loss) * coupling**2,
         chain=experiment.chain,
         initial=first_graph(experiment),

@@ -103,11 +103,25 @@ def _noise(experiment: ValidExperiment) -> str:
         parts.append(f"published values have noise of standard deviation {noise.broadcast:g}, equal for all receivers")
     if noise.link:
         parts.append(f"each receiver adds noise of standard deviation {noise.link:g}")
-    if noise.loss:
-        parts.append(f"{100 * noise.loss:.3g} % of the messages are lost")
+    if noise.loss.any:
+        parts.append(_losses(experiment))
     if noise.delay:
         parts.append(f"received values are {noise.delay} steps old")
     return "; ".join(parts) + "."
+
+
+def _losses(experiment: ValidExperiment) -> str:
+    noise, loss = experiment.noise, experiment.noise.loss
+    text = f"{100 * loss.default:.3g} % of the messages are lost"
+    listed_links = [*(f"{i} to {j}" for i, j, _ in loss.arcs), *(f"{i} and {j}" for i, j, _ in loss.edges)]
+    if listed_links:
+        largest, least = max(p for *_, p in (*loss.arcs, *loss.edges)), min(p for *_, p in (*loss.arcs, *loss.edges))
+        some = "1 link" if len(listed_links) == 1 else f"{len(listed_links)} links"
+        span = f"{100 * least:.3g}" if least == largest else f"{100 * least:.3g} to {100 * largest:.3g}"
+        text += f", and {span} % of those of {some}"
+    if noise.burst is not None:
+        text += f", on average {noise.burst:.3g} of a link in a row"
+    return text + (", and the last value that was heard takes the place of a lost one" if noise.holds else "")
 
 
 def _run(experiment: ValidExperiment) -> str:
