@@ -169,4 +169,4 @@ def _equal_noise(system: JumpSystem) -> bool:
     pinned = (system.matrices == 0.0).all(axis=(0, 1)) & (system.matrices == 0.0).all(axis=(0, 2))
     pinned &= (system.noise == 0.0).all(axis=(0, 1))
     expected = scale * np.diag((~pinned).astype(float))
-    return system.loss_variance is None and bool(np.abs(system.noise - expected).max(initial=0.0) <= 1e-12 * scale)
+    return not system.lossy and bool(np.abs(system.noise - expected).max(initial=0.0) <= 1e-12 * scale)

@@ -290,9 +290,16 @@ def stationary_start_factor(experiment: ValidExperiment, mode: int) -> FloatArra
     step = build_step_model(experiment)
     with one_blas_thread():
         solver, steady = _steady(step, build_run_model(experiment, step), experiment.problem)
-        values, vectors = np.linalg.eigh(steady[mode] / step.stationary[mode])
-        root = (vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T
-        return solver.system.lifted(root)
+        system = solver.system
+        moments = system.by_graph(steady)[mode] / step.stationary[mode]
+        if system.readout is not None:  # the agents are some of the numbers of the system
+            return _root(system.lifted(moments))
+        return system.lifted(_root(moments))
+
+
+def _root(moments: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(moments)
+    return np.asarray((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
 
 
 def _steady(step: StepModel, run: StepModel, problem: str) -> tuple[MomentSolver, FloatArray]:
@@ -329,17 +336,17 @@ def _require_stability(solver: MomentSolver) -> None:
 
 def _safe_step(step: StepModel) -> float:
     """The dt below which no agent overshoots what it hears: W is stochastic then, and stable with any delay."""
-    own = np.diagonal(step.weights, axis1=1, axis2=2)
-    if (step.weights < 0.0).sum() > (own < 0.0).sum():
+    own = np.diagonal(step.nominal, axis1=1, axis2=2)
+    if (step.nominal < 0.0).sum() > (own < 0.0).sum():
         return 0.0  # a protocol that subtracts what it hears: no dt is known to be safe
-    heard = (step.weights.sum(axis=2) - own) / (1.0 - step.loss)  # without loss
-    pull = (1.0 - step.weights.sum(axis=2)) + heard
+    pull = 1.0 - own  # on what is heard, and on the reference
     return float(step.dt / pull[:, ~step.grounded].max())
 
 
 def _moments(solver: MomentSolver, steady: FloatArray, names: Sequence[str] | None) -> Moments:
     system = solver.system
-    return Moments(system.lifted(steady.sum(axis=0)), system.lifted(steady), solver.report, names=names)
+    moments = system.lifted(steady.sum(axis=0))
+    return Moments(moments, system.lifted(system.by_graph(steady)), solver.report, names=names)
 
 
 def _static(system: JumpSystem, names: Sequence[str] | None) -> Moments | None:

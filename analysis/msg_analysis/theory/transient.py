@@ -127,8 +127,7 @@ def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | Non
     ``deviation``: (m,) x(0) - (what x should be), in consensus x(0); ``law``: (n,) of g(0), by default stationary.
     """
     law = system.stationary if law is None else law
-    y = system.reduced(deviation)
-    return Snapshot(law, np.multiply.outer(law, y), np.multiply.outer(law, np.outer(y, y)))
+    return Snapshot(law, np.multiply.outer(law, system.reduced(deviation)), system.started(deviation[None], law))
 
 
 def start_of(experiment: ValidExperiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
@@ -138,11 +137,12 @@ def start_of(experiment: ValidExperiment, system: JumpSystem, stationary: FloatA
     """
     law = system.stationary
     if experiment.switching.initial != "stationary":
-        law = np.array([float(graph.name == experiment.switching.initial) for graph in experiment.graph_list])
+        law = system.of_modes(
+            np.array([float(graph.name == experiment.switching.initial) for graph in experiment.graph_list])
+        )
     start = experiment.run.start
     if start == "stationary":
-        shares = law / system.stationary
-        return Snapshot(law, np.zeros((system.modes, system.dimension)), shares[:, None, None] * stationary)
+        return Snapshot(law, np.zeros((system.modes, system.dimension)), system.started_steady(stationary, law))
     place = np.zeros(experiment.agents) if start == "zero" else np.array(start, dtype=float)
     return point_start(system, place - experiment.reference, law)
 

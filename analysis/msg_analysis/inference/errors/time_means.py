@@ -34,8 +34,7 @@ from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.theory.moments import mode_potential, transient_mean
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.system import packed_symmetric
-from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.theory.system.lost_messages import lost_adjoint
+from msg_analysis.theory.system.jump_system import JumpSystem, held
 from msg_analysis.types import FloatArray
 
 ROUNDING = 64 * float(np.finfo(float).eps)  # of the largest state: what thousands of steps may leave in differences
@@ -265,13 +264,13 @@ def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedV
     values: list[Value | SharedValue] = []
     for mode, step in enumerate(system.matrices):
         before = step.T @ dual @ step  # (q, n, d, d): the adjoint of this graph's step
-        if system.loss_variance is not None:
-            before += lost_adjoint(system.lift, system.loss_variance[mode], dual)
+        if system.lossy:
+            before += held(system, mode).lost_adjoint(dual)
         constant = packed @ packed_symmetric.pack(system.noise[mode]) + kappa.T
         ahead = np.concatenate([np.moveaxis(packed_symmetric.pack(before), 1, 0), constant[:, :, None]], axis=2)
         law = system.chain[mode]
         expected = np.tensordot(law, ahead, axes=1)
-        if system.loss_variance is None:
+        if not system.lossy:
             values.append(Value(law, ahead - expected, np.moveaxis(dual, 1, 0), step, system.noise[mode]))
         else:
             reached = np.tensordot(law, here, axes=1)

@@ -218,7 +218,7 @@ class _Judge:
 
     def _add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
         a = self._packed(deviations)
-        shared = self._system.loss_variance is not None
+        shared = self._system.lossy
         b = self._packed(later) if shared else a
         looked = steps % self._stride == 0
         self._looked += int(looked.sum())

@@ -233,7 +233,7 @@ class ValidExperiment:
         purpose
             "run" (simulate it or run a network) or "predict"
         """
-        lines = self._unpredicted() if purpose == "predict" else self._not_run()
+        lines = self._not_run() if purpose == "run" else []
         if self.protocol:
             lines += self.protocol.unavailable(purpose)
         return lines
@@ -250,12 +250,6 @@ class ValidExperiment:
         if self.noise.delay > 0:
             lines.append(problem("noise.delay", self.noise.delay, "not available in runs yet", "use 0"))
         return lines
-
-    def _unpredicted(self) -> list[str]:
-        """What has no prediction, apart from protocols."""
-        if self.run.pace == "realtime":
-            return self._only_lockstep(("broadcast", "link", "loss", "delay"))
-        return self._special_losses("has no prediction yet")
 
     def _special_losses(self, why: str) -> list[str]:
         noise, lines = self.noise, []

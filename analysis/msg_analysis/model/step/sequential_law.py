@@ -48,10 +48,16 @@ def build_run_model(experiment: ValidExperiment, step: StepModel | None = None) 
     """What a step of all agents of a run with a linear law does to x(k), as one jump linear system.
 
     In real time the law is sequential: noise of an agent reaches those that are due later in the same period. ``step``
-    is the model of the experiment, if it is known.
+    is the model of the experiment, if it is known. With messages that are noisy, late or lost, the micro-steps stay
+    apart (``turns``): what two agents hear of a third one need not be the same.
     """
     step = step or build_step_model(experiment)
-    return sequential(step, phases(experiment)) if step_law(experiment) == "sequential" else step
+    if step_law(experiment) == "synchronous":
+        return step
+    phase = phases(experiment)
+    if experiment.noise.steps_only:
+        return dataclasses.replace(step, turns=np.argsort(phase))
+    return sequential(step, phase)
 
 
 def sequential(step: StepModel, phase: FloatArray) -> StepModel:

@@ -43,7 +43,13 @@ class Wiring:
     chain: MarkovChain  # switches between the graphs
     initial: FloatArray  # (n,) law of g(0)
     dt: float  # simulated time of a step
-    loss: float  # largest probability of any link that a message is lost; see ``ValidExperiment.loss``
+    losses: FloatArray  # (m, m) probability that a message from agent j (column) to agent i (row) is lost
+    burst: float | None  # mean number of messages of a link that are lost in a row; None: losses are independent
+
+    @property
+    def loss(self) -> float:
+        """Largest probability of any link that a message is lost."""
+        return float(self.losses.max())
 
     @property
     def modes(self) -> int:
@@ -93,7 +99,8 @@ class StepModel(Wiring):
     """x(k+1) = W_g(k) x(k) + offset_g(k) + noise, then g jumps with P: "what the network actually does".
 
     Convention: the step k -> k+1 uses g(k). With a delay d, the entries of W_g(k) off the diagonal take x(k - d)
-    instead of x(k), and x(k) = x(0) before the start.
+    instead of x(k), and x(k) = x(0) before the start. ``weights``, ``noise`` and ``loss_variance`` are for agents that
+    step all at once and lose messages independently, each replaced by the agent's own value.
     """
 
     # (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
@@ -106,11 +113,21 @@ class StepModel(Wiring):
     noise_gain: FloatArray
     noise: FloatArray  # (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
     delay: int  # age d, in steps, of the states of others that a step uses
-    # (n, m, m) p_ij (1 - p_ij) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and their spread
-    # adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
+    # (n, m, m) p_ij (1 - p_ij) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and their
+    # spread adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
     loss_variance: FloatArray
     grounded: BoolArray  # (m,) True for leaders of infinite gain
     reference: float  # what tracking agents should hold; 0 for consensus
+    broadcast: float  # standard deviation of the noise in what an agent publishes
+    link: float  # standard deviation of the noise that a receiver adds
+    holds: bool  # whether the last value heard takes the place of a lost one, and not the agent's own
+    turns: IntArray | None = None  # (m,) agents in the order of their steps in a period; None: all at once
+
+    @property
+    def by_message(self) -> bool:
+        """Whether ``weights``, ``noise`` and ``loss_variance`` are not the whole law: values are kept from step to step."""
+        bursts = self.burst is not None and self.loss > 0.0
+        return self.holds or bursts or self.turns is not None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,7 +159,8 @@ def build_model(experiment: ValidExperiment, matrices: StepMatrices | None = Non
         chain=experiment.chain,
         initial=first_graph(experiment),
         dt=experiment.step_length,
-        loss=float(experiment.loss.max()),
+        losses=experiment.loss,
+        burst=experiment.noise.burst,
     )
 
 
@@ -196,13 +214,17 @@ def build_step_model(experiment: ValidExperiment, matrices: StepMatrices | None 
         noise_gain=gain,
         noise=noise,
         delay=experiment.noise.delay,
-        loss=float(loss.max()),
+        losses=loss,
+        burst=experiment.noise.burst,
         loss_variance=loss * (1 - loss) * coupling**2,
         chain=experiment.chain,
         initial=first_graph(experiment),
         grounded=grounded,
         reference=reference,
         dt=dt,
+        broadcast=experiment.noise.broadcast,
+        link=experiment.noise.link,
+        holds=experiment.noise.holds,
     )
 
 

@@ -31,7 +31,6 @@ from msg_analysis.theory.solvers.krylov import STRIP, flat, norms, strips
 from msg_analysis.theory.solvers.lyapunov import LocalSolves, single
 from msg_analysis.theory.solvers.solver_report import MAX_RELATIVE_ERROR, singular_message
 from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.theory.system.lost_messages import lost, lost_adjoint
 from msg_analysis.types import BoolArray, FloatArray
 
 # Amplification of relative errors of the averaged matrix from which rounding alone makes its inverse worthless.
@@ -80,7 +79,7 @@ class CoupledEquations:
             self.drift, self.rates = forward.drift.transpose(0, 2, 1), _off_diagonal(system.chain)
         self.leaving = self.rates.sum(axis=1)
         # Whether the preconditioner is A^-1.
-        self.direct = system.modes == 1 and system.loss_variance is None
+        self.direct = system.modes == 1 and not system.lossy
         self.symmetric = np.array_equal(self.drift, self.drift.transpose(0, 2, 1))
         self._levels = self._averages() if system.modes > 1 else []
         self.whole = self._levels[-1].solves if self._levels else self.modes
@@ -151,7 +150,7 @@ class CoupledEquations:
         """(Z, A Z) for Z near A^-1 R."""
         z, moved = self.modes(right)
         rest = self._mixed(moved)  # R - A Z
-        if self.system.loss_variance is not None:
+        if self.system.lossy:
             rest += self.after_jump(self._lost(z))
         return self._averaged(z, rest, right)
 
@@ -197,7 +196,7 @@ class CoupledEquations:
         squared *= -0.5
         squared += half
         local = _plus_transposes(squared)
-        if self.system.loss_variance is not None:
+        if self.system.lossy:
             local -= self._lost(x)
         return local, np.subtract(x, local, out=half)
 
@@ -217,11 +216,7 @@ class CoupledEquations:
 
     def _lost(self, x: FloatArray) -> FloatArray:
         """What lost messages add to K[X], or to its adjoint."""
-        variance = self.system.loss_variance
-        assert variance is not None
-        if self._forward is None:
-            return lost(self.system.lift, variance, x)
-        return lost_adjoint(self.system.lift, variance, x)
+        return self.system.lost(x) if self._forward is None else self.system.lost_adjoint(x)
 
 
 def _combined(factors: FloatArray, stack: FloatArray) -> FloatArray:

@@ -94,7 +94,7 @@ class IterativeSolver:
 
 def _averaged(equations: CoupledEquations) -> AveragedEquations | None:
     """The cheaper preconditioner, where it promises to be better."""
-    if not (equations.one_level and equations.large) or equations.system.loss_variance is not None:
+    if not (equations.one_level and equations.large) or equations.system.lossy:
         return None
     return AveragedEquations(equations) if suitable(equations) else None
 

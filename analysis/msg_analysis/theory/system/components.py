@@ -23,14 +23,15 @@ a Jordan block, whose eigenvalues rounding scatters. See docs/theory.md, "Transi
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse.csgraph
 
 from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.types import FloatArray
+from msg_analysis.theory.system.loss_events import LossEvents
+from msg_analysis.types import BoolArray, FloatArray
 
 CHANGE = 1e-12  # relative size of the changes that show how sensitive a rate is
 
@@ -42,6 +43,7 @@ class Component:
     matrices: FloatArray  # (n, q, q) of Z_i or W_i
     consensus: bool  # whether only their disagreement decays: they hear nobody else, and there are no leaders
     lost: FloatArray | None  # (n, q, q + 1) loss variance; the last column is that of what comes from elsewhere
+    losses: LossEvents | None = None  # with messages one by one, in place of ``lost``
 
     @property
     def normal(self) -> bool:
@@ -64,6 +66,7 @@ class Component:
             stationary=of.stationary,
             lift=inner if variance is None else np.vstack([inner, np.zeros((1, d))]),
             loss_variance=variance,
+            losses=self.losses and self.losses.projected(inner),
         )
 
     def changed(self, rng: np.random.Generator) -> Component:
@@ -71,7 +74,7 @@ class Component:
         q = self.matrices.shape[1]
         change = self.matrices * (1.0 - np.eye(q)) * rng.uniform(-CHANGE, CHANGE, (q, q))
         change -= np.eye(q) * change.sum(axis=2)[:, :, None]
-        return Component(self.matrices + change, self.consensus, self.lost)
+        return replace(self, matrices=self.matrices + change)
 
 
 def components(system: JumpSystem) -> list[Component]:
@@ -82,11 +85,14 @@ def components(system: JumpSystem) -> list[Component]:
     variance = system.loss_variance
     if variance is not None:
         hears |= (variance != 0.0).any(axis=0)
-    return list(_found(matrices, variance, hears, consensus=consensus))
+    losses = system.unreduced_losses if consensus else system.losses
+    if losses is not None:
+        hears |= losses.uses()
+    return list(_found(matrices, variance, losses, hears, consensus=consensus))
 
 
 def _found(
-    matrices: FloatArray, variance: FloatArray | None, hears: FloatArray, *, consensus: bool
+    matrices: FloatArray, variance: FloatArray | None, losses: LossEvents | None, hears: BoolArray, *, consensus: bool
 ) -> Iterator[Component]:
     count, labels = scipy.sparse.csgraph.connected_components(hears, connection="strong")
     for label in range(count):
@@ -98,4 +104,5 @@ def _found(
         if variance is not None:
             from_outside = variance[:, inside][:, :, outside].sum(axis=2, keepdims=True)
             lost = np.concatenate([variance[:, inside][:, :, inside], from_outside], axis=2)
-        yield Component(matrices[:, inside][:, :, inside], alone, lost)
+        events = losses and losses.projected(np.eye(len(labels))[:, inside])
+        yield Component(matrices[:, inside][:, :, inside], alone, lost, events)

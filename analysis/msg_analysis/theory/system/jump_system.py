@@ -20,18 +20,30 @@ docs/theory.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from msg_analysis.model.network.markov_chain import Time
-from msg_analysis.types import FloatArray
+from msg_analysis.theory.system.loss_events import LossEvents
+from msg_analysis.theory.system.lost_messages import lost, lost_adjoint
+from msg_analysis.theory.system.message_steps import message_steps
+from msg_analysis.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from msg_analysis.model.experiment.experiment import ValidExperiment
     from msg_analysis.model.step.step_model import StepModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Messages:
+    """What a system of the agents and what they heard has beside the agents; see ``message_steps``."""
+
+    graphs: IntArray  # (n,) graph of every mode: with losses in bursts, modes are graphs and states of the channels
+    copies: IntArray  # (k,) the agent whose state every number s is, at some time
+    start_noise: FloatArray  # (d, d) second moment of the noise in what was heard of x(0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +66,9 @@ class JumpSystem:
     loss_variance: FloatArray | None = None  # (n, k, k), see ``StepModel.loss_variance``; discrete time only
     readout: FloatArray | None = None  # (m, d) with a delay; None without, where ``lift`` has this role
     unreduced: FloatArray | None = None  # (n, k, k) in consensus: the same for the numbers s, whose zeros are exact
+    losses: LossEvents | None = None  # with messages one by one, in place of ``loss_variance``
+    unreduced_losses: LossEvents | None = None  # in consensus: the same for the numbers s
+    messages: Messages | None = None  # with messages one by one
 
     @property
     def modes(self) -> int:
@@ -77,20 +92,72 @@ class JumpSystem:
     def reduced(self, deviations: FloatArray) -> FloatArray:
         """(..., d) reduced coordinates of the deviations of the agents (..., m); in consensus, of their states.
 
-        With a delay, the earlier states are taken to be the same.
+        With a delay, the earlier states are taken to be the same; so is what was heard, without its noise.
         """
+        if self.messages is not None:
+            return np.asarray(deviations[..., self.messages.copies] @ self.lift)
         lift = self.lift.reshape(-1, deviations.shape[-1], self.dimension).sum(axis=0)
         return np.asarray(deviations @ lift)
+
+    @property
+    def lossy(self) -> bool:
+        """Whether lost messages make the second moments more than W C W^T + N."""
+        return self.loss_variance is not None or self.losses is not None
+
+    def lost(self, moments: FloatArray) -> FloatArray:
+        """(..., n, d, d): what lost messages add to W C W^T, for moments C (..., n, d, d)."""
+        if self.losses is not None:
+            return self.losses.lost(moments)
+        assert self.loss_variance is not None
+        return lost(self.lift, self.loss_variance, moments)
+
+    def lost_adjoint(self, forms: FloatArray) -> FloatArray:
+        """(..., n, d, d): the adjoint of ``lost``, for forms Y (..., n, d, d)."""
+        if self.losses is not None:
+            return self.losses.adjoint(forms)
+        assert self.loss_variance is not None
+        return lost_adjoint(self.lift, self.loss_variance, forms)
+
+    def of_modes(self, law: FloatArray) -> FloatArray:
+        """(n,) law of the modes from that of the graphs; channels are in their stationary state."""
+        if self.messages is None:
+            return law
+        graphs = self.messages.graphs
+        shares = np.bincount(graphs, self.stationary)
+        return np.asarray(law[graphs] * self.stationary / shares[graphs])
+
+    def by_graph(self, stack: FloatArray) -> FloatArray:
+        """Sums over the modes of each graph of a stack (..., n, a, b)."""
+        if self.messages is None or len(self.messages.graphs) == self.messages.graphs[-1] + 1:
+            return stack
+        first = np.flatnonzero(np.diff(self.messages.graphs, prepend=-1))
+        return np.add.reduceat(stack, first, axis=-3)
+
+    def started(self, deviations: FloatArray, law: FloatArray) -> FloatArray:
+        """(n, d, d) second moments at the start, from the agents' deviations (R, m) and the law (n,) of the modes."""
+        y = self.reduced(deviations)
+        moment = y.T @ y / len(y)
+        if self.messages is not None:
+            moment = moment + self.messages.start_noise
+        return np.asarray(law[:, None, None] * moment)
+
+    def started_steady(self, steady: FloatArray, law: FloatArray) -> FloatArray:
+        """(n, d, d) second moments at the start, of agents that are as in the steady state (n, d, d) given the mode.
+
+        What they have heard is x(0), while in the steady state it may be older.
+        """
+        shares = (law / self.stationary)[:, None, None]
+        if self.messages is None:
+            return np.asarray(shares * steady)
+        place = self.reduced(np.eye(len(self.output)))  # (m, d)
+        moments = place.T @ self.lifted(steady) @ place
+        return np.asarray(shares * moments + law[:, None, None] * self.messages.start_noise)
 
     def propagate(self, moments: FloatArray) -> FloatArray:
         """(n, d, d): K_j[C_j] = E[W C_j W^T | mode j] for every mode. Discrete time."""
         after = self.matrices @ moments @ self.matrices.transpose(0, 2, 1)
-        if self.loss_variance is not None:
-            full = self.lift @ moments @ self.lift.T
-            own = np.diagonal(full, axis1=1, axis2=2)
-            squares = own[:, :, None] + own[:, None, :] - full - full.transpose(0, 2, 1)
-            spread = (self.loss_variance * squares).sum(axis=2)
-            after += np.einsum("ia,ni,ib->nab", self.lift, spread, self.lift)
+        if self.lossy:
+            after += self.lost(moments)
         return np.asarray(after)
 
     def advance(self, moments: FloatArray, law: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -112,6 +179,8 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
     common to all of them, not one for each x(k - s): the agents' mean moves, and this acts on agents of unequal degree,
     because they compare their own new values with old ones of others.
     """
+    if step.by_message:
+        return _by_message(step, problem)
     m, delay = step.agents, step.delay
     size = m * (delay + 1)
     consensus = problem == "consensus"
@@ -137,6 +206,27 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
         loss_variance=loss_variance if step.loss else None,
         readout=readout,
         unreduced=weights if consensus else None,
+    )
+
+
+def _by_message(step: StepModel, problem: str) -> JumpSystem:
+    """The same where values are kept from step to step, or agents step one after the other."""
+    whole = message_steps(step)
+    size, m = whole.matrices.shape[1], step.agents
+    consensus = problem == "consensus"
+    lift = scipy.linalg.helmert(size).T if consensus else np.eye(size)
+    return JumpSystem(
+        time="discrete",
+        matrices=lift.T @ whole.matrices @ lift,
+        noise=_reduced_noise(whole.noise, lift),
+        chain=whole.chain,
+        stationary=whole.stationary,
+        lift=lift,
+        readout=lift[:m] - (lift[:m].mean(axis=0) if consensus else 0.0),
+        unreduced=whole.matrices if consensus else None,
+        losses=whole.losses and whole.losses.projected(lift),
+        unreduced_losses=whole.losses if consensus else None,
+        messages=Messages(whole.graphs, whole.copies, lift.T @ whole.start_noise @ lift),
     )
 
 
@@ -175,6 +265,9 @@ def held(system: JumpSystem, mode: int) -> JumpSystem:
         loss_variance=None if system.loss_variance is None else system.loss_variance[mode : mode + 1],
         readout=system.readout,
         unreduced=None if system.unreduced is None else system.unreduced[mode : mode + 1],
+        losses=system.losses and system.losses.of_mode(mode),
+        unreduced_losses=system.unreduced_losses and system.unreduced_losses.of_mode(mode),
+        messages=system.messages and replace(system.messages, graphs=np.zeros(1, np.int64)),
     )
 
 
