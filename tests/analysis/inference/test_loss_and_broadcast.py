@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from msg_analysis.inference.hypothesis_tests.broadcast import BroadcastSums
 from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations
-from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import BroadcastSums, loss_test
+from msg_analysis.inference.hypothesis_tests.losses import loss_test
 from msg_analysis.inference.observed.heard_values import HeardValues
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.verdict.compare import compare

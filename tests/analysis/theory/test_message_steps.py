@@ -13,6 +13,7 @@ import math
 import numpy as np
 import pytest
 import scipy.linalg
+from tests.support.switching_systems import LINE_RING, steady_of
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
@@ -23,7 +24,6 @@ from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict, stationary_start_factor
 from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.transient import solve_transient
-from tests.support.switching_systems import LINE_RING, steady_of
 
 GRAPHS = {"a": {"arcs": [[1, 2], [2, 3, 0.7], [3, 1]]}, "b": {"edges": [[1, 2, 0.5]]}}
 PAIR = {"a": {"edges": [[1, 2]]}, "b": {"arcs": [[1, 2, 0.5]]}}

@@ -33,8 +33,9 @@ from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.common.text.number_words import percent
 from msg_analysis.inference.blame import suspects
 from msg_analysis.inference.blame.switching_rates import find_rates
+from msg_analysis.inference.hypothesis_tests.broadcast import BroadcastSums
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
-from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import BroadcastSums, LossTally
+from msg_analysis.inference.hypothesis_tests.losses import LossTally
 from msg_analysis.inference.hypothesis_tests.switching import Transitions
 from msg_analysis.inference.statistics.distributions import binomial_interval, log_normal_tail
 from msg_analysis.inference.statistics.forward_selection import Selected, select
@@ -111,8 +112,7 @@ def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list
     gains = suspects.gains(sums, pardoned)
     losses = broadcast = None
     if accused.loss:
-        tally = accused.loss
-        losses = suspects.losses(tally.pairs, tally.messages, tally.lost, tally.probability)
+        losses = suspects.losses(accused.loss)
     if accused.broadcast:
         broadcast = suspects.variances(np.diag(accused.broadcast.scatter), accused.broadcast.samples)
     # All classes count before anything is selected: also the 3 of the rates and the 1 of the pairs.
@@ -289,12 +289,16 @@ def _loss_words(one: Selected, tally: LossTally) -> Cause:
         chosen = (receiver if part == "receiver" else sender) == what
         agent, whose = what + 1, f"the messages {'to' if part == 'receiver' else 'of'} agent {what + 1}"
     lost, messages = int(tally.lost[chosen].sum()), int(tally.messages[chosen].sum())
-    share, interval = lost / messages, binomial_interval(lost, messages)
+    weights = tally.messages[chosen] / messages
+    expected = float(weights @ tally.probability[chosen])
+    # In bursts, so many messages say as much as fewer independent ones.
+    alike = float(weights @ tally.inflation[chosen])
+    share, interval = lost / messages, binomial_interval(round(lost / alike), round(messages / alike))
     words = (
         f"{percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %) of {whose} are lost, "
-        f"not {percent(tally.probability)}"
+        f"not {percent(expected)}"
     )
-    return Cause("loss", words, agent, link, None, share, interval, tally.probability, math.exp(one.log_p))
+    return Cause("loss", words, agent, link, None, share, interval, expected, math.exp(one.log_p))
 
 
 def _broadcast_words(one: Selected) -> Cause:

@@ -26,10 +26,11 @@ import numpy as np
 
 from msg_analysis.inference.hypothesis_tests.gain_regression import Term
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
+from msg_analysis.inference.hypothesis_tests.losses import LossTally
 from msg_analysis.inference.observed.heard_values import NO_NOISE
 from msg_analysis.inference.statistics.forward_selection import Candidate
 from msg_analysis.inference.statistics.known_covariance import pseudo_inverse
-from msg_analysis.types import BoolArray, FloatArray, IntArray
+from msg_analysis.types import BoolArray, FloatArray
 
 MIN_SAMPLES = 30  # fewest innovations for a variance
 MAX_PARAMETERS = 600  # most parameters whose information is inverted
@@ -162,11 +163,9 @@ def variances(squares: FloatArray, samples: int) -> Suspects:
     return Suspects(information @ np.log(np.maximum(squares, 1e-300) / samples), information, classes)
 
 
-def losses(pairs: IntArray, messages: IntArray, lost: IntArray, probability: float) -> Suspects:
-    """Log-odds of losing a message, link by link: of ``messages`` (links,), ``lost`` (links,) were lost.
-
-    ``pairs`` (links, 2) are receiver and sender, from 0; ``probability`` is the nominal one.
-    """
+def losses(tally: LossTally) -> Suspects:
+    """Log-odds of losing a message, link by link."""
+    pairs, messages, probability = tally.pairs, tally.messages, tally.probability
     identity = np.eye(len(pairs))
     classes = [
         [Candidate("link", (int(j), int(i)), identity[a]) for a, (i, j) in enumerate(pairs)],
@@ -174,8 +173,11 @@ def losses(pairs: IntArray, messages: IntArray, lost: IntArray, probability: flo
         [Candidate("sender", int(j), (pairs[:, 1] == j) * 1.0) for j in np.unique(pairs[:, 1])],
         [Candidate("all", None, np.ones(len(pairs)))],
     ]
-    information = np.diag(messages * probability * (1.0 - probability))
-    return Suspects(np.asarray(lost - probability * messages), information, classes)
+    information = messages * probability * (1.0 - probability) / tally.inflation
+    score = (tally.lost - probability * messages) / tally.inflation
+    # A link that should lose nothing is impossible, not improbable: a chance of 1e-9 makes it nearly so.
+    information += np.where(probability == 0.0, 1e-9 * messages, 0.0)
+    return Suspects(np.asarray(score), np.diag(information), classes)
 
 
 def _explained(sums: InnovationSums, change: FloatArray) -> FloatArray:

@@ -100,7 +100,8 @@ def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Esti
     errors = np.sqrt(np.einsum("aq,qr,ar->a", combinations, means.covariance, combinations).clip(0.0))
     found, nodes = beside(measured, predicted, errors)
     if not len(means.nodes):
-        both = (np.diag(system.lifted(matrix)) for matrix in (means.second_moments, means.expected_moments))
+        frame = system.frame
+        both = (np.diag(frame @ matrix @ frame.T) for matrix in (means.second_moments, means.expected_moments))
         return found, [Estimate(float(m), float(p)) for m, p in zip(*both, strict=True)]
     return found, nodes
 
@@ -144,8 +145,9 @@ def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
     CovarianceTest
         without ``chi2`` where not all moments are estimated together; without ``p`` where dof = 0
     """
-    measured = system.lifted(means.second_moments)
-    predicted = system.lifted(means.expected_moments)
+    frame = system.frame
+    measured = frame @ means.second_moments @ frame.T
+    predicted = frame @ means.expected_moments @ frame.T
     if not means.joint:
         return CovarianceTest(measured, predicted, note="too many agents for a joint test of a run of this length")
     chi2, dof = quadratic_form(means.measured - means.predicted, means.covariance)
@@ -155,10 +157,11 @@ def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
 
 def _standardised(means: TimeMeans, system: JumpSystem) -> FloatArray:
     """(m, m) entries of the difference of the second moments of the agents, each in its standard errors."""
-    d = system.dimension
+    frame = system.frame
+    d = frame.shape[1]
     variances, directions = np.linalg.eigh(means.covariance)
-    spread = system.lifted(packed_symmetric.unpack(directions.T * np.sqrt(variances.clip(0.0))[:, None], d))
+    spread = frame @ packed_symmetric.unpack(directions.T * np.sqrt(variances.clip(0.0))[:, None], d) @ frame.T
     errors = np.sqrt(np.square(spread).sum(axis=0))
-    difference = system.lifted(packed_symmetric.unpack(means.measured - means.predicted, d))
+    difference = frame @ packed_symmetric.unpack(means.measured - means.predicted, d) @ frame.T
     scale = float(np.abs(means.predicted).max(initial=0.0))
     return np.where(errors > 1e-12 * scale, difference / np.where(errors > 0.0, errors, 1.0), np.nan)

@@ -202,7 +202,7 @@ def _steps(observation: Observation) -> tuple[IntArray, FloatArray, FloatArray] 
     matrices, noise = np.empty((2, len(kinds), step.agents, step.agents))
     for number, kind in enumerate(kinds):
         matrices[number], noise[number] = _with_losses(observation, step, int(kind[0]), kind[1:])
-    lift = system.lift
+    lift = system.frame
     return which.reshape(-1), lift.T @ matrices @ lift, lift.T @ noise @ lift
 
 

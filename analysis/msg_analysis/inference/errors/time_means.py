@@ -50,8 +50,8 @@ class TimeMeans:
     All entries of y y^T, packed (joint, q = p), the node errors (q = m), or the system error (q = 1).
     """
 
-    second_moments: FloatArray  # (d, d) time mean of y y^T
-    expected_moments: FloatArray  # (d, d) its exact expectation for the run's start and length
+    second_moments: FloatArray  # (f, f) time mean of y y^T, y the agents' coordinates in ``JumpSystem.frame``
+    expected_moments: FloatArray  # (f, f) its exact expectation for the run's start and length
     joint: bool  # whether q = p
     measured: FloatArray  # (q,) time means, replicas averaged
     predicted: FloatArray  # (q,) their exact expectation for the run's start and length
@@ -175,26 +175,28 @@ def expected_mean(observation: Observation) -> FloatArray:
     Returns
     -------
     FloatArray
-        (d, d)
+        (f, f) in the frame of the agents
     """
     prediction = observation.prediction
     step, system, steady = prediction.step, prediction.system, prediction.steady
     if prediction.experiment.run.start == "stationary":
-        law = step.initial
-        initial = (law / step.stationary)[:, None, None] * steady
+        law = system.of_modes(step.initial)
+        initial = system.started_steady(steady, law)
     else:
-        law = np.eye(step.modes)[observation.modes[0]]
-        y = system.reduced((observation.start - step.reference).T)
-        initial = law[:, None, None] * (y.T @ y / len(y))
-    return transient_mean(system, steady, initial, law, observation.steps)
+        law = system.of_modes(np.eye(step.modes)[observation.modes[0]])
+        initial = system.started((observation.start - step.reference).T, law)
+    return system.framed(transient_mean(system, steady, initial, law, observation.steps))
 
 
 def time_means(observation: Observation) -> TimeMeans:
     """Second moments of a run in lockstep and their standard errors, by the martingale method of this module.
 
+    Where agents keep values from step to step, f depends on more than is logged: then there are no standard errors.
     Time and memory per step are those of p = d (d + 1) / 2 second moments.
     """
     system, steps = observation.prediction.system, observation.steps
+    if system.readout is not None:
+        return _without_errors(observation)
     p = packed_symmetric.size(system.dimension)
     forms, nodes, trace = forms_of(system, "nodes")
 
@@ -234,6 +236,32 @@ def time_means(observation: Observation) -> TimeMeans:
         system_series=series,
         system_variances=variances,
         switches=_expected_switches(observation),
+    )
+
+
+def _without_errors(observation: Observation) -> TimeMeans:
+    """Time means and their expectation over all paths, without standard errors."""
+    system, steps = observation.prediction.system, observation.steps
+    forms, nodes, trace = forms_of(system, "nodes")
+    p = packed_symmetric.size(system.frame.shape[1])
+    seen, series = np.zeros(p), np.empty(steps)
+    for first, last in observation.blocks(max(p, observation.states[0].size), "errors"):
+        found = moments(observation, first, last, observation.states)
+        seen += found.sum(axis=0)
+        series[first:last] = found @ (trace @ forms)
+    expected = expected_mean(observation)
+    return TimeMeans(
+        second_moments=packed_symmetric.unpack(seen / steps, system.frame.shape[1]),
+        expected_moments=expected,
+        joint=False,
+        measured=forms @ (seen / steps),
+        predicted=forms @ packed_symmetric.pack(expected),
+        covariance=np.zeros((len(forms), len(forms))),
+        nodes=nodes,
+        trace=trace,
+        system_series=series,
+        system_variances=np.zeros(steps),
+        switches=0.0,
     )
 
 
@@ -296,7 +324,8 @@ def forms_of(
         the forms (q, p); the node errors as combinations of them (m, q), or (0, q) if only the system error is
         estimated; the system error (q,), which is the sum of the node errors
     """
-    per_node = packed_symmetric.pack(system.lift[:, :, None] * system.lift[:, None, :])
+    frame = system.frame
+    per_node = packed_symmetric.pack(frame[:, :, None] * frame[:, None, :])
     if kind == "joint":
         return np.eye(per_node.shape[1]), per_node, per_node.sum(axis=0)
     if kind == "nodes":
@@ -315,7 +344,7 @@ def packed_moments(deviations: FloatArray, system: JumpSystem, largest: float) -
 
     ``largest`` is the size of the largest state of the run.
     """
-    y = without_rounding(np.einsum("kmr,md->krd", deviations, system.lift, optimize=True), system, largest)
+    y = without_rounding(np.einsum("kmr,md->krd", deviations, system.frame, optimize=True), system, largest)
     return packed_symmetric.pack(y.transpose(0, 2, 1) @ y / deviations.shape[2])
 
 

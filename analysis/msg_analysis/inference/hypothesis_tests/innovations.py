@@ -21,7 +21,7 @@ values that the agents heard (see ``heard_values``), for any timing. See docs/st
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from msg_analysis.inference.observed.heard_values import (
     full_reception_noise,
 )
 from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.observed.repeated_noise import RepeatedNoise
 from msg_analysis.inference.statistics.distributions import chi2_tail
 from msg_analysis.inference.statistics.known_covariance import direction_p, quadratic_form
 from msg_analysis.inference.statistics.normal_covariance import covariance_statistic
@@ -84,16 +85,20 @@ class InnovationSums:
         self._directions = [_directions(matrix) for matrix in self.noises]
         # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
         self._whiteness = Whiteness(min(len(d.whitener) for d in self._directions))
-        varies = step.loss > 0.0 and noise.link > 0.0
-        if observation.timers:
+        self._repeated = RepeatedNoise.of(observation)
+        # False where innovations depend on each other in a way that is not followed here.
+        self.independent = self._repeated is None or not _correlated(step)
+        varies = self._repeated is not None or (step.loss > 0.0 and noise.link > 0.0)
+        if observation.timers and not varies:
             varies = bool((step.noise_gain != step.noise_gain[0]).any())
         self._equalizer = Equalizer(step, self.noises) if varies else None
         regression: StateRegression | HeardRegression = (
             HeardRegression(observation, MAX_REGRESSORS, position if _correlated(step) else None)
-            if noise.on_air or observation.timers
+            if noise.steps_only or observation.timers
             else StateRegression(observation, MAX_REGRESSORS)
         )
-        self._add(observation, regression)
+        if self.independent:
+            self._add(observation, regression)
         self.terms = regression.terms
         self.score, self.covariance = regression.statistic()  # (K,), (K, K)
         self.gram = regression.gram()  # (K, K), see ``StateRegression.gram``; None where it is not available
@@ -118,6 +123,8 @@ class InnovationSums:
 
     def tests(self) -> InnovationTests:
         """All tests of the innovations."""
+        if not self.independent:
+            return InnovationTests(None, None, None)
         ratios: tuple[float, ...] | None = None
         # Variances below NO_NOISE are allowed for: ten standard deviations.
         hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
@@ -160,6 +167,9 @@ class InnovationSums:
             if isinstance(regression, HeardRegression):
                 reception = HeardValues.of(observation, first, last)
                 e = innovations(observation, first, last, reception)
+                if self._repeated:
+                    e, link_variance = self._repeated.free(e, reception)
+                    reception = replace(reception, link_variance=link_variance)
                 regression.add(reception, e, first)
                 if self._equalizer:
                     e = self._equalizer.equalize(e, reception)

@@ -57,7 +57,7 @@ class HeardValues:
     senders: IntArray  # (b, m, D) that neighbour
     weights: FloatArray  # (b, m, D) nominal weights of received values; 0 for others
     own: FloatArray  # (b, m) weight of an agent's own state, which also replaces values that did not arrive
-    link_variance: FloatArray  # (b, m) of the link noise in what each agent heard
+    link_variance: FloatArray  # (b, m) of the link noise in what each agent heard, unless it is partly known
 
     @classmethod
     def of(cls, observation: Observation, first: int, last: int) -> HeardValues:
@@ -67,11 +67,13 @@ class HeardValues:
         if timers is None:
             graphs = np.repeat(modes[:, None], step.agents, axis=1)
             used = np.broadcast_to(np.arange(first, last)[:, None, None], (*graphs.shape, step.most_neighbours))
+            if observation.used is not None:
+                used = observation.used[first:last]
+            elif observation.lost is not None:
+                used = np.where(observation.lost[first:last], -1, used)
         else:
             graphs, used = timers.graphs[first:last], timers.used[first:last]
         weights = neighbour_weights(step)[graphs, agents]
-        if observation.lost is not None:
-            weights = np.where(observation.lost[first:last], 0.0, weights)
         weights = np.where(used >= 0, weights, 0.0)
         published = observation.states if observation.published is None else observation.published
         return cls(

@@ -39,6 +39,7 @@ class Measurement:
     deviations: FloatArray  # (N - first, m, R) from the reference, or in consensus from the agents' mean
     modes: IntArray  # (N,) g(0..N-1)
     lost: BoolArray | None  # (N, m, D) see ``Trajectory.lost``
+    sure_messages: int  # see ``Observation.sure_messages``
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> Measurement:
@@ -55,6 +56,7 @@ class Measurement:
             deviations=deviations[first:],
             modes=trajectory.modes[:steps],
             lost=None if lost is None else lost[:steps],
+            sure_messages=experiment.noise.delay + (1 if experiment.noise.holds else 0),
         )
 
     @property

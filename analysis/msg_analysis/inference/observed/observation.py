@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +26,7 @@ from msg_analysis.common.large_arrays import BLOCK_NUMBERS, pieces, release
 from msg_analysis.common.long_work import tell
 from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.errors import InputError
+from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.theory.prediction import Prediction
@@ -55,6 +56,7 @@ class Observation:
     published: FloatArray | None = None  # (N + 1, m, R) what others heard of x(0..N); None where that is x
     lost: BoolArray | None = None  # (N, m, D) see ``Trajectory.lost``
     timers: Timers | None = None  # None in lockstep
+    used: IntArray | None = None  # (N, m, D) in lockstep, see ``Trajectory.used``
 
     @classmethod
     def of(cls, trajectory: Trajectory, prediction: Prediction) -> Observation:
@@ -64,7 +66,7 @@ class Observation:
         """
         real_time = trajectory.record.experiment.run.pace == "realtime"
         steps = _known_steps(trajectory) if real_time else trajectory.prefix
-        published, lost = trajectory.published, trajectory.lost
+        published, lost, used = trajectory.published, trajectory.lost, trajectory.used
         timers = None
         if real_time:
             assert trajectory.agent_modes is not None
@@ -81,6 +83,7 @@ class Observation:
             None if published is None else bounded(published[: steps + 1]),
             None if lost is None else lost[:steps],
             timers,
+            None if used is None or real_time else used[:steps],
         )
 
     @property
@@ -93,6 +96,11 @@ class Observation:
         """N."""
         return len(self.modes)
 
+    @property
+    def sure_messages(self) -> int:
+        """Steps at the beginning whose messages say nothing about losses."""
+        return self.step.delay + (1 if self.step.holds else 0)
+
     @cached_property
     def largest(self) -> float:
         """Size of the largest state."""
@@ -102,6 +110,17 @@ class Observation:
     def replicas(self) -> int:
         """R."""
         return int(self.states.shape[2])
+
+    def as_timed(self) -> Observation:
+        """A run in lockstep as one in real time in which all agents step together, always on time."""
+        steps, m, most = self.steps, self.step.agents, self.step.most_neighbours
+        used = self.used
+        if used is None:
+            used = np.broadcast_to(np.arange(steps)[:, None, None], (steps, m, most))
+            used = used if self.lost is None else np.where(self.lost, -1, used)
+        graphs = np.repeat(self.modes[:, None], m, axis=1)
+        made = np.repeat(StepClock(self.step.dt).times(np.arange(steps + 1))[:, None], m, axis=1)
+        return replace(self, timers=Timers(graphs, used, made), used=None)
 
     def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
         """(first, last + 1) of blocks of steps that keep temporary arrays of so many numbers per step small.

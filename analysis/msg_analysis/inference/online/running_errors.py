@@ -85,6 +85,8 @@ class LiveEstimate:
         self._note = reason
         if prediction is not None and not lockstep:
             self._note = "in real time the expected errors depend on the lateness of the agents: compare the bag"
+        elif prediction is not None and prediction.system.readout is not None:
+            self._note = "where values are kept from step to step, intervals need the whole run: compare the bag"
         elif prediction is not None and not self._errors.nodes_judged:
             self._note = "too many agents for intervals of the agent errors"
 
@@ -140,7 +142,7 @@ class RunningErrors:
         self._expected: _Expected | None = None
         if prediction is not None:
             self._expected = _Expected(prediction)
-            if experiment.run.pace == "lockstep":
+            if experiment.run.pace == "lockstep" and prediction.system.readout is None:
                 self._judge = _Judge(prediction, self._replicas, nodes=nodes)
                 self.nodes_judged = self._judge.nodes
 
@@ -290,14 +292,13 @@ class _Expected:
 
     def _begin(self, record: RunRecord, first_mode: int | None) -> None:
         step, system, steady = self._prediction.step, self._prediction.system, self._prediction.steady
-        law = step.initial
+        law = system.of_modes(step.initial)
         if record.experiment.run.start == "stationary":
-            initial = (law / step.stationary)[:, None, None] * steady
+            initial = system.started_steady(steady, law)
         else:
             if first_mode is not None:
-                law = np.eye(step.modes)[first_mode]
-            y = system.reduced((record.start - step.reference).T)
-            initial = law[:, None, None] * (y.T @ y / len(y))
+                law = system.of_modes(np.eye(step.modes)[first_mode])
+            initial = system.started((record.start - step.reference).T, law)
         self._away, self._law = initial - steady, law - system.stationary
         self._scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
 

@@ -24,7 +24,8 @@ z], with martingale increments D. The covariance of their sum is estimated by th
 
     Cov(D_a, D_b | z(K-1)) = tr( Y_a N Y_b (2 N + 4 A z z^T A^T) ) / R
 
-as in ``errors.given_path``; where z contains noise, which is not logged, z z^T is replaced by its expectation M(K-1).
+as in ``errors.given_path``; what z contains that is not logged, noise, is replaced by its expectation given the rest.
+In lockstep the same law, with all steps on time, is that of runs in which values are kept from step to step.
 M is computed forwards, Y backwards, in blocks: going backwards, the M of a block are computed again from its beginning.
 """
 
@@ -72,9 +73,10 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
     experiment = observation.prediction.experiment
     graphs, used, made = ideal_log(experiment, observation.step, observation.modes)
     ideal = replace(observation, timers=Timers(graphs[1:], used, made))
-    total = _forward(Periods(ideal, order_events(ideal).position), _start(observation))[0]
-    lift = observation.prediction.system.lift
-    expected = float(np.trace(lift.T @ total @ lift)) / observation.steps
+    periods = Periods(ideal, order_events(ideal).position)
+    total = _forward(periods, periods.start(_start(observation)))[0]
+    frame = observation.prediction.system.frame
+    expected = float(np.trace(frame.T @ total @ frame)) / observation.steps
     return float(means.trace @ means.predicted) / expected - 1.0 if expected > 0.0 else None
 
 
@@ -103,7 +105,8 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
             f"{entries} values are in use at the same time, expected at most {MAX_ENTRIES}: some were used long after "
             "they were computed"
         )
-    p = packed_symmetric.size(system.dimension)
+    frame = system.frame
+    p = packed_symmetric.size(frame.shape[1])
     for kind in ("joint", "nodes", "system"):
         forms, nodes, trace = forms_of(system, kind)
         q = len(forms)
@@ -112,8 +115,7 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
             break
     else:
         raise PatternUnavailableError(f"{steps} steps of {entries} values are too many to compute")
-    lifted = packed_symmetric.unpack(forms, system.dimension)
-    lifted = system.lift @ lifted @ system.lift.T
+    lifted = frame @ packed_symmetric.unpack(forms, frame.shape[1]) @ frame.T
 
     x = sampled(observation)
     seen = np.zeros(p)
@@ -123,9 +125,9 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
         seen += found.sum(axis=0)
         series[first:last] = found @ (trace @ forms)
     total, covariance, variances = _follow(periods, _start(observation), lifted, trace)
-    expected = system.lift.T @ (total / steps) @ system.lift
+    expected = frame.T @ (total / steps) @ frame
     return TimeMeans(
-        second_moments=packed_symmetric.unpack(seen / steps, system.dimension),
+        second_moments=packed_symmetric.unpack(seen / steps, frame.shape[1]),
         expected_moments=expected,
         joint=kind == "joint",
         measured=forms @ (seen / steps),
@@ -138,32 +140,46 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
     )
 
 
+def means_in_lockstep(observation: Observation) -> TimeMeans | None:
+    """Time means of a run in lockstep, given the path of the graphs and which values were heard.
+
+    None where that would take too long.
+    """
+    timed = observation.as_timed()
+    steps, m = observation.steps, observation.step.agents
+    try:
+        return pattern_means(timed, EventOrder(np.arange(steps * m).reshape(steps, m), None))
+    except PatternUnavailableError:
+        return None
+
+
 def _follow(
     periods: Periods, start: FloatArray, forms: FloatArray, trace: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum of E[X X^T] (m, m), sum of Cov(D) (q, q), and Var of the system error's D by period (N,); one replica."""
     steps, m, q = periods.steps, len(start), len(forms)
-    total, beginnings, length = _forward(periods, start)
+    total, beginnings, length = _forward(periods, periods.start(start))
     covariance, variances = np.zeros((q, q)), np.zeros(steps)
     dual = np.zeros((q, periods.entries(steps - 1), periods.entries(steps - 1)))
     dual[:, :m, :m] = forms
     for block in reversed(range(len(beginnings))):
         first, last = block * length, min((block + 1) * length, steps)
-        moments_of = [beginnings[block]]
+        beginning, here = beginnings[block]
+        moments_of = [here]
         for number in range(first + 1, last):
             moments_of.append(_next(periods, number, moments_of[-1]))
         for number in range(last - 1, max(first, 1) - 1, -1):
-            period, before = periods[number], periods.stack(number - 1)
+            period, moment = periods[number], moments_of[number - first]
+            before = periods.stack(number - 1, moments_of[number - 1 - first] if number > first else beginning)
             if before is None:
-                spread = 4.0 * moments_of[number - first] - 2.0 * period.noise
+                spread = 4.0 * moment - 2.0 * period.noise
             else:
-                after = period.matrix @ before
-                spread = 2.0 * period.noise + 4.0 * after @ after.T / after.shape[1]
+                spread = 2.0 * period.noise + 4.0 * period.matrix @ before @ period.matrix.T
             left = (dual @ period.noise).reshape(q, -1)
             right = (spread @ dual).reshape(q, -1)
-            here = left @ right.T
-            covariance += here
-            variances[number] = trace @ here @ trace
+            added = left @ right.T
+            covariance += added
+            variances[number] = trace @ added @ trace
             dual = period.matrix.T @ dual @ period.matrix
             dual[:, :m, :m] += forms
     return total, covariance, variances
@@ -177,15 +193,15 @@ def _start(observation: Observation) -> FloatArray:
     return np.asarray(start @ start.T / observation.replicas)
 
 
-def _forward(periods: Periods, start: FloatArray) -> tuple[FloatArray, list[FloatArray], int]:
-    """Sum of E[X X^T] (m, m), M at the beginning of every block, and the number of periods in a block."""
-    m, length = len(start), max(1, math.isqrt(periods.steps))
-    total, beginnings, moment = np.zeros((m, m)), [], start
+def _forward(periods: Periods, start: FloatArray) -> tuple[FloatArray, list[tuple[FloatArray, FloatArray]], int]:
+    """Sum of E[X X^T] (m, m), M before and at the beginning of every block, and the number of periods in a block."""
+    m, length = periods.agents, max(1, math.isqrt(periods.steps))
+    total, beginnings, moment, before = np.zeros((m, m)), [], start, start
     for number in range(periods.steps):
         if number:
-            moment = _next(periods, number, moment)
+            before, moment = moment, _next(periods, number, moment)
         if number % length == 0:
-            beginnings.append(moment)
+            beginnings.append((before, moment))
         total += moment[:m, :m]
     return total, beginnings, length
 

@@ -15,9 +15,11 @@
 """The periods of a run in real time as linear maps between the states known at its sampling times.
 
 The state of the network at the sampling time K dt is a stack: the newest state of every agent; older ones that a later
-step still uses, because a message was slow or its reader late; and, if noise is correlated between agents, the noise of
-a step that some agents have made and others not yet. A period maps one stack to the next by a matrix and noise, which
-depend on the log alone. Nearly all periods of a run are alike: matrices are computed once for each pattern.
+step still uses, because a message was slow, its reader late, or a newer one lost; in place of these, with noise on the
+air, the values as they were published, or received if they are received once and used again; and, if process noise is
+correlated between agents, that of a step that some agents have made and others not yet. A period maps one stack to the
+next by a matrix and noise, which depend on the log alone. Without losses nearly all periods of a run are alike:
+matrices are computed once for each pattern.
 """
 
 from __future__ import annotations
@@ -55,6 +57,11 @@ class Periods:
     def __init__(self, observation: Observation, position: IntArray) -> None:
         assert observation.timers is not None
         self._step = step = observation.step
+        links = np.argwhere(step.listens())
+        # Entries: the states of m agents, m sources of noise, what m agents published, what came on every link.
+        self._owners = np.concatenate([np.tile(np.arange(step.agents), 3), links[:, 1]])
+        self._numbers = np.full((step.agents, step.agents), -1)
+        self._numbers[links[:, 0], links[:, 1]] = 3 * step.agents + np.arange(len(links))
         self._shared = _shared_sources(step)
         graphs, used, made = observation.timers.graphs, observation.timers.used, observation.timers.made
         steps, m = graphs.shape
@@ -66,11 +73,15 @@ class Periods:
         known = np.minimum(period, steps - 1) - 1
         offsets = np.where(used >= 0, used - newest[known[:, :, None], senders], _OWN)
         seen = period < steps
-        self._extras(period, newest, np.where(seen[:, :, None], used, -1), senders, offsets)
+        used = np.where(seen[:, :, None], used, -1)
+        again = np.zeros_like(used)
+        if step.link:
+            again = self._again(used, senders, position)
+        self._extras(period, newest, used, senders, offsets, again)
         own = np.arange(steps)[:, None] - newest[known, agents]
         lag = np.arange(steps)[:, None] - period if self._shared.any() else np.zeros_like(period)
         columns = [np.broadcast_to(agents, period.shape), graphs, lag, own]
-        table = np.concatenate([np.stack(columns, axis=2), offsets], axis=2).reshape(steps * m, -1)
+        table = np.concatenate([np.stack(columns, axis=2), offsets, again], axis=2).reshape(steps * m, -1)
         order = np.lexsort((position.ravel(), period.ravel()))[: int(seen.sum())]
         self._table = np.ascontiguousarray(table[order])
         self._ends = np.searchsorted(period.ravel()[order], np.arange(steps + 1))
@@ -78,19 +89,45 @@ class Periods:
         self._cached = 0
         self.steps = steps
 
-    def _extras(self, period: IntArray, newest: IntArray, used: IntArray, senders: IntArray, offsets: IntArray) -> None:
+    def _again(self, used: IntArray, senders: IntArray, position: IntArray) -> IntArray:
+        """(N, m, D): 1 and 2 for the first and the later uses of a message that is used again, 0 for others."""
+        k, i, d = np.nonzero(used >= 0)
+        order = np.lexsort((position[k, i], used[k, i, d], senders[k, i, d], i))
+        message = np.column_stack([i, senders[k, i, d], used[k, i, d]])[order]
+        same = (message[1:] == message[:-1]).all(axis=1)
+        earlier, later = np.concatenate([[False], same]), np.concatenate([same, [False]])
+        again = np.zeros_like(used)
+        again[k[order], i[order], d[order]] = np.where(earlier, 2, later)
+        return again
+
+    def _extras(
+        self,
+        period: IntArray,
+        newest: IntArray,
+        used: IntArray,
+        senders: IntArray,
+        offsets: IntArray,
+        again: IntArray,
+    ) -> None:
         """What is stacked after the newest states: rows (entry, its step from the newest one, or from K), by K."""
         steps, m = period.shape
-        k, i, d = np.nonzero((used >= 0) & (offsets < 0))
+        k, i, d = np.nonzero((used >= 0) & (again < 2) & ((offsets < 0) | (self._step.broadcast > 0.0)))
         sender, step, last = senders[k, i, d], used[k, i, d], period[k, i] - 1
-        # First sampling time at which that agent has a newer state.
-        first = period[step, sender]
-        values, owner = np.unique(np.column_stack([sender, step, first]), axis=0, return_inverse=True)
-        end = np.full(len(values), -1)
-        np.maximum.at(end, owner.reshape(-1), last)
-        sender, step, first = values.reshape(-1, 3).T
-        at, which = _spread(first, end)
-        rows = [np.column_stack([at, sender[which], step[which] - newest[at, sender[which]]])]
+        if self._step.broadcast:  # first sampling time at which it has been published
+            entry, first = 2 * m + sender, np.where(step > 0, period[step - 1, sender], 0)
+        else:  # first one at which that agent has a newer state
+            entry, first = sender, period[step, sender]
+        values = [_lasting(entry, step, first, last)]
+        k, i, d = np.nonzero(again == 2)
+        if k.size:
+            received = np.column_stack([self._numbers[i, senders[k, i, d]], used[k, i, d]])
+            k0, i0, d0 = np.nonzero(again == 1)
+            begun = np.column_stack([self._numbers[i0, senders[k0, i0, d0]], used[k0, i0, d0], period[k0, i0]])
+            values.append(_lasting(received[:, 0], received[:, 1], _looked_up(begun, received), period[k, i] - 1))
+        rows = []
+        for entry, step, first, last in values:
+            at, which = _spread(first, last)
+            rows.append(np.column_stack([at, entry[which], step[which] - newest[at, self._owners[entry[which]]]]))
         if self._shared.any():
             first, end = period.min(axis=1), np.minimum(period.max(axis=1), steps) - 1
             at, which = _spread(first, end)
@@ -102,23 +139,50 @@ class Periods:
         self._extra_ends = np.searchsorted(found[:, 0], np.arange(steps + 1))
         self.largest = m + int(np.diff(self._extra_ends).max(initial=0))  # entries of the largest stack
 
+    @property
+    def agents(self) -> int:
+        """M."""
+        return self._step.agents
+
     def entries(self, number: int) -> int:
         """Entries of the stack at sampling time ``number``, from 0."""
         return self._step.agents + int(self._extra_ends[number + 1] - self._extra_ends[number])
 
-    def stack(self, number: int) -> FloatArray | None:
-        """(S, R): the stack at sampling time ``number``, as logged; None where it contains noise, which is not."""
+    def start(self, moment: FloatArray) -> FloatArray:
+        """(S, S): second moment of the stack at the start, from that of the states (m, m)."""
+        m = self._step.agents
+        entries = np.concatenate([np.arange(m), self._extra[: self._extra_ends[1], 0]])
+        owners = self._owners[entries]
+        noise = np.diag(np.where(entries >= 2 * m, self._step.broadcast**2, 0.0))
+        return np.asarray(moment[np.ix_(owners, owners)] + noise)
+
+    def stack(self, number: int, moment: FloatArray) -> FloatArray | None:
+        """(S, S): mean of z z^T over the replicas at sampling time ``number``, given what is logged.
+
+        What was received is not logged, but follows, but for its noise, from the rest: by regression, with the second
+        moment (S, S) of the law. None where the stack contains process noise.
+        """
         if self._shared.any():
             return None
-        step, m = self._step, self._step.agents
+        step, m, observation = self._step, self._step.agents, self._observation
         extra = self._extra[self._extra_ends[number] : self._extra_ends[number + 1]]
-        agents = np.concatenate([np.arange(m), extra[:, 0]])
-        steps = self._newest[number, agents]
+        entries = np.concatenate([np.arange(m), extra[:, 0]])
+        steps = self._newest[number, self._owners[entries]]
         steps[m:] += extra[:, 1]
-        found = self._observation.states[steps, agents] - step.reference
+        known = entries < 3 * m
+        entries, steps = entries[known], steps[known]
+        states, published = observation.states, observation.published
+        found = states[steps, self._owners[entries]]
+        if published is not None:
+            aired = entries >= 2 * m
+            found[aired] = published[steps[aired], entries[aired] - 2 * m]
+        found = found - step.reference
         # In consensus the common part does not count, and can be large.
-        consensus = self._observation.prediction.experiment.problem == "consensus"
-        return np.asarray(found - found.mean(axis=0) if consensus else found)
+        consensus = observation.prediction.experiment.problem == "consensus"
+        if consensus:
+            found = found - found.mean(axis=0)
+        seen = np.asarray(found @ found.T / found.shape[1])
+        return seen if known.all() else _completed(seen, known, moment, centred=consensus)
 
     def __getitem__(self, number: int) -> Period:
         """The period that ends at sampling time ``number`` (1..N-1)."""
@@ -139,26 +203,44 @@ class Periods:
         step, m = self._step, self._step.agents
         tables, weights = neighbour_tables(step), neighbour_weights(step)
         live = _Live(m + len(before), m)
+        sources = range(m, 2 * m)
+        owners = self._owners.tolist()
         # Values by agent and step from the newest one at the beginning; noise by source and step from the end.
         for j in range(m):
             live.start((j, 0))
         for entry, offset in before.tolist():
-            live.start((entry, offset if entry < m else offset - 1))
+            live.start((entry, offset - 1 if entry in sources else offset))
         made = [0] * m
         rows: list[tuple[_Key, dict[_Key, float], float]] = []
+        published = 2 * m if step.broadcast else 0
         for agent, graph, lag, own, *heard in events.tolist():
             mine = agent, own
             terms = {mine: float(step.nominal[graph, agent, agent])}
+            variance = 0.0
             for d in range(int(tables.count[graph, agent])):
-                key = mine if heard[d] == _OWN else (int(tables.senders[graph, agent, d]), heard[d])
-                terms[key] = terms.get(key, 0.0) + float(weights[graph, agent, d])
+                sender, weight, again = int(tables.senders[graph, agent, d]), float(weights[graph, agent, d]), 0
+                key = mine
+                if heard[d] != _OWN:
+                    key, again = (published + sender, heard[d]), heard[step.most_neighbours + d]
+                    if again:
+                        received = int(self._numbers[agent, sender]), heard[d]
+                        if again == 1:
+                            rows.append((received, {key: 1.0}, step.link**2))
+                        key = received
+                    else:
+                        variance += (weight * step.link) ** 2
+                terms[key] = terms.get(key, 0.0) + weight
             gain = step.noise_gain[graph, agent]
             for which in np.flatnonzero(self._shared & (gain != 0.0)).tolist():
                 terms[m + which, lag] = float(gain[which])
             made[agent] = own + 1
-            rows.append(((agent, own + 1), terms, float((gain[~self._shared] ** 2).sum())))
+            rows.append(((agent, own + 1), terms, variance + float((gain[~self._shared] ** 2).sum())))
+            if published:
+                rows.append(((published + agent, own + 1), {(agent, own + 1): 1.0}, step.broadcast**2))
         stacked = [(j, made[j]) for j in range(m)]
-        stacked += [(entry, made[entry] + offset if entry < m else offset) for entry, offset in after.tolist()]
+        stacked += [(e, offset if e in sources else made[owners[e]] + offset) for e, offset in after.tolist()]
+        wanted = set(stacked).union(*(terms for _, terms, _ in rows))
+        rows = [row for row in rows if row[0] in wanted]
         last_use = {key: number for number, (_, terms, _) in enumerate(rows) for key in terms}
         last_use |= dict.fromkeys(stacked, len(rows))
         for number, (key, terms, variance) in enumerate(rows):
@@ -173,7 +255,7 @@ _Key = tuple[int, int]
 class _Live:
     """Values as combinations of the stack at the beginning of a period, and the covariance of the noise added since.
 
-    Keys are (agent or m + source, step); noise sources are numbers of variance 1, new where not known yet.
+    Keys are (entry, step), see ``Periods``; noise sources are numbers of variance 1, new where not known yet.
     """
 
     def __init__(self, entries: int, agents: int) -> None:
@@ -210,7 +292,7 @@ class _Live:
         return Period(self._matrix[rows], self._noise[np.ix_(rows, rows)])
 
     def _find(self, key: _Key) -> int:
-        if key not in self._place and key[0] >= self._agents:
+        if key not in self._place and self._agents <= key[0] < 2 * self._agents:
             place = self._new(key)
             self._matrix[place] = self._noise[place] = self._noise[:, place] = 0.0
             self._noise[place, place] = 1.0
@@ -229,6 +311,38 @@ class _Live:
 def _shared_sources(step: StepModel) -> BoolArray:
     """(m,): whether more than one agent feels a source of noise, in any graph."""
     return np.asarray((step.noise_gain != 0.0).any(axis=0).sum(axis=0) > 1)
+
+
+def _lasting(
+    entry: IntArray, step: IntArray, first: IntArray, last: IntArray
+) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Each (entry, step, first) once, with the last of its uses."""
+    values, owner = np.unique(np.column_stack([entry, step, first]), axis=0, return_inverse=True)
+    end = np.full(len(values), -1)
+    np.maximum.at(end, owner.reshape(-1), last)
+    entry, step, first = values.reshape(-1, 3).T
+    return entry, step, first, end
+
+
+def _looked_up(table: IntArray, keys: IntArray) -> IntArray:
+    """The third column of the rows of a table whose first two columns are the keys (K, 2)."""
+    size = int(table[:, 1].max()) + 1
+    codes = table[:, 0] * size + table[:, 1]
+    order = np.argsort(codes)
+    return np.asarray(table[order[np.searchsorted(codes[order], keys[:, 0] * size + keys[:, 1])], 2])
+
+
+def _completed(seen: FloatArray, known: BoolArray, moment: FloatArray, *, centred: bool) -> FloatArray:
+    """E[z z^T] given the mean ``seen`` over the replicas for the ``known`` entries, by linear regression."""
+    if centred:
+        centre = np.eye(len(known)) - np.outer(np.ones(len(known)), known / known.sum())
+        moment = centre @ moment @ centre.T
+    gain = moment[:, known] @ np.linalg.pinv(moment[np.ix_(known, known)], hermitian=True)
+    rest = moment[np.ix_(~known, ~known)] - gain[~known] @ moment[np.ix_(known, ~known)]
+    found = gain @ seen @ gain.T
+    found[np.ix_(known, known)] = seen
+    found[np.ix_(~known, ~known)] += rest
+    return found
 
 
 def _spread(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:

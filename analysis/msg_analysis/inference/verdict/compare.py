@@ -28,7 +28,7 @@ from msg_analysis.inference.errors.given_path import GivenPath
 from msg_analysis.inference.errors.ranking import rank_agents
 from msg_analysis.inference.errors.time_means import TimeMeans
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
-from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import loss_test
+from msg_analysis.inference.hypothesis_tests.losses import loss_test
 from msg_analysis.inference.hypothesis_tests.switching import switching_test
 from msg_analysis.inference.observed.measurement import Measurement
 from msg_analysis.inference.observed.observation import Observation

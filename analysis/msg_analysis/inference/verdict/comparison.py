@@ -32,7 +32,7 @@ from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.errors.given_path import GivenPath
 from msg_analysis.inference.errors.ranking import Ranking
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
-from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import LossTest
+from msg_analysis.inference.hypothesis_tests.losses import LossTest
 from msg_analysis.inference.hypothesis_tests.switching import SwitchingTest
 from msg_analysis.inference.realtime.laws import Laws
 from msg_analysis.inference.realtime.timing import Timing

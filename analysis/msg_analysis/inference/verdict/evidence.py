@@ -23,12 +23,14 @@ import numpy as np
 from msg_analysis.common.blas_threads import blas_threads
 from msg_analysis.inference.errors.given_path import means_given_path
 from msg_analysis.inference.errors.time_means import TimeMeans, time_means
+from msg_analysis.inference.hypothesis_tests.broadcast import BroadcastSums
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
-from msg_analysis.inference.hypothesis_tests.loss_and_broadcast import BroadcastSums, LossTally
+from msg_analysis.inference.hypothesis_tests.losses import LossTally
 from msg_analysis.inference.hypothesis_tests.switching import Transitions
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.realtime.event_order import order_events
 from msg_analysis.inference.realtime.laws import Laws, measure_laws
+from msg_analysis.inference.realtime.logged_pattern import means_in_lockstep
 from msg_analysis.inference.realtime.timing import Timing, measure_timing
 
 
@@ -71,7 +73,8 @@ class Evidence:
             means, laws = measure_laws(observation, order, timing, level)
         else:
             means = time_means(observation)
-            given = means_given_path(observation)
+            kept = observation.prediction.system.readout is not None
+            given = means_in_lockstep(observation) if kept else means_given_path(observation)
         return cls(
             steps=observation.steps,
             means=means,

@@ -125,7 +125,7 @@ class StepModel(Wiring):
 
     @property
     def by_message(self) -> bool:
-        """Whether ``weights``, ``noise`` and ``loss_variance`` are not the whole law: values are kept from step to step."""
+        """Whether ``weights``, ``noise`` and ``loss_variance`` are not all: values are kept from step to step."""
         bursts = self.burst is not None and self.loss > 0.0
         return self.holds or bursts or self.turns is not None
 

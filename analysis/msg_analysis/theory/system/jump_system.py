@@ -85,6 +85,20 @@ class JumpSystem:
         """(m, d): output @ y is the deviation of the agents from what they should be."""
         return self.lift if self.readout is None else self.readout
 
+    @property
+    def frame(self) -> FloatArray:
+        """(m, f) columns orthonormal: coordinates of the deviations of the agents alone. ``lift`` where that is all."""
+        if self.readout is None:
+            return self.lift
+        m = len(self.readout)
+        return np.asarray(scipy.linalg.helmert(m).T if self.unreduced is not None else np.eye(m))
+
+    def framed(self, moments: FloatArray) -> FloatArray:
+        """(..., f, f) second moments of the agents in ``frame``, from those of the reduced coordinates (..., d, d)."""
+        if self.readout is None:
+            return moments
+        return np.asarray(self.frame.T @ self.lifted(moments) @ self.frame)
+
     def lifted(self, moments: FloatArray) -> FloatArray:
         """(..., m, m) second moments of the agents from those of the reduced coordinates, (..., d, d)."""
         return np.asarray(self.output @ moments @ self.output.T)

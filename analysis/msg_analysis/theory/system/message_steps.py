@@ -24,7 +24,6 @@ together if all agents do, so in consensus one number drops out. See docs/theory
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -79,13 +78,13 @@ def message_steps(step: StepModel) -> MessageSteps:
         periods.append(_period(step, stack, graph, probability))
     chain, stationary = step.transition, step.stationary
     if len(channels):
-        laws = [_gilbert(step.losses[i, j], step.burst or 1.0) for i, j in channels.tolist()]
-        chain = functools.reduce(np.kron, [law for law, _ in laws], chain)
-        stationary = functools.reduce(np.kron, [law for _, law in laws], stationary)
+        for i, j in channels.tolist():
+            channel, shares = _gilbert(float(step.losses[i, j]), step.burst or 1.0)
+            chain, stationary = np.kron(chain, channel), np.kron(stationary, shares)
     matrices = np.stack([period.matrix for period in periods])
     losses = _stacked(periods)
     kept = _read(matrices, losses, step.agents)
-    square = np.ix_(range(modes), kept, kept)
+    square = np.ix_(np.arange(modes), kept, kept)
     return MessageSteps(
         matrices=matrices[square],
         noise=np.stack([period.noise for period in periods])[square],
@@ -133,7 +132,7 @@ class _Stack:
 
     @property
     def size(self) -> int:
-        """k."""
+        """K."""
         return len(self.copies)
 
     def source(self, receiver: int, sender: int) -> int:

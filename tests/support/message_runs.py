@@ -1,0 +1,124 @@
+"""Runs simulated message by message, in a simulator of its own: what every agent heard, used and logged.
+
+It shares the experiment's document and the phases of the agents with the software, and no random number. Timers may be
+late and messages slow; by default nobody is late, and messages arrive at once.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import scipy.linalg
+
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.trajectory import Completeness, Trajectory
+from msg_analysis.model.step.phases import phases
+from msg_analysis.twin.simulate import new_record
+
+
+def lost_messages(random, probability, burst, count):
+    """(count,) of one link: independent, or a Gilbert channel from its stationary law."""
+    if burst is None or not probability:
+        return random.random(count) < probability
+    found = np.empty(count, dtype=bool)
+    found[0] = random.random() < probability
+    fails = probability / (burst * (1 - probability))
+    for s, draw in enumerate(random.random(count - 1), start=1):
+        found[s] = draw >= 1 / burst if found[s - 1] else draw < fails
+    return found
+
+
+def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0, latency=0.0) -> Trajectory:
+    """A run of an experiment, by the law of ``actual`` if that is another one; start zero or given.
+
+    ``late`` and ``latency``: mean of exponential times, in steps, by which steps are late and messages under way.
+    """
+    law, random = actual or experiment, np.random.default_rng(seed)
+    record = new_record(experiment)
+    m, steps, dt, replicas = law.agents, law.steps, law.step_length, law.run.replicas
+    noise, real_time = law.noise, law.run.pace == "realtime"
+    gains = law.leader_gains
+    laplacians = [np.diag(g.adjacency.sum(axis=1)) - g.adjacency for g in law.graph_list]
+    weights = np.eye(m) - dt * (np.stack(laplacians) + np.diag(gains))
+    senders = [[[j for j in range(m) if j != i and w[i, j]] for i in range(m)] for w in weights]
+    most = max(len(one) for graph in senders for one in graph)
+
+    transition = scipy.linalg.expm(dt * law.chain.matrix)
+    shares = np.linalg.matrix_power(transition, 4096)[0]
+    modes = np.empty(steps, dtype=np.int64)
+    mode = random.choice(len(shares), p=shares)
+    for k in range(steps):
+        modes[k] = mode
+        mode = random.choice(len(shares), p=transition[mode])
+
+    links = sorted({(i, j) for graph in senders for i in range(m) for j in graph[i]})
+    lost = {link: lost_messages(random, law.loss[link], noise.burst, steps + 1) for link in links}
+    if noise.holds:
+        for link in links:
+            lost[link][0] = False
+    drawn = {link: noise.link * random.standard_normal((steps + 1, replicas)) for link in links}
+    process = math.sqrt(dt) * random.standard_normal((steps, m, replicas)) @ np.eye(replicas)
+    process = np.einsum("ij,kjr->kir", law.noise_gain[0], process)
+    air = noise.broadcast * random.standard_normal((steps + 1, m, replicas))
+
+    due = np.repeat(np.arange(1.0, steps + 1)[:, None], m, axis=1)
+    if real_time:
+        due += phases(law) - 1.0 + late * random.exponential(size=(steps, m))
+        due = np.maximum.accumulate(due + 1e-9 * np.arange(1, steps + 1)[:, None], axis=0)
+    made = np.zeros((steps + 1, m), dtype=np.int64)
+    made[1:] = np.rint(1e9 * dt * due).astype(np.int64)
+    arrives = {
+        link: made[:, link[1]] + np.rint(1e9 * dt * latency * random.exponential(size=steps + 1)) for link in links
+    }
+
+    states = np.empty((steps + 1, m, replicas))
+    states[0] = record.start
+    published = np.empty_like(states)
+    published[0] = states[0] + air[0]
+    used = np.full((steps, m, most), -1, dtype=np.int64)
+    gone = np.zeros((steps, m, most), dtype=bool)
+    newest = dict.fromkeys(links, 0)
+    order = np.lexsort((np.tile(np.arange(m), steps), np.repeat(np.arange(steps), m), due.ravel()))
+    reference = law.reference
+    for k, i in np.column_stack(np.unravel_index(order, (steps, m))).tolist():
+        w, own = weights[modes[k], i], states[k, i]
+        total = own * w[i] + reference * (1.0 - w.sum())
+        for d, j in enumerate(senders[modes[k]][i]):
+            n = k
+            if real_time:
+                while newest[i, j] < steps and _there(newest[i, j] + 1, made[k + 1, i], made[:, j], arrives[i, j]):
+                    newest[i, j] += 1
+                n = newest[i, j]
+            s = max(0, n - noise.delay)
+            gone[k, i, d] = lost[i, j][s]
+            if noise.holds:
+                while lost[i, j][s]:
+                    s -= 1
+            elif lost[i, j][s]:
+                s = -1
+            used[k, i, d] = s
+            total = total + w[j] * (own if s < 0 else published[s, j] + drawn[i, j][s])
+        states[k + 1, i] = total + process[k, i]
+        published[k + 1, i] = states[k + 1, i] + air[k + 1, i]
+    whole = Completeness(states.shape[0] * m, states.shape[0] * m, 0)
+    return Trajectory(
+        record,
+        states,
+        modes,
+        whole,
+        agent_modes=np.concatenate([np.full((1, m), -1), np.repeat(modes[:, None], m, axis=1)]) if real_time else None,
+        published=published if noise.broadcast else None,
+        lost=gone if noise.loss.any and not real_time else None,
+        used=used if real_time or noise.delay or noise.holds else None,
+        made=made if real_time else None,
+    )
+
+
+def _there(step, now, made, arrives):
+    """Whether a message has been made and has arrived; messages of a link keep their order."""
+    return (
+        made[step] < now and arrives[: step + 1].max() <= now
+        if step < 50
+        else made[step] < now and (arrives[step - 50 : step + 1].max() <= now)
+    )
