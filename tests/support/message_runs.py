@@ -58,7 +58,7 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
         for link in links:
             lost[link][0] = False
     drawn = {link: noise.link * random.standard_normal((steps + 1, replicas)) for link in links}
-    process = math.sqrt(dt) * random.standard_normal((steps, m, replicas)) @ np.eye(replicas)
+    process = math.sqrt(dt) * random.standard_normal((steps, m, replicas))
     process = np.einsum("ij,kjr->kir", law.noise_gain[0], process)
     air = noise.broadcast * random.standard_normal((steps + 1, m, replicas))
 
@@ -117,8 +117,4 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
 
 def _there(step, now, made, arrives):
     """Whether a message has been made and has arrived; messages of a link keep their order."""
-    return (
-        made[step] < now and arrives[: step + 1].max() <= now
-        if step < 50
-        else made[step] < now and (arrives[step - 50 : step + 1].max() <= now)
-    )
+    return made[step] < now and arrives[max(0, step - 50) : step + 1].max() <= now

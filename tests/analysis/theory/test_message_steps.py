@@ -143,10 +143,8 @@ class Brute:
                     w = self.weights[graph, i, j]
                     if j == i or not w:
                         continue
-                    if not holds and lost.get((i, j)):
-                        total = total + w * x[i]
-                    else:
-                        total = total + w * heard[i, j][d]
+                    own = not holds and lost.get((i, j))
+                    total = total + w * (x[i] if own else heard[i, j][d])
                 new[i] = total + sum(self.gain[graph, i, s] * process[s] for s in range(m))
             for i in agents:
                 x[i] = new[i]

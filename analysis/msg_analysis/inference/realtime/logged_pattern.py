@@ -74,7 +74,7 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
     graphs, used, made = ideal_log(experiment, observation.step, observation.modes)
     ideal = replace(observation, timers=Timers(graphs[1:], used, made))
     periods = Periods(ideal, order_events(ideal).position)
-    total = _forward(periods, periods.start(_start(observation)))[0]
+    total = _forward(periods, np.sum(periods.start(_start(observation)), axis=0))[0]
     frame = observation.prediction.system.frame
     expected = float(np.trace(frame.T @ total @ frame)) / observation.steps
     return float(means.trace @ means.predicted) / expected - 1.0 if expected > 0.0 else None
@@ -158,7 +158,8 @@ def _follow(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sum of E[X X^T] (m, m), sum of Cov(D) (q, q), and Var of the system error's D by period (N,); one replica."""
     steps, m, q = periods.steps, len(start), len(forms)
-    total, beginnings, length = _forward(periods, periods.start(start))
+    known, published = periods.start(start)
+    total, beginnings, length = _forward(periods, known + published)
     covariance, variances = np.zeros((q, q)), np.zeros(steps)
     dual = np.zeros((q, periods.entries(steps - 1), periods.entries(steps - 1)))
     dual[:, :m, :m] = forms
@@ -175,14 +176,20 @@ def _follow(
                 spread = 4.0 * moment - 2.0 * period.noise
             else:
                 spread = 2.0 * period.noise + 4.0 * period.matrix @ before @ period.matrix.T
-            left = (dual @ period.noise).reshape(q, -1)
-            right = (spread @ dual).reshape(q, -1)
-            added = left @ right.T
+            added = _spread(dual, period.noise, spread)
             covariance += added
             variances[number] = trace @ added @ trace
             dual = period.matrix.T @ dual @ period.matrix
             dual[:, :m, :m] += forms
+    added = _spread(dual, published, 2.0 * published + 4.0 * known)
+    covariance += added
+    variances[0] = trace @ added @ trace
     return total, covariance, variances
+
+
+def _spread(dual: FloatArray, noise: FloatArray, spread: FloatArray) -> FloatArray:
+    """(q, q): tr(Y_a N Y_b S) of the forms Y (q, S, S)."""
+    return np.asarray((dual @ noise).reshape(len(dual), -1) @ (spread @ dual).reshape(len(dual), -1).T)
 
 
 def _start(observation: Observation) -> FloatArray:

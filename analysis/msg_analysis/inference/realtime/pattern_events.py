@@ -148,13 +148,13 @@ class Periods:
         """Entries of the stack at sampling time ``number``, from 0."""
         return self._step.agents + int(self._extra_ends[number + 1] - self._extra_ends[number])
 
-    def start(self, moment: FloatArray) -> FloatArray:
-        """(S, S): second moment of the stack at the start, from that of the states (m, m)."""
+    def start(self, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(S, S) each, of the stack at the start: second moment without noise, from that of the states (m, m); noise."""
         m = self._step.agents
         entries = np.concatenate([np.arange(m), self._extra[: self._extra_ends[1], 0]])
         owners = self._owners[entries]
         noise = np.diag(np.where(entries >= 2 * m, self._step.broadcast**2, 0.0))
-        return np.asarray(moment[np.ix_(owners, owners)] + noise)
+        return moment[np.ix_(owners, owners)], noise
 
     def stack(self, number: int, moment: FloatArray) -> FloatArray | None:
         """(S, S): mean of z z^T over the replicas at sampling time ``number``, given what is logged.
@@ -201,7 +201,7 @@ class Periods:
     def _compile(self, events: IntArray, before: IntArray, after: IntArray) -> Period:
         """Event by event; values are kept as long as they are used."""
         step, m = self._step, self._step.agents
-        tables, weights = neighbour_tables(step), neighbour_weights(step)
+        tables, weights, most = neighbour_tables(step), neighbour_weights(step), step.most_neighbours
         live = _Live(m + len(before), m)
         sources = range(m, 2 * m)
         owners = self._owners.tolist()
@@ -221,7 +221,7 @@ class Periods:
                 sender, weight, again = int(tables.senders[graph, agent, d]), float(weights[graph, agent, d]), 0
                 key = mine
                 if heard[d] != _OWN:
-                    key, again = (published + sender, heard[d]), heard[step.most_neighbours + d]
+                    key, again = (published + sender, heard[d]), heard[most + d]
                     if again:
                         received = int(self._numbers[agent, sender]), heard[d]
                         if again == 1:

@@ -80,7 +80,7 @@ def message_steps(step: StepModel) -> MessageSteps:
     if len(channels):
         for i, j in channels.tolist():
             channel, shares = _gilbert(float(step.losses[i, j]), step.burst or 1.0)
-            chain, stationary = np.kron(chain, channel), np.kron(stationary, shares)
+            chain, stationary = np.asarray(np.kron(chain, channel)), np.asarray(np.kron(stationary, shares))
     matrices = np.stack([period.matrix for period in periods])
     losses = _stacked(periods)
     kept = _read(matrices, losses, step.agents)
