@@ -120,7 +120,9 @@ class Collected:
         self._graphs = len(experiment.graph_list)
         self._realtime = experiment.run.pace == "realtime"
         self._record, self._experiment = record, experiment
+        self._delay, self._holds = experiment.noise.delay, experiment.noise.holds and not self._realtime
         self._lossy = experiment.noise.loss.any or self._realtime
+        self._steps_used = self._realtime or self._holds  # whether the log has steps that cannot be known before
         most = self._links.most if self._lossy else 0
         cells = self._shape[0] * self._shape[1]
         # The result has the size that the record states, however little of it the bag holds.
@@ -137,9 +139,9 @@ class Collected:
             self._states: FloatArray = zeros((cells, width), np.float64)
             self._position = zeros((cells,), np.int64)
             self._modes = zeros((cells,), np.int64)
-            self._used = zeros((cells, most if self._realtime else 0), np.int64)
+            self._used = zeros((cells, most if self._steps_used else 0), np.int64)
             self._made = zeros((cells if self._realtime else 0,), np.int64)
-            self._lost = zeros((cells, 0 if self._realtime else most), np.bool_)
+            self._lost = zeros((cells, 0 if self._steps_used else most), np.bool_)
             self._listed = np.zeros(cells if self._lossy else 0, dtype=np.bool_)  # whether ``heard`` was not empty
         except (MemoryError, ValueError) as error:
             raise BagError(
@@ -190,7 +192,7 @@ class Collected:
     @cached_property
     def _links(self) -> _Links:
         """Made when the first ``heard`` has to be interpreted: most runs have none."""
-        return _Links(self._record.model, self._experiment.steps)
+        return _Links(self._record.model, self._experiment.steps, self._delay)
 
     def _good(self, states: States) -> tuple[States, FloatArray]:
         """Those that can be states of this run, and their values; the others are counted by reason."""
@@ -214,7 +216,7 @@ class Collected:
         if not good.all():
             states, values = states[good], values[good]
         if self._lossy or states.heard_count.any():
-            fits = self._links.fit(states, realtime=self._realtime, lossy=self._lossy)
+            fits = self._links.fit(states, realtime=self._realtime, lossy=self._lossy, holds=self._holds)
             self.refused[Refusal.BAD_HEARD] += int((~fits).sum())
             states, values = states[fits], values[fits]
         return states, values
@@ -226,11 +228,12 @@ class Collected:
             return
         heard = states.heard(self._links.most)
         self._listed[cell] = states.heard_count > 0
-        if self._realtime:
+        if self._steps_used:
             listed = np.arange(self._links.most) < states.heard_count[:, None]
             self._used[cell] = np.where(listed & (heard != LOST), heard.astype(np.int64) + 1, 0)
+        if self._realtime:
             self._made[cell] = states.stamp + 1
-        else:
+        elif not self._holds:
             self._lost[cell] = heard == LOST
 
     def _differ(self, cell: IntArray, states: States, values: FloatArray) -> BoolArray:
@@ -246,11 +249,11 @@ class Collected:
         """(cells, D) ``heard`` of the copies that were kept; 0 beyond its end."""
         step, agent = np.divmod(cell, self._shape[1])
         count = self._links.neighbours(self._modes[cell], agent) * self._listed[cell]
-        if self._realtime:
+        if self._steps_used:
             used = self._used[cell]
             heard = np.where(used > 0, used.astype(np.uint64) - np.uint64(1), LOST)
         else:
-            heard = np.where(self._lost[cell], LOST, (step - 1).astype(np.uint64)[:, None])
+            heard = np.where(self._lost[cell], LOST, _newest(step, self._delay).astype(np.uint64)[:, None])
         return np.where(np.arange(self._links.most) < count[:, None], heard, np.uint64(0))
 
     def finish(self) -> None:
@@ -277,8 +280,35 @@ class Collected:
         if self._realtime:
             self.used = self._used.reshape(*self._shape, self._used.shape[1])[1:]
             self.made = self._made.reshape(self._shape)
-        elif self._lossy:
+            return
+        if self._lossy and not self._holds:
             self.lost = self._lost.reshape(*self._shape, self._lost.shape[1])[1:]
+        if self._delay or self._holds:
+            self._complete_used()
+
+    def _complete_used(self) -> None:
+        """In lockstep: the steps of values that the log leaves out, because no message was lost; and which were."""
+        steps, agents = self._shape
+        used = np.full((steps - 1, agents, self._links.most), -1, dtype=np.int64)
+        newest = _newest(np.arange(1, steps), self._delay)
+        listed = self._listed.reshape(self._shape)[1:] if self._holds else None
+        logged = self._used.reshape(*self._shape, -1)[1:] if self._holds else None
+        for i in range(agents):
+            count = self._links.neighbours(self.modes[1:, i] + 1, np.full(steps - 1, i))
+            there = np.arange(self._links.most) < count[:, None]
+            used[:, i] = np.where(there, newest[:, None], -1)
+            if listed is not None and logged is not None:
+                used[:, i] = np.where(listed[:, i, None], logged[:, i], used[:, i])
+            elif self.lost is not None:
+                used[:, i][self.lost[:, i]] = -1
+        self.used = used
+        if self._holds:
+            self.lost = (used >= 0) & (used < newest[:, None, None])
+
+
+def _newest(step: IntArray, delay: int) -> IntArray:
+    """In lockstep: steps of the newest messages that are used in the steps to states of these steps."""
+    return np.maximum(0, step - 1 - delay)
 
 
 def _out_of_order(position: IntArray) -> int:
@@ -294,8 +324,9 @@ def _out_of_order(position: IntArray) -> int:
 class _Links:
     """What ``heard`` can be; ``most`` is the largest number of neighbours of any agent."""
 
-    def __init__(self, model: Wiring, steps: int) -> None:
+    def __init__(self, model: Wiring, steps: int, delay: int) -> None:
         self._last = np.uint64(steps)
+        self._delay = delay
         self.most = model.most_neighbours
         self._neighbours = np.zeros((model.modes + 1, model.agents), dtype=np.int64)  # row 0: no graph led to step 0
         for mode in range(model.modes):
@@ -305,15 +336,18 @@ class _Links:
         """How many neighbours these agents (from 0) have in these graphs (from 1; 0: none, at step 0)."""
         return np.asarray(self._neighbours[mode, agent])
 
-    def fit(self, states: States, *, realtime: bool, lossy: bool) -> BoolArray:
+    def fit(self, states: States, *, realtime: bool, lossy: bool, holds: bool) -> BoolArray:
         """Whether ``heard`` is possible: one entry per neighbour in their graph, each a step that can be.
 
-        In lockstep that is the step before, and an empty ``heard`` says so of all; ``LOST`` is possible if ``lossy``.
+        In lockstep that is the newest one, and an empty ``heard`` says so of all; where the last value heard takes the
+        place of a lost one (``holds``) an earlier one, too; else ``LOST``, if ``lossy``.
         """
         heard, count = states.heard(self.most), states.heard_count
-        before = (states.step.astype(np.uint64) - np.uint64(1))[:, None]
-        possible = heard <= self._last if realtime else heard == before
-        if lossy:
+        newest = _newest(states.step, self._delay).astype(np.uint64)[:, None]
+        possible = heard == newest
+        if realtime or holds:
+            possible = heard <= (self._last if realtime else newest)
+        if lossy and not holds:
             possible |= heard == LOST
         known = possible | (np.arange(self.most) >= count[:, None])
         fits = (count == self.neighbours(states.mode, states.agent - 1)) & known.all(axis=1)

@@ -138,7 +138,7 @@ def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[
     lost, values = trajectory.lost, trajectory.used
     if lost is None and values is None:
         return lambda _k, _i: []
-    model = trajectory.record.model
+    model, delay = trajectory.record.model, trajectory.record.experiment.noise.delay
     modes, agents = range(model.modes), range(model.agents)
     counts = [[len(model.neighbours(mode, i)) for i in agents] for mode in modes]
 
@@ -146,11 +146,15 @@ def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[
         if k == 0:
             return []
         neighbours = counts[used[k, i]][i]
+        newest = max(0, k - 1 - delay)
         if values is not None:
-            return [LOST if step < 0 else step for step in values[k - 1, i, :neighbours].tolist()]
+            steps = values[k - 1, i, :neighbours].tolist()
+            if trajectory.made is None and all(step == newest for step in steps):
+                return []
+            return [LOST if step < 0 else step for step in steps]
         if lost is None or not lost[k - 1, i].any():
             return []
-        return [LOST if gone else k - 1 for gone in lost[k - 1, i, :neighbours].tolist()]
+        return [LOST if gone else newest for gone in lost[k - 1, i, :neighbours].tolist()]
 
     return listed
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.air_reception import lost_messages
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.twin.log_replay import replay
 from msg_analysis.twin.simulate import simulate
@@ -73,6 +74,7 @@ def check(trajectory: Trajectory) -> Check:
         _first_state(trajectory, trajectory.states, twin.states, "logged"),
         _first_state(trajectory, trajectory.published, twin.published, "published"),
         _first_loss(trajectory, twin),
+        _first_use(trajectory, twin),
         _first_graph(trajectory, twin.modes),
     ]
     count = trajectory.completeness
@@ -81,14 +83,18 @@ def check(trajectory: Trajectory) -> Check:
 
 def _check_realtime(trajectory: Trajectory) -> Check:
     experiment = trajectory.record.experiment
-    law = replay(trajectory)
-    path = mode_path(experiment, trajectory.record.step_model.initial)
+    law, published = replay(trajectory)
+    path = mode_path(experiment, trajectory.record.model.initial)
     found = [
         _first_state(trajectory, trajectory.states, law, "logged"),
+        _first_state(trajectory, trajectory.published, published, "published"),
         _first_early_use(trajectory),
+        _first_lost_use(trajectory),
         _first_graph(trajectory, path),
     ]
     compared = int((trajectory.present & ~np.isnan(law).any(axis=2)).sum())
+    if published is not None and trajectory.published is not None:
+        compared += int((~np.isnan(published) & ~np.isnan(trajectory.published)).all(axis=2).sum())
     count = trajectory.completeness
     return Check(compared, count.expected - compared + count.missing_modes, _earliest(found))
 
@@ -115,7 +121,7 @@ def _first_early_use(trajectory: Trajectory) -> tuple[float, str] | None:
     assert used is not None
     assert made is not None
     assert modes is not None
-    model = trajectory.record.step_model
+    model = trajectory.record.model
     # Where a state is missing its mode is -1, which picks the last graph: harmless, since ``used`` is -1 there too.
     sender = neighbour_tables(model).senders[modes[1:], np.arange(model.agents)]
     early = (used >= 0) & (made[1:] >= 0)[:, :, None] & (made[used, sender] >= made[1:, :, None])
@@ -178,3 +184,45 @@ def _first_loss(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] |
     # After the graph of this step, before the states of the next one.
     found = _first(comparable[:, :, None] & (logged != law), describe)
     return found and (found[0] + 0.5, found[1])
+
+
+def _first_use(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] | None:
+    """In lockstep, where values of several steps can be used: the first that is not the one which the seed gives."""
+    if trajectory.used is None or twin.used is None or trajectory.agent_modes is None:
+        return None
+    logged, law = trajectory.used, twin.used
+    comparable = (trajectory.agent_modes[1:] == twin.modes[:, None])[:, :, None] & (logged >= 0) & (law >= 0)
+
+    def describe(step: int, agent: int, which: int) -> str:
+        sender = int(trajectory.record.model.neighbours(int(twin.modes[step]), agent)[which]) + 1
+        return (
+            f"the value of agent {sender} that agent {agent + 1} used in step {step}: logged as that of step "
+            f"{logged[step, agent, which]}, the seed gives step {law[step, agent, which]}"
+        )
+
+    found = _first(comparable & (logged != law), describe)
+    return found and (found[0] + 0.5, found[1])
+
+
+def _first_lost_use(trajectory: Trajectory) -> tuple[float, str] | None:
+    """In real time: the first message that was used although it was lost."""
+    experiment, used, modes = trajectory.record.experiment, trajectory.used, trajectory.agent_modes
+    if not experiment.noise.loss.any:
+        return None
+    assert used is not None
+    assert modes is not None
+    model, lost = trajectory.record.model, np.zeros(used.shape, dtype=np.bool_)
+    senders = neighbour_tables(model).senders[modes[1:], np.arange(model.agents)]
+    for i, j in np.argwhere(model.listens()).tolist():
+        gone = lost_messages(experiment, i, j, len(used) + 1)
+        at = (senders[:, i] == j) & (used[:, i] >= 0)
+        lost[:, i] |= at & gone[used[:, i]]
+
+    def describe(step: int, agent: int, which: int) -> str:
+        return (
+            f"agent {agent + 1} at step {step + 1}: used the message with step {used[step, agent, which]} of agent "
+            f"{senders[step, agent, which] + 1}, which the seed loses"
+        )
+
+    found = _first(lost, describe)
+    return found and (found[0] + 1, found[1])

@@ -21,37 +21,44 @@ import numpy as np
 from msg_analysis.model.arithmetic.payload import from_payload, to_payload
 from msg_analysis.model.run.agent_law import agent_law
 from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.air import NOTHING
 from msg_analysis.types import FloatArray
 
 
-def replay(trajectory: Trajectory) -> FloatArray:
-    """(N + 1, m, R) states that the law gives from the logged inputs of every step; NaN where inputs are missing.
+def replay(trajectory: Trajectory) -> tuple[FloatArray, FloatArray | None]:
+    """What the law gives from the logged inputs of every step: ``states`` and ``published``; NaN where inputs miss.
 
     By induction, a log in real time that equals this from x(0) on is what the law gives for the start, the seed, and
     the values that the agents used. ValueError: the log does not have these (a run in lockstep).
     """
     used, modes = trajectory.used, trajectory.agent_modes
-    if used is None or modes is None:
+    if used is None or modes is None or trajectory.made is None:
         raise ValueError("a run in lockstep: its twin is `simulate`")
     record, states = trajectory.record, trajectory.states
-    model = record.step_model
+    model = record.model
+    heard_of = states if trajectory.published is None else trajectory.published
     there = np.asarray(~np.isnan(states).any(axis=2))
+    readable = np.asarray(~np.isnan(heard_of).any(axis=2))
     law_gives = np.full_like(states, np.nan)
     law_gives[0] = record.start
+    published = None if trajectory.published is None else np.full_like(heard_of, np.nan)
     for i in range(model.agents):
         law = agent_law(record, model, i)
         neighbours = [law.neighbours(mode) for mode in range(model.modes)]
+        if published is not None:
+            for k in np.flatnonzero(there[:, i]).tolist():
+                published[k, i] = from_payload(law.published(k, to_payload(states[k, i])))
         for k in range(len(used)):
             mode = int(modes[k + 1, i])
             if mode < 0 or not there[k, i]:
                 continue
-            heard = list(zip(used[k, i].tolist(), neighbours[mode], strict=False))
-            if not all(step < 0 or there[step, j] for step, j in heard):
+            senders = neighbours[mode]
+            steps = used[k, i, : len(senders)].tolist()
+            if not all(step == NOTHING or readable[step, j] for step, j in zip(steps, senders, strict=True)):
                 continue
-            own = to_payload(states[k, i])
             if law.step != k:
-                law.resume(k, own)
-            law.state = own
-            values = [own if step < 0 else to_payload(states[step, j]) for step, j in heard]
-            law_gives[k + 1, i] = from_payload(law.advance(mode, values))
-    return law_gives
+                law.resume(k, to_payload(states[k, i]))
+            law.state = to_payload(states[k, i])
+            values = [to_payload(heard_of[max(step, 0), j]) for step, j in zip(steps, senders, strict=True)]
+            law_gives[k + 1, i] = from_payload(law.advance(mode, values, steps))
+    return law_gives, published

@@ -23,37 +23,28 @@ import numpy as np
 from msg_analysis.model.arithmetic.many_steps import ManySteps, Round
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.air_reception import AirReception
-from msg_analysis.model.step.phases import phases
+from msg_analysis.model.step.air_reception import AirReception, ahead
 from msg_analysis.model.step.process_noise import ProcessNoise
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
 def states(
-    experiment: ValidExperiment,
-    model: StepModel,
-    modes: IntArray,
-    start: FloatArray,
-    first: int = 0,
-    reception: AirReception | None = None,
+    experiment: ValidExperiment, model: StepModel, modes: IntArray, start: FloatArray, first: int = 0
 ) -> Iterator[FloatArray]:
     """x(first + 1), x(first + 2), ..., from x(first) under the graphs ``modes`` from there on, in blocks (k, m, R).
 
-    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``reception``: one that keeps a log.
+    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative.
     """
-    if experiment.noise.on_air and reception is None:
-        reception = AirReception(experiment, model)
-    phase = phases(experiment) if experiment.run.pace == "realtime" else np.zeros(model.agents)
-    law = ManySteps([_rounds(model, mode, phase) for mode in range(model.modes)])
-    state = start
+    air = AirReception(experiment, model, start, first) if experiment.noise.steps_only else None
+    lead = ahead(experiment).astype(np.bool_)
+    holds = model.listens() if experiment.noise.holds else None
+    law = ManySteps([_rounds(model, mode, lead, holds) for mode in range(model.modes)])
+    past = np.repeat(start[None], experiment.noise.delay + 1, axis=0)  # before the start the states are those of it
     for begin, now, drives in _blocks(experiment, model, modes, first):
-        heard = None if reception is None else reception.block(begin // STEPS_PER_BLOCK)
-        made = law.advance(now, state, drives, heard)
-        if reception is not None and heard is not None:
-            reception.note(begin, state, made, heard)
+        made = law.advance(now, past, drives, air.block(begin, len(now)) if air else None)
         yield made
-        state = made[-1]
+        past = np.concatenate([past, made])[-len(past) :]
 
 
 Block = tuple[int, IntArray, FloatArray]
@@ -85,15 +76,20 @@ def _padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
     return columns, there
 
 
-def _rounds(model: StepModel, mode: int, phase: FloatArray) -> list[Round]:
-    """The agents in rounds: each in the first one after those of the neighbours that are due before it."""
-    m = model.agents
+def _rounds(model: StepModel, mode: int, lead: BoolArray, heard: BoolArray | None) -> list[Round]:
+    """The agents in rounds: each in the first one after those that step before it (``lead``) and that it uses.
+
+    ``heard`` (m, m): whom it hears whatever the graph, and must wait for, too.
+    """
+    m, every = model.agents, np.arange(model.agents)
     columns, there = _padded_inputs(model, mode)
-    weights = np.where(there, model.nominal[mode, np.arange(m), columns], 0.0)  # 0 for padding changes no sum
-    earlier = there & (phase[columns] < phase)
+    weights = np.where(there, model.nominal[mode, every, columns], 0.0)  # 0 for padding changes no sum
+    earlier = there & lead[every, columns]
+    waits = np.zeros((m, m), dtype=np.bool_) if heard is None else heard & lead
+    np.logical_or.at(waits, (np.broadcast_to(every, columns.shape)[earlier], columns[earlier]), True)
     number = np.zeros(m, dtype=np.int64)
-    for i in np.argsort(phase).tolist():
-        number[i] = 1 + max(number[columns[earlier[:, i], i]], default=-1)
+    for i in np.argsort(lead.sum(axis=1), kind="stable").tolist():
+        number[i] = 1 + max(number[waits[i]], default=-1)
     rows = columns + m * earlier
     chosen = [np.flatnonzero(number == one) for one in range(int(number.max()) + 1)]
     return [Round(agents, rows[:, agents], there[:, agents], weights[:, agents]) for agents in chosen]

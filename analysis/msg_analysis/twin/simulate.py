@@ -21,20 +21,19 @@ import uuid
 
 import numpy as np
 
-from msg_analysis.model.arithmetic.payload import from_payload
+from msg_analysis.model.arithmetic.payload import from_payload, to_payload
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.protocol_binding import AgentProtocol
 from msg_analysis.model.run.agent_law import ProtocolLaw
 from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.model.step.air import LOST
-from msg_analysis.model.step.air_reception import AirReception
+from msg_analysis.model.step.air_reception import add_broadcast_noise, ahead, sources
 from msg_analysis.model.step.step_model import StepMatrices, StepModel, build_model
 from msg_analysis.twin.ideal_timers import ideal_log
 from msg_analysis.twin.network_steps import states as states_of_all
 from msg_analysis.twin.start import draw_start
-from msg_analysis.types import BoolArray
+from msg_analysis.types import FloatArray, IntArray
 
 KEY_SIZE = 32  # bytes
 
@@ -55,56 +54,70 @@ def new_record(experiment: ValidExperiment, run: uuid.UUID | None = None) -> Run
 def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) -> Trajectory:
     """Run an experiment without ROS, or repeat the run of a record (then its experiment is used); see ``api``.
 
-    The states equal those of a network run to the last bit: in lockstep, or with ideal timers and no delay.
+    The states equal those of a network run to the last bit: in lockstep, or with ideal timers and no latency.
     """
     experiment = record.experiment if record else experiment
     experiment.require_available()
     record = record or new_record(experiment)
-    if experiment.protocol and not experiment.protocol.linear:
-        return _simulate_agents(record)
-    model = record.step_model
+    model = record.model
     modes = mode_path(experiment, model.initial)
-    states = np.empty((experiment.steps + 1, *record.start.shape))
-    states[0] = record.start
-    reception = AirReception(experiment, model, experiment.steps) if experiment.noise.on_air else None
-    known = 1
-    for block in states_of_all(experiment, model, modes, record.start, reception=reception):
-        states[known : known + len(block)] = block
-        known += len(block)
+    if isinstance(model, StepModel):
+        states, published = _all_at_once(record, model, modes)
+    else:
+        states, published = _one_by_one(record, modes)
+    noise = experiment.noise
+    agent_modes = lost = used = made = None
     if experiment.run.pace == "realtime":
         agent_modes, used, made = ideal_log(experiment, model, modes)
-        whole = Completeness(states.shape[0] * states.shape[1], states.shape[0] * states.shape[1], 0)
-        return Trajectory(record, states, modes, whole, agent_modes, used=used, made=made)
-    published, lost = reception.log(states[-1], modes) if reception else (None, None)
-    expected = states.shape[0] * states.shape[1] * (1 if published is None else 2)
-    return Trajectory(record, states, modes, Completeness(expected, expected, 0), published=published, lost=lost)
-
-
-def _simulate_agents(record: RunRecord) -> Trajectory:
-    """The same by the laws of the single agents, one after the other, as the network has them."""
-    experiment, model, agents = record.experiment, record.model, range(record.model.agents)
-    modes = mode_path(experiment, model.initial)
-    laws = [ProtocolLaw(record, model, i) for i in agents]
-    neighbours = [[law.neighbours(mode) for mode in range(model.modes)] for law in laws]
-    states = np.empty((experiment.steps + 1, *record.start.shape))
-    published = np.empty((experiment.steps + 1, model.agents, experiment.run.replicas))
-    lost: BoolArray = np.zeros((experiment.steps, model.agents, model.most_neighbours), dtype=np.bool_)
-    for k in range(experiment.steps + 1):
-        values = [law.published(k, law.state) for law in laws]
-        for i, law in enumerate(laws):
-            states[k, i], published[k, i] = from_payload(law.state), from_payload(values[i])
-        if k == experiment.steps:
-            break
-        mode = int(modes[k])
-        for i, law in enumerate(laws):
-            law.advance(mode, [values[j] for j in neighbours[i][mode]])
-            lost[k, i, : len(law.heard)] = [step == LOST for step in law.heard]
+    elif noise.loss.any or noise.delay:
+        used, lost = sources(experiment, model, modes)
     expected = states.shape[0] * states.shape[1] * (2 if experiment.truth else 1)
     return Trajectory(
         record,
         states,
         modes,
         Completeness(expected, expected, 0),
-        published=published if experiment.truth else None,
-        lost=lost if experiment.noise.loss.any else None,
+        agent_modes,
+        published=published,
+        lost=lost if noise.loss.any else None,
+        used=used if made is not None or noise.delay or noise.holds else None,
+        made=made,
     )
+
+
+def _all_at_once(record: RunRecord, model: StepModel, modes: IntArray) -> tuple[FloatArray, FloatArray | None]:
+    """(N + 1, m, R) states, and what is published of them if that is something else, of a linear law."""
+    experiment = record.experiment
+    states = np.empty((experiment.steps + 1, *record.start.shape))
+    states[0] = record.start
+    known = 1
+    for block in states_of_all(experiment, model, modes, record.start):
+        states[known : known + len(block)] = block
+        known += len(block)
+    return states, add_broadcast_noise(experiment, states) if experiment.noise.broadcast else None
+
+
+def _one_by_one(record: RunRecord, modes: IntArray) -> tuple[FloatArray, FloatArray | None]:
+    """The same by the laws of the single agents, one after the other, as the network has them."""
+    experiment, model = record.experiment, record.model
+    laws = [ProtocolLaw(record, model, i) for i in range(model.agents)]
+    neighbours = [[law.neighbours(mode) for mode in range(model.modes)] for law in laws]
+    lead = ahead(experiment)
+    states = np.empty((experiment.steps + 1, *record.start.shape))
+    published = np.empty((experiment.steps + 1, model.agents, experiment.run.replicas))
+
+    def note(k: int, i: int) -> None:
+        states[k, i] = from_payload(laws[i].state)
+        published[k, i] = from_payload(laws[i].published(k, laws[i].state))
+
+    for i in range(model.agents):
+        note(0, i)
+    order = np.argsort(lead.sum(axis=1), kind="stable").tolist()
+    for k, mode in enumerate(modes.tolist()):
+        for i in order:
+            senders = neighbours[i][mode]
+            used = [laws[i].air.source(j, k + int(lead[i, j])) for j in senders]
+            heard = [to_payload(published[step, j]) for step, j in zip(used, senders, strict=True)]
+            laws[i].advance(mode, heard, used)
+            note(k + 1, i)
+    return states, published if experiment.truth else None

@@ -24,9 +24,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from msg_analysis.errors import InputError
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.model.arithmetic.update_law import weighted_sum
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.experiment.problems import problem
 from msg_analysis.model.run.graph_path import past_modes
 from msg_analysis.model.step.step_model import StepModel, Wiring
 from msg_analysis.twin.network_steps import states
@@ -53,6 +55,9 @@ def draw_start(experiment: ValidExperiment, model: Wiring, first_mode: int) -> F
         return np.repeat(np.array(start, dtype=float)[:, None], replicas, axis=1)
     assert isinstance(model, StepModel), "experiments without a prediction start from given values"
     found = _from_the_past(experiment, model, first_mode)
+    if found is None and (reason := experiment.unpredictable()):
+        wanted = f"expected 'zero' or one value per agent, since a past would take too long, and {reason}"
+        raise InputError(f"{experiment.source}: {problem('run.start', 'stationary', wanted, 'give x(0)')}")
     return _gaussian(experiment, first_mode) if found is None else found
 
 

@@ -54,7 +54,7 @@ class Checkpoint:
         self._size = size
         self._slot = size + MARK.size
         total = room_for(size)
-        self._capacity = total // self._slot
+        self.capacity = total // self._slot  # messages
         if path is None:
             self._map = mmap.mmap(-1, total)
             return
@@ -80,7 +80,7 @@ class Checkpoint:
 
     def write(self, step: int, message: bytes) -> None:
         """Keep the message (CDR) of a step; steps must be consecutive."""
-        start = step % self._capacity * self._slot
+        start = step % self.capacity * self._slot
         MARK.pack_into(self._map, start + self._size, 0, 0)  # who reads meanwhile must not take it for the old one
         self._map[start : start + len(message)] = message
         MARK.pack_into(self._map, start + self._size, len(message), step + 1)
@@ -90,11 +90,11 @@ class Checkpoint:
 
         The slot after the newest is left out: it may be torn.
         """
-        marks = [MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self._capacity)]
+        marks = [MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self.capacity)]
         newest = max(mark for _, mark in marks) - 1
         found: list[tuple[int, bytes]] = []
-        for step in range(newest, max(first - 1, newest - self._capacity + 1, -1), -1):
-            slot = step % self._capacity
+        for step in range(newest, max(first - 1, newest - self.capacity + 1, -1), -1):
+            slot = step % self.capacity
             length, mark = marks[slot]
             if mark != step + 1:
                 break

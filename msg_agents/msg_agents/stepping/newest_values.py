@@ -20,6 +20,7 @@ neighbour under that graph. Nothing waits, so nothing is buffered.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -85,12 +86,15 @@ class NewestValues(AgentInputs[Value]):
         return self._mode is not None and self.step < self.steps
 
     def inputs(self) -> tuple[int, list[tuple[int, Value | None]]]:
-        """Mode of the due step; step and value of the newest state of each agent that its row uses, ascending.
+        """Mode of the due step; step and value of the state to use of each agent that its row uses, ascending.
 
-        ``(NOTHING, None)`` for an agent of which no state has been received.
+        ``(NOTHING, None)`` where the agent's own value is to be used.
         """
         assert self._mode is not None, "not ready"
-        return self._mode, [(self._newest[j], self._values.get(j)) for j in self._inputs[self._mode]]
+        return self._mode, [self._used(j) for j in self._inputs[self._mode]]
+
+    def _used(self, agent: int) -> tuple[int, Value | None]:
+        return self._newest[agent], self._values.get(agent)
 
     def advance(self) -> None:
         """Count the due step as made."""
@@ -106,3 +110,44 @@ class NewestValues(AgentInputs[Value]):
     def behind(self) -> dict[int, int]:
         """For each peer, how many steps its newest value is older than the agent's own state."""
         return {j: self.step - newest for j, newest in self._newest.items()}
+
+
+class NewestOnAir(NewestValues[Value]):
+    """The same with messages that are lost, or ``delay`` steps old.
+
+    Of an agent with a newest state x(n), a step uses the newest of those up to x(n - delay), and the own value where
+    that one is ``lost`` (of agent and step) or nothing came; with ``holds``, the newest of these that is not lost.
+    """
+
+    def __init__(self, *, delay: int, lost: Callable[[int, int], bool], holds: bool, **options: Any) -> None:
+        super().__init__(**options)
+        self._delay, self._lost, self._holds = delay, lost, holds
+        self._kept: dict[int, deque[tuple[int, Value]]] = {j: deque() for j in self._newest}
+
+    def offer(self, agent: int, step: int, value: Value) -> str | None:
+        """See NewestValues."""
+        refusal = super().offer(agent, step, value)
+        if refusal is None and not (self._holds and self._lost(agent, step)):
+            self._kept[agent].append((step, value))
+            self._forget(agent)
+        return refusal
+
+    def review(self) -> None:
+        """See NewestValues."""
+        super().review()
+        for j, kept in self._kept.items():
+            if self._newest[j] == NOTHING:
+                kept.clear()
+
+    def _forget(self, agent: int) -> int:
+        """Drop what is older than the state to use; the newest step that may be used."""
+        kept, usable = self._kept[agent], max(0, self._newest[agent] - self._delay)
+        while len(kept) > 1 and kept[1][0] <= usable:
+            kept.popleft()
+        return usable
+
+    def _used(self, agent: int) -> tuple[int, Value | None]:
+        usable, kept = self._forget(agent), self._kept[agent]
+        if not kept or kept[0][0] > usable or (not self._holds and self._lost(agent, kept[0][0])):
+            return NOTHING, None
+        return kept[0]

@@ -68,15 +68,18 @@ class _Uses:
 
 
 class Synchronizer(AgentInputs[Value]):
-    """The lockstep of one agent; it may be ``window`` steps (>= 0) ahead of a peer. Other options as in AgentInputs."""
+    """The lockstep of one agent; it may be ``window`` steps (>= 0) ahead of a peer. Other options as in AgentInputs.
 
-    def __init__(self, *, window: int = LOCKSTEP_WINDOW, **options: Any) -> None:
+    ``kept``: steps for which values are kept after they became the newest.
+    """
+
+    def __init__(self, *, window: int = LOCKSTEP_WINDOW, kept: int = KEPT_AFTER_USE, **options: Any) -> None:
         super().__init__(**options)
-        self._window = window
+        self._window, self._kept = window, kept
         self._places = {j: place for place, j in enumerate(self._newest)}  # of the peers in a row
         # The values of a step are in the row (step modulo the number of rows): None where there is none. The rows are
         # those of the last steps, for which values are kept, and of those to come.
-        self._number_of_rows = KEPT_AFTER_USE + window + 2
+        self._number_of_rows = kept + window + 2
         self._rows: list[list[Value | None]] = [[None] * len(self._places) for _ in range(self._number_of_rows)]
         self._uses = [_Uses.of([self._places[j] for j in row], len(self._places)) for row in self._inputs]
         self._limit = window - 1 if self._newest else self.steps
@@ -118,7 +121,7 @@ class Synchronizer(AgentInputs[Value]):
         if ahead > self._window + 1:
             return Refusal.TOO_NEW
         row = self._rows[step % self._number_of_rows]
-        known = row[place] if ahead >= -KEPT_AFTER_USE else None
+        known = row[place] if ahead >= -self._kept else None
         if ahead < 0 or known is not None:
             # Also of a peer that is behind: its value is of no use, but it shows the progress of the peer.
             if known is not None and known != value:
@@ -159,7 +162,7 @@ class Synchronizer(AgentInputs[Value]):
     def advance(self) -> None:
         """Move on to x(step + 1): the step that was ready has been made."""
         step = self.step
-        self._rows[(step - KEPT_AFTER_USE) % self._number_of_rows] = [None] * len(self._places)
+        self._rows[(step - self._kept) % self._number_of_rows] = [None] * len(self._places)
         self.step = step + 1
         if self._known[0].last <= step:
             self._known.popleft()
@@ -177,6 +180,10 @@ class Synchronizer(AgentInputs[Value]):
     def _row(self, step: int) -> list[Value | None]:
         return self._rows[step % self._number_of_rows]
 
+    def _next(self, place: int) -> tuple[int, Value | None]:
+        """Step and value, if it is there, of what the next step would use of the agent in a place."""
+        return self.step, self._row(self.step)[place]
+
     def _within_window(self) -> bool:
         self._limit = min(self._newest.values()) + self._window
         return self.step <= self._limit
@@ -188,9 +195,12 @@ class Synchronizer(AgentInputs[Value]):
         if not self._known:
             return f"the graph of step {self.step}"
         inputs = self._inputs[self._known[0].mode]
-        missing = [j for j in inputs if self._row(self.step)[self._places[j]] is None]
+        missing = [(j, step) for j in inputs for step, value in [self._next(self._places[j])] if value is None]
         if missing:
-            return f"step {self.step} of " + ", ".join(f"agent {j + 1}" for j in missing)
+            steps = {step for _, step in missing}
+            if len(steps) > 1:
+                return ", ".join(f"step {step} of agent {j + 1}" for j, step in missing)
+            return f"step {min(steps)} of " + ", ".join(f"agent {j + 1}" for j, _ in missing)
         if behind := self._behind():
             return "too far behind: " + ", ".join(f"agent {j + 1}" for j in behind)
         return "nothing"
@@ -198,8 +208,8 @@ class Synchronizer(AgentInputs[Value]):
     def lacking(self) -> list[int]:
         """Peers of which it lacks a state, as far as it knows what the next step needs."""
         needed = self._needed.flags if self._needed else ()
-        row = self._row(self.step)
-        missing = [j for j, flag, value in zip(self._places, needed, row, strict=False) if flag and value is None]
+        places = [place for place, flag in enumerate(needed) if flag and self._next(place)[1] is None]
+        missing = [j for j, place in self._places.items() if place in places]
         return sorted({*missing, *self._behind()})
 
     def _behind(self) -> list[int]:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msg_agents.stepping.agent_inputs import NOTHING
-from msg_agents.stepping.newest_values import NewestValues
+from msg_agents.stepping.newest_values import NewestOnAir, NewestValues
 from msg_analysis.wire.refusals import Refusal
 
 STEPS = 40
@@ -141,3 +141,59 @@ def test_another_value_of_the_newest_step() -> None:
     assert node.offer(1, 5, "second") == Refusal.CONTRADICTION
     assert node.known(1) == "first"
     assert node.offer(1, 4, "older") == Refusal.REPEATED
+
+
+@given(
+    steps=st.lists(st.integers(0, STEPS), max_size=30),
+    lost=st.sets(st.integers(0, STEPS)),
+    delay=st.integers(0, 8),
+    holds=st.booleans(),
+)
+def test_on_the_air(steps: list[int], lost: set[int], delay: int, holds: bool) -> None:
+    """Against a memory of all that came, asked after every message or only now and then."""
+    nodes = [
+        NewestOnAir(
+            delay=delay,
+            lost=lambda agent, step: agent == 3 and step in lost,
+            holds=holds,
+            agent=0,
+            steps=STEPS,
+            inputs=[[3]],
+            peers=[3, 4],
+            reach=Clock(),
+        )
+        for _ in range(2)
+    ]
+    came: list[int] = []
+    for node in nodes:
+        assert node.learn(0, 0) is None
+        assert node.inputs() == (0, [(NOTHING, None)])
+    for count, step in enumerate(steps):
+        refused = Refusal.REPEATED if came and step <= came[-1] else None
+        assert [node.offer(3, step, f"x{step}") for node in nodes] == [refused] * 2
+        if not refused:
+            came.append(step)
+        usable = [step for step in came if step <= max(0, came[-1] - delay) and not (holds and step in lost)]
+        expected: tuple[int, str | None] = (NOTHING, None)
+        if usable and (holds or usable[-1] not in lost):
+            expected = usable[-1], f"x{usable[-1]}"
+        for node in nodes[: 2 if count % 5 == 4 else 1]:
+            assert node.inputs() == (0, [expected])
+            assert node.known(3) == f"x{came[-1]}"
+
+
+def test_on_the_air_what_came_too_early_is_forgotten() -> None:
+    clock = Clock()
+    node = NewestOnAir(
+        delay=1, lost=lambda _j, _k: False, holds=True, agent=0, steps=STEPS, inputs=[[1]], peers=[1], reach=clock
+    )
+    assert node.learn(0, 0) is None
+    assert node.offer(1, 4, "fine") is None
+    assert node.offer(1, 39, "forged") is None
+    assert node.inputs() == (0, [(4, "fine")])
+    clock.reach = 5
+    node.review()
+    assert node.inputs() == (0, [(NOTHING, None)])
+    assert node.offer(1, 4, "fine") is None
+    assert node.offer(1, 5, "newest") is None
+    assert node.inputs() == (0, [(4, "fine")])

@@ -28,40 +28,57 @@ def rounds_of(rows: list[list[Row]]) -> list[Round]:
     return found
 
 
-def used(reception: Reception, k: int, state: list[list[float]], agent: int, sender: int, r: int) -> float:
-    """What the agent uses for the sender's value."""
+Heard = dict[tuple[int, int], list[float]]
+
+
+def message(reception: Reception, k: int, states: list[Any], agent: int, sender: int) -> list[float] | None:
+    """What the link brings in step k; None where it is lost. ``states`` begin a delay before x(0)."""
     link = reception.links[agent, sender]
-    if reception.own[link, k]:
-        return state[agent][r]
-    value = state[sender][r]
-    if reception.broadcast is not None:
-        value += float(reception.broadcast[sender, k, r])
-    if reception.link is not None:
-        value += float(reception.link[link, k, r])
-    return value
+    which = k + int(reception.ahead[link])
+    if reception.lost[link, which]:
+        return None
+    values = list(states[which][sender])
+    for r in range(len(values)):
+        if reception.broadcast is not None:
+            values[r] += float(reception.broadcast[sender, which, r])
+        if reception.link is not None:
+            values[r] += float(reception.link[link, which, r])
+    return values
 
 
 def by_hand(
-    graphs: list[list[list[Row]]], modes: list[int], start: Any, drives: Any, reception: Reception | None = None
+    graphs: list[list[list[Row]]],
+    modes: list[int],
+    past: Any,
+    drives: Any,
+    reception: Reception | None = None,
+    held: Heard | None = None,
 ) -> Any:
-    """The same with Python's floats, one sum after the other."""
-    m, replicas = start.shape
-    states = [start.tolist()]
+    """The same with Python's floats, one sum after the other; ``held``: the last values heard, by receiver, sender."""
+    _, m, replicas = past.shape
+    states = past.tolist()
     for k, (mode, drive) in enumerate(zip(modes, drives.tolist(), strict=True)):
+        now = states[-1]
         after: list[list[float]] = [[0.0] * replicas for _ in range(m)]
+        states.append(after)
         for agent, terms in (row for each in graphs[mode] for row in each):
+            for link in held or {}:
+                if link[0] == agent and reception is not None:
+                    held[link] = message(reception, k, states, *link) or held[link]  # type: ignore[index]
             for r in range(replicas):
                 total = None
                 for column, weight in terms:
-                    if reception is not None:
-                        value = used(reception, k, states[-1], agent, column, r)
+                    sender = column % m
+                    if reception is None or sender == agent:
+                        value = now[column][r] if column < m else after[column - m][r]
+                    elif held is not None:
+                        value = held[agent, sender][r]
                     else:
-                        value = states[-1][column][r] if column < m else after[column - m][r]
+                        value = (message(reception, k, states, agent, sender) or now[agent])[r]
                     total = value * weight if total is None else total + value * weight
                 assert total is not None
                 after[agent][r] = total + drive[agent][r]
-        states.append(after)
-    return np.array(states[1:])
+    return np.array(states[len(past) :])
 
 
 @st.composite
@@ -92,7 +109,7 @@ def test_equal_to_the_last_bit(compiled: bool, network: tuple[int, list[list[lis
     replicas = data.draw(st.integers(1, 4))
     modes = data.draw(st.lists(st.integers(0, len(graphs) - 1), min_size=1, max_size=6))
     random = np.random.default_rng(data.draw(st.integers(0, 1000)))
-    start, drives = random.normal(size=(m, replicas)), random.normal(size=(len(modes), m, replicas))
+    start, drives = random.normal(size=(1, m, replicas)), random.normal(size=(len(modes), m, replicas))
     assert many_steps.COMPILED
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(many_steps, "COMPILED", compiled)
@@ -101,24 +118,47 @@ def test_equal_to_the_last_bit(compiled: bool, network: tuple[int, list[list[lis
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-@given(network=networks(rounds=1), data=st.data())
-def test_with_noise_and_loss_on_the_air(compiled: bool, network: tuple[int, Any], data: st.DataObject) -> None:
-    m, graphs = network
-    replicas, most = data.draw(st.integers(1, 4)), 6
-    modes = data.draw(st.lists(st.integers(0, len(graphs) - 1), min_size=1, max_size=most))
+@given(m=st.integers(1, 5), data=st.data())
+def test_with_noise_loss_and_delay_on_the_air(compiled: bool, m: int, data: st.DataObject) -> None:
+    """In lockstep, or one agent after the other in an order that all graphs share."""
+    graphs, order = [], data.draw(st.permutations(range(m)))
+    one_by_one = data.draw(st.booleans())
+    before = {agent: set(order[:place]) if one_by_one else set() for place, agent in enumerate(order)}
+    for _ in range(data.draw(st.integers(1, 3))):
+        rows: list[list[Row]] = []
+        for agent in order:
+            others = sorted(data.draw(st.sets(st.integers(0, m - 1))) | {agent})
+            weights = data.draw(st.lists(st.floats(-2, 2).filter(bool), min_size=len(others), max_size=len(others)))
+            terms = [(j + m * (j in before[agent]), weight) for j, weight in zip(others, weights, strict=True)]
+            rows.append([(agent, terms)])
+        graphs.append(rows if one_by_one else [[row for each in rows for row in each]])
+    replicas, delay = data.draw(st.integers(1, 4)), data.draw(st.integers(0, 3))
+    modes = data.draw(st.lists(st.integers(0, len(graphs) - 1), min_size=1, max_size=6))
     random = np.random.default_rng(data.draw(st.integers(0, 1000)))
-    start, drives = random.normal(size=(m, replicas)), random.normal(size=(len(modes), m, replicas))
-    links = np.arange(m * m).reshape(m, m)
-    np.fill_diagonal(links, m * m)
-    own = random.random((m * m + 1, most)) < 0.3
-    own[-1] = True
-    broadcast = random.normal(size=(m, most, replicas)) if data.draw(st.booleans()) else None
-    link = random.normal(size=(m * m + 1, most, replicas)) if data.draw(st.booleans()) else None
-    reception = Reception(links, own, broadcast, link)
+    pairs = [(i, j) for i in range(m) for j in range(m) if i != j]
+    numbers, messages = np.full((m, m), len(pairs)), len(modes) + 1
+    for link, pair in enumerate(pairs):
+        numbers[pair] = link
+    past, drives = random.normal(size=(delay + 1, m, replicas)), random.normal(size=(len(modes), m, replicas))
+    held = random.normal(size=(len(pairs), replicas)) if data.draw(st.booleans()) and pairs else None
+    reception = Reception(
+        links=numbers,
+        first=np.arange(m + 1) * (m - 1),
+        senders=np.array([j for _, j in pairs], dtype=np.int64),
+        ahead=np.array([int(j in before[i]) for i, j in pairs], dtype=np.int64),
+        delay=delay,
+        lost=random.random((len(pairs) + 1, messages)) < 0.3,
+        broadcast=random.normal(size=(m, messages, replicas)) if data.draw(st.booleans()) else None,
+        link=random.normal(size=(len(pairs), messages, replicas)) if data.draw(st.booleans()) and pairs else None,
+        held=held,
+    )
+    last = None if held is None else {pair: held[link].tolist() for link, pair in enumerate(pairs)}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(many_steps, "COMPILED", compiled)
-        states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), start, drives, reception)
-    np.testing.assert_array_equal(states, by_hand(graphs, modes, start, drives, reception))
+        states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), past, drives, reception)
+    np.testing.assert_array_equal(states, by_hand(graphs, modes, past, drives, reception, last))
+    if last is not None:
+        np.testing.assert_array_equal(held, list(last.values()))
 
 
 ARGUMENTS: dict[str, Any] = {  # two agents, one graph, three steps of one replica; agent 1 uses both
@@ -168,9 +208,14 @@ def test_the_kernel_reads_and_writes_nothing_outside_its_arrays(wrong: dict[str,
 
 AIR: dict[str, Any] = {  # two links, and their noise, in the three steps
     "links": np.array([2, 0, 1, 2]),
-    "own": np.array([[False] * 3, [False] * 3, [True] * 3]),
-    "broadcast": np.zeros((2, 3, 1)),
-    "link": np.zeros((3, 3, 1)),
+    "first": np.array([0, 1, 2]),
+    "senders": np.array([1, 0]),
+    "ahead": np.array([0, 1]),
+    "delay": 1,
+    "lost": np.zeros((3, 4), dtype=np.bool_),
+    "broadcast": np.zeros((2, 4, 1)),
+    "link": np.zeros((2, 4, 1)),
+    "held": np.zeros((2, 1)),
 }
 
 
@@ -181,18 +226,33 @@ AIR: dict[str, Any] = {  # two links, and their noise, in the three steps
         {"links": np.array([2, 0, 1, 3])},
         {"links": np.array([2, 0, -1, 2])},
         {"links": np.array([2, 0, 2**62, 2])},
-        {"own": np.ones((3, 2), dtype=np.bool_)},
-        {"own": np.ones(10, dtype=np.bool_)},
-        {"own": b""},
-        {"broadcast": np.zeros((2, 2, 1))},
-        {"broadcast": np.zeros((2, 3, 2))},
-        {"link": np.zeros((2, 3, 1))},
-        {"columns": np.array([0, 3, 1])},  # what another agent makes in the same step
+        {"first": np.array([0, 1])},
+        {"first": np.array([0, 3, 2])},
+        {"first": np.array([1, 1, 2])},
+        {"first": b""},
+        {"senders": np.array([1, 2])},
+        {"senders": np.array([-1, 0])},
+        {"senders": np.array([1, 0, 0])},
+        {"senders": b""},
+        {"ahead": np.array([0, 2])},
+        {"ahead": np.array([-1, 0])},
+        {"ahead": np.array([0])},
+        {"delay": 0},
+        {"delay": 2},
+        {"delay": -1},
+        {"delay": 2**62},
+        {"lost": np.zeros((3, 3), dtype=np.bool_)},
+        {"lost": np.zeros(13, dtype=np.bool_)},
+        {"lost": b""},
+        {"broadcast": np.zeros((2, 3, 1))},
+        {"broadcast": np.zeros((2, 4, 2))},
+        {"link": np.zeros((3, 4, 1))},
+        {"held": np.zeros((3, 1))},
     ],
     ids=str,
 )
 def test_nor_of_the_arrays_of_the_air(wrong: dict[str, Any]) -> None:
-    right = ARGUMENTS | {"states": np.ones((4, 2, 1))} | AIR
+    right = ARGUMENTS | {"states": np.ones((5, 2, 1))} | AIR
     _kernel.advance(*right.values())
     with pytest.raises(ValueError, match="sizes and indices"):
         _kernel.advance(*(right | wrong).values())

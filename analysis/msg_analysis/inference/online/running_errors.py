@@ -76,7 +76,7 @@ class LiveEstimate:
         lockstep = experiment.run.pace == "lockstep"
         self.record = record
         self.steps = StepCollector(experiment.agents, len(experiment.graph_list), experiment.steps, lockstep=lockstep)
-        reason = experiment.protocol.unpredictable() if experiment.protocol else None
+        reason = experiment.unpredictable()
         prediction = None if reason else predict(experiment, record.step_model)
         self._errors = RunningErrors(record, prediction, nodes=nodes)
         self._recent = RecentSteps()

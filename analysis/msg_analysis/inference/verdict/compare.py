@@ -65,8 +65,7 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     InputError
         no prediction (too large, unbounded), or a log without what is needed
     """
-    protocol = trajectory.record.experiment.protocol
-    unpredicted = protocol.unpredictable() if protocol else None
+    unpredicted = trajectory.record.experiment.unpredictable()
     if unpredicted:
         return _measured(trajectory, level, unpredicted)
     prediction = predict(trajectory.record.experiment, trajectory.record.step_model)

@@ -94,7 +94,7 @@ def _examine(name: str, run: Trajectory, prediction: Prediction, level: float) -
 
 
 def _require_prediction(name: str, experiment: ValidExperiment) -> None:
-    reason = experiment.protocol.unpredictable() if experiment.protocol else None
+    reason = experiment.unpredictable()
     if reason:
         raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
 

@@ -100,46 +100,92 @@ static PyObject *all_finite(PyObject *Py_UNUSED(module), PyObject *payload)
 
 PyDoc_STRVAR(advance_doc,
              "advance(order, offsets, columns, weights, modes, drives, states, agents, replicas,"
-             " links=b'', own=b'', broadcast=b'', link=b'')\n\n"
-             "Fill states[1:] from states[0], with the reception of the last four: see many_steps.py.");
+             " links=b'', first=b'', senders=b'', ahead=b'', delay=0, lost=b'', broadcast=b'', link=b'', held=b'')\n\n"
+             "Fill states[delay + 1:] from the states before, with the reception of the last nine: see many_steps.py.");
 
-/* What happens on the air: arrays of Reception in many_steps.py; noise that there is none of is NULL. */
+/* What happens on the air: arrays of Reception in many_steps.py; what there is not is NULL. */
 struct air {
-    const int64_t *links;
-    const char *own;
+    const int64_t *links, *first, *senders, *ahead;
+    const char *lost;
     const double *broadcast, *link;
-    Py_ssize_t steps;
+    double *held;
+    int64_t own;                /* number in place of a link for an agent's own value */
+    Py_ssize_t messages, delay; /* messages of a link */
 };
 
-/* The values that an agent uses for one term of its sum: of the sender, or its own; ``room`` is for them. */
-static const double *heard(const struct air *air, const double *before, int64_t receiver, int64_t sender,
-                           Py_ssize_t k, Py_ssize_t agents, Py_ssize_t replicas, double *room)
+/* What a link brings in the step k: the value of the sender, with its noise; ``room`` is for the sum. */
+static const double *message(const struct air *air, const double *states, int64_t link, Py_ssize_t k,
+                             Py_ssize_t agents, Py_ssize_t replicas, double *room)
 {
-    const Py_ssize_t at = air->links[receiver * agents + sender] * air->steps + k;
-    if (air->own[at])
-        return before + receiver * replicas;
-    const double *values = before + sender * replicas;
+    const int64_t sender = air->senders[link];
+    const Py_ssize_t which = k + air->ahead[link];
+    const double *values = states + (which * agents + sender) * replicas;
     if (air->broadcast) {
         for (Py_ssize_t r = 0; r < replicas; ++r)
-            room[r] = values[r] + air->broadcast[(sender * air->steps + k) * replicas + r];
+            room[r] = values[r] + air->broadcast[(sender * air->messages + which) * replicas + r];
         values = room;
     }
     if (air->link) {
         for (Py_ssize_t r = 0; r < replicas; ++r)
-            room[r] = values[r] + air->link[at * replicas + r];
+            room[r] = values[r] + air->link[(link * air->messages + which) * replicas + r];
         values = room;
     }
     return values;
 }
 
+static int is_lost(const struct air *air, int64_t link, Py_ssize_t k)
+{
+    return air->lost[link * air->messages + k + air->ahead[link]];
+}
+
+/* Keep what is heard on all links to an agent in the step k, whether this step uses it or not. */
+static void hold(const struct air *air, const double *states, int64_t receiver, Py_ssize_t k, Py_ssize_t agents,
+                 Py_ssize_t replicas, double *room)
+{
+    for (int64_t link = air->first[receiver]; link < air->first[receiver + 1]; ++link)
+        if (!is_lost(air, link, k))
+            memcpy(air->held + link * replicas, message(air, states, link, k, agents, replicas, room),
+                   replicas * sizeof *room);
+}
+
+/* The values that an agent uses for one term of its sum: of the sender, or its own. */
+static const double *heard(const struct air *air, const double *states, int64_t receiver, int64_t sender, Py_ssize_t k,
+                           Py_ssize_t agents, Py_ssize_t replicas, double *room)
+{
+    const int64_t link = air->links[receiver * agents + sender];
+    if (link == air->own || (!air->held && is_lost(air, link, k)))
+        return states + ((air->delay + k) * agents + receiver) * replicas;
+    return air->held ? air->held + link * replicas : message(air, states, link, k, agents, replicas, room);
+}
+
+/* Whether all indices in the arrays of a reception are within the others; sets ``own`` and ``messages``. */
+static int fits(struct air *air, const Py_buffer *lost, Py_ssize_t links, Py_ssize_t agents, Py_ssize_t steps)
+{
+    Py_ssize_t latest = 0;
+    air->own = links;
+    air->messages = lost->len / (links + 1);
+    int right = lost->len == air->messages * (links + 1) && air->first[0] == 0 && air->first[agents] == links;
+    for (Py_ssize_t i = 0; right && i < agents; ++i)
+        right = air->first[i] <= air->first[i + 1];
+    for (Py_ssize_t i = 0; right && i < agents * agents; ++i)
+        right = air->links[i] >= 0 && air->links[i] <= links;
+    for (Py_ssize_t i = 0; right && i < links; ++i) {
+        right = air->senders[i] >= 0 && air->senders[i] < agents && (air->ahead[i] == 0 || air->ahead[i] == 1);
+        latest = right && air->ahead[i] > latest ? air->ahead[i] : latest;
+    }
+    return right && air->messages >= steps + latest;
+}
+
 static PyObject *advance(PyObject *Py_UNUSED(module), PyObject *arguments)
 {
-    enum { ORDER, OFFSETS, COLUMNS, WEIGHTS, MODES, DRIVES, STATES, LINKS, BROADCAST, LINK, ARRAYS };
-    Py_buffer views[ARRAYS] = {{0}}, own = {0};
-    Py_ssize_t agents, replicas;
-    if (!PyArg_ParseTuple(arguments, "y*y*y*y*y*y*w*nn|y*y*y*y*", &views[ORDER], &views[OFFSETS], &views[COLUMNS],
-                          &views[WEIGHTS], &views[MODES], &views[DRIVES], &views[STATES], &agents, &replicas,
-                          &views[LINKS], &own, &views[BROADCAST], &views[LINK]))
+    enum { ORDER, OFFSETS, COLUMNS, WEIGHTS, MODES, DRIVES, STATES, LINKS, FIRST, SENDERS, AHEAD, BROADCAST, LINK, HELD,
+           ARRAYS };
+    Py_buffer views[ARRAYS] = {{0}}, lost = {0};
+    Py_ssize_t agents, replicas, delay = 0;
+    if (!PyArg_ParseTuple(arguments, "y*y*y*y*y*y*w*nn|y*y*y*y*ny*y*y*w*", &views[ORDER], &views[OFFSETS],
+                          &views[COLUMNS], &views[WEIGHTS], &views[MODES], &views[DRIVES], &views[STATES], &agents,
+                          &replicas, &views[LINKS], &views[FIRST], &views[SENDERS], &views[AHEAD], &delay, &lost,
+                          &views[BROADCAST], &views[LINK], &views[HELD]))
         return NULL;
     const int64_t *order = views[ORDER].buf, *offsets = views[OFFSETS].buf, *columns = views[COLUMNS].buf;
     const int64_t *modes = views[MODES].buf;
@@ -151,11 +197,12 @@ static PyObject *advance(PyObject *Py_UNUSED(module), PyObject *arguments)
         counts[i] = views[i].len / 8;
         right = right && views[i].len % 8 == 0;
     }
-    right = right && agents > 0 && agents <= counts[STATES] && replicas > 0 && replicas <= counts[STATES] / agents;
+    right = right && agents > 0 && agents <= counts[STATES] && replicas > 0 && replicas <= counts[STATES] / agents &&
+            delay >= 0 && delay < counts[STATES];
     const Py_ssize_t steps = counts[MODES], terms = counts[COLUMNS], size = right ? agents * replicas : 1;
     const Py_ssize_t graphs = right ? counts[ORDER] / agents : 0;
     right = right && counts[ORDER] == graphs * agents && counts[OFFSETS] == graphs * agents + 1 &&
-            counts[WEIGHTS] == terms && counts[DRIVES] == steps * size && counts[STATES] == (steps + 1) * size;
+            counts[WEIGHTS] == terms && counts[DRIVES] == steps * size && counts[STATES] == (delay + steps + 1) * size;
     for (Py_ssize_t i = 0; right && i < graphs * agents; ++i)
         right = order[i] >= 0 && order[i] < agents && offsets[i] >= 0 && offsets[i] < offsets[i + 1] &&
                 offsets[i + 1] <= terms;
@@ -163,45 +210,47 @@ static PyObject *advance(PyObject *Py_UNUSED(module), PyObject *arguments)
         right = columns[i] >= 0 && columns[i] < 2 * agents;
     for (Py_ssize_t k = 0; right && k < steps; ++k)
         right = modes[k] >= 0 && modes[k] < graphs;
-    struct air air = {views[LINKS].buf, own.buf, NULL, NULL, 0};
+    struct air air = {views[LINKS].buf, views[FIRST].buf, views[SENDERS].buf, views[AHEAD].buf, lost.buf,
+                      NULL, NULL, NULL, 0, 0, delay};
     double *room = NULL;
     if (right && views[LINKS].len) {
-        Py_ssize_t numbers = 1;
-        right = counts[LINKS] / agents == agents && counts[LINKS] % agents == 0;
-        for (Py_ssize_t i = 0; right && i < counts[LINKS]; ++i) {
-            right = air.links[i] >= 0 && air.links[i] < own.len;
-            numbers = right && air.links[i] >= numbers ? air.links[i] + 1 : numbers;
-        }
-        air.steps = right ? own.len / numbers : 0;
-        right = right && air.steps >= steps && own.len == numbers * air.steps;
-        for (Py_ssize_t i = 0; right && i < terms; ++i)
-            right = columns[i] < agents; /* no agent hears what another one makes in the same step */
+        const Py_ssize_t links = counts[SENDERS];
+        right = counts[LINKS] / agents == agents && counts[LINKS] % agents == 0 && counts[FIRST] == agents + 1 &&
+                counts[AHEAD] == links && fits(&air, &lost, links, agents, steps);
         if (right && views[BROADCAST].len) {
             air.broadcast = views[BROADCAST].buf;
-            right = counts[BROADCAST] == agents * air.steps * replicas;
+            right = counts[BROADCAST] == agents * air.messages * replicas;
         }
         if (right && views[LINK].len) {
             air.link = views[LINK].buf;
-            right = counts[LINK] == own.len * replicas;
+            right = counts[LINK] == links * air.messages * replicas;
+        }
+        if (right && views[HELD].len) {
+            air.held = views[HELD].buf;
+            right = counts[HELD] == links * replicas;
         }
         if (right && (room = PyMem_Malloc(replicas * sizeof *room)) == NULL) {
             for (int i = 0; i < ARRAYS; ++i)
                 PyBuffer_Release(&views[i]);
-            PyBuffer_Release(&own);
+            PyBuffer_Release(&lost);
             return PyErr_NoMemory();
         }
-    }
+    } else
+        right = right && delay == 0;
     if (right) {
         Py_BEGIN_ALLOW_THREADS;
         for (Py_ssize_t k = 0; k < steps; ++k) {
-            const double *before = states + k * size, *drive = drives + k * size; /* x(k), and after it x(k+1) */
+            /* x(k), and after it x(k+1) */
+            const double *before = states + (delay + k) * size, *drive = drives + k * size;
             for (Py_ssize_t row = modes[k] * agents; row < (modes[k] + 1) * agents; ++row) {
-                double *total = states + (k + 1) * size + order[row] * replicas;
+                double *total = states + (delay + k + 1) * size + order[row] * replicas;
+                if (air.held)
+                    hold(&air, states, order[row], k, agents, replicas, room);
                 for (int64_t term = offsets[row]; term < offsets[row + 1]; ++term) {
                     const double weight = weights[term];
-                    const double *values =
-                        room ? heard(&air, before, order[row], columns[term], k, agents, replicas, room)
-                             : before + columns[term] * replicas;
+                    const double *values = room ? heard(&air, states, order[row], columns[term] % agents, k, agents,
+                                                        replicas, room)
+                                                : before + columns[term] * replicas;
                     if (term == offsets[row])
                         for (Py_ssize_t r = 0; r < replicas; ++r)
                             total[r] = values[r] * weight;
@@ -218,7 +267,7 @@ static PyObject *advance(PyObject *Py_UNUSED(module), PyObject *arguments)
     PyMem_Free(room);
     for (int i = 0; i < ARRAYS; ++i)
         PyBuffer_Release(&views[i]);
-    PyBuffer_Release(&own);
+    PyBuffer_Release(&lost);
     if (!right)
         return wrong("expected arrays of 8-byte numbers whose sizes and indices fit together");
     Py_RETURN_NONE;

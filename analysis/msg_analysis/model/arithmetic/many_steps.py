@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -44,20 +45,51 @@ class Round:
 
 @dataclass(frozen=True, slots=True)
 class Reception:
-    """What becomes of the values that agents send each other in K steps or more, over L links."""
+    """What becomes of the values that agents send each other in K steps or more, over L links sorted by receiver.
+
+    The messages are those of C steps in a row, the first of which is ``delay`` before the first of the K; in step k a
+    link brings message k + ahead. So C is K, or K + 1 if one is ahead.
+    """
 
     links: IntArray  # (m, m) number of the link from the sender, the column; L for an agent's own value
-    own: BoolArray  # (L + 1, K) whether the receiver uses its own value, since the message is lost; last row: True
-    broadcast: FloatArray | None  # (m, K, R) noise that is added to what each agent publishes
-    link: FloatArray | None  # (L + 1, K, R) noise that is added on each link
+    first: IntArray  # (m + 1,) number of the first link to each receiver, and L
+    senders: IntArray  # (L,)
+    ahead: IntArray  # (L,) 1 where the sender steps before the receiver in real time, else 0
+    delay: int
+    lost: BoolArray  # (L + 1, C) which messages are lost; the last row is not used
+    broadcast: FloatArray | None  # (m, C, R) noise that is added to what each agent publishes
+    link: FloatArray | None  # (L, C, R) noise that is added on each link
+    # (L, R) the last values heard, which take the place of lost ones, and are changed; None: an agent's own value does
+    held: FloatArray | None = None
 
-    def heard(self, k: int, state: FloatArray, agents: IntArray, rows: IntArray) -> list[FloatArray]:
-        """For each d, (a, R): what the agents use for their d-th value of x(k) (m, R)."""
-        numbers = self.links[agents, rows]
-        values = (state if self.broadcast is None else state + self.broadcast[:, k])[rows]
-        if self.link is not None:
-            values = values + self.link[numbers, k]
-        return list(np.where(self.own[numbers, k, None], state[agents], values))
+    def hold(self, k: int, states: FloatArray, agents: IntArray) -> None:
+        """Keep what these agents hear in step k, of all links."""
+        if self.held is not None:
+            links = np.concatenate([np.arange(self.first[i], self.first[i + 1]) for i in agents])
+            links = links[~self.lost[links, k + self.ahead[links]]]
+            self.held[links] = self._messages(k, states, links)
+
+    def heard(self, k: int, states: FloatArray, agents: IntArray, senders: IntArray) -> list[FloatArray]:
+        """For each d, (a, R): what agents (a,) use of ``senders`` (d, a) in step k; ``states`` as in ``advance``."""
+        numbers = self.links[agents, senders]
+        own = numbers == len(self.senders)
+        links = np.where(own, 0, numbers)
+        mine = states[self.delay + k][agents]
+        if not len(self.senders):
+            return [mine for _ in senders]
+        if self.held is not None:
+            values = self.held[links]
+        else:
+            values = self._messages(k, states, links)
+            own = own | self.lost[links, k + self.ahead[links]]
+        return list(np.where(own[..., None], mine, values))
+
+    def _messages(self, k: int, states: FloatArray, links: IntArray) -> FloatArray:
+        which, senders = k + self.ahead[links], self.senders[links]
+        values = states[which, senders]
+        if self.broadcast is not None:
+            values = values + self.broadcast[senders, which]
+        return values if self.link is None else values + self.link[links, which]
 
 
 class ManySteps:
@@ -76,36 +108,38 @@ class ManySteps:
         self._weights = np.concatenate([one.weights.T[one.there.T] for one in together])
 
     def advance(
-        self, modes: IntArray, start: FloatArray, drives: FloatArray, reception: Reception | None = None
+        self, modes: IntArray, past: FloatArray, drives: FloatArray, reception: Reception | None = None
     ) -> FloatArray:
-        """(K, m, R): x(1) to x(K) from x(0) = ``start``, under the graphs ``modes`` (K,).
+        """(K, m, R): x(1) to x(K) under the graphs ``modes`` (K,), from ``past``, which ends with x(0).
 
-        ``drives`` (K, m, R) has the noise of each step and what the reference adds. With a ``reception``, all agents
-        are in one round.
+        ``past`` (delay + 1, m, R) goes back as far as the delay of the ``reception``. ``drives`` (K, m, R) has the
+        noise of each step and what the reference adds.
         """
-        if not COMPILED:
-            return self._with_numpy(modes, start, drives, reception)
-        states = np.empty((len(modes) + 1, *start.shape))
-        states[0] = start
-        arrays = self._order, self._offsets, self._columns, self._weights, np.ascontiguousarray(modes)
-        air: list[IntArray | BoolArray | FloatArray | bytes] = []
-        if reception is not None:
-            air = [reception.links, reception.own]
-            air += [b"" if noise is None else noise for noise in (reception.broadcast, reception.link)]
-        _kernel.advance(*arrays, np.ascontiguousarray(drives), states, *start.shape, *air)
-        return states[1:]
+        states = np.empty((len(past) + len(modes), *past.shape[1:]))
+        states[: len(past)] = past
+        if COMPILED:
+            arrays = self._order, self._offsets, self._columns, self._weights, np.ascontiguousarray(modes)
+            air: list[Any] = []
+            if reception is not None:
+                air = [reception.links, reception.first, reception.senders, reception.ahead, reception.delay]
+                air += [reception.lost]
+                air += [b"" if noise is None else noise for noise in (reception.broadcast, reception.link)]
+                air += [] if reception.held is None else [reception.held]
+            _kernel.advance(*arrays, np.ascontiguousarray(drives), states, *past.shape[1:], *air)
+        else:
+            self._with_numpy(modes, states, drives, reception)
+        return states[len(past) :]
 
-    def _with_numpy(
-        self, modes: IntArray, start: FloatArray, drives: FloatArray, reception: Reception | None
-    ) -> FloatArray:
+    def _with_numpy(self, modes: IntArray, states: FloatArray, drives: FloatArray, reception: Reception | None) -> None:
         m = self._agents
-        states = np.empty((len(modes), *start.shape))
-        both = np.concatenate([start, start])  # x(k) above x(k+1)
+        now = len(states) - len(modes) - 1
         sums = [[(one.agents, list(one.weights[:, :, None]), one.rows) for one in each] for each in self._rounds]
         for k, mode in enumerate(modes):
-            both[:m] = both[m:]
+            both = states[now + k : now + k + 2].reshape(2 * m, -1)  # x(k) above x(k+1)
             for agents, weights, rows in sums[mode]:
-                values = list(both[rows]) if reception is None else reception.heard(k, both[:m], agents, rows)
+                if reception is None:
+                    values = list(both[rows])
+                else:
+                    reception.hold(k, states, agents)
+                    values = reception.heard(k, states, agents, rows % m)
                 both[m + agents] = step(weights, values, drives[k, agents])
-            states[k] = both[m:]
-        return states

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -26,7 +26,7 @@ import numpy as np
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import NotAvailableError
-from msg_analysis.model.experiment import memory, protocol_binding, validation
+from msg_analysis.model.experiment import memory, protocol_binding, topology, validation
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show
 from msg_analysis.model.experiment.protocol_binding import ChosenProtocol, ProtocolInfo
 from msg_analysis.model.experiment.sections import Sections
@@ -45,6 +45,12 @@ from msg_analysis.protocol import Network
 from msg_analysis.types import FloatArray
 
 __all__ = ["ExperimentError", "ValidExperiment", "json_schema"]
+
+MOST_STATES = 512
+"""Of graph and links together, in a prediction with losses in bursts."""
+
+MOST_VALUES = 1500
+"""That agents keep from step to step, in a prediction: the last ones heard, and those that a delay makes older."""
 
 SHOWN_GRAPHS = 4
 """Largest number of graphs named in a ``repr``."""
@@ -233,41 +239,33 @@ class ValidExperiment:
         purpose
             "run" (simulate it or run a network) or "predict"
         """
-        lines = self._not_run() if purpose == "run" else []
+        lines = self._unpredicted() if purpose == "predict" else []
         if self.protocol:
             lines += self.protocol.unavailable(purpose)
         return lines
 
-    def _not_run(self) -> list[str]:
-        """What is not available in runs."""
-        if self.run.pace == "realtime":
-            lines = self._only_lockstep(("broadcast", "link", "loss", "delay"))
-            if self.protocol and not self.protocol.linear:
-                name, wanted = show(self.protocol.info.name), "in real time expected a linear one"
-                lines.append(problem("protocol.name", name, wanted, "use run.pace: lockstep"))
-            return lines
-        lines = self._special_losses("not available in runs yet")
-        if self.noise.delay > 0:
-            lines.append(problem("noise.delay", self.noise.delay, "not available in runs yet", "use 0"))
-        return lines
+    def unpredictable(self) -> str | None:
+        """Why there is no prediction, as a part of a sentence; None where there is one."""
+        reason = self.protocol.unpredictable() if self.protocol else None
+        if not reason and (lines := self._unpredicted()):
+            reason = lines[0]
+        return reason
 
-    def _special_losses(self, why: str) -> list[str]:
+    def _unpredicted(self) -> list[str]:
+        """What has no prediction because it would be too large, apart from protocols that are not linear."""
         noise, lines = self.noise, []
-        if noise.holds:
-            lines.append(problem("noise.on_loss", noise.on_loss, why, "use own"))
-        if noise.loss.any and noise.burst is not None:
-            lines.append(problem("noise.burst", noise.burst, why, "remove it"))
-        if noise.loss.any and (noise.loss.edges or noise.loss.arcs):
-            lines.append(problem("noise.loss", "by link", why, "use a number"))
+        links = topology.heard_links(self.graph_list, self.time) & np.isfinite(self.leader_gains)[:, None]
+        lossy = int((links & (self.loss > 0.0)).sum())
+        if noise.burst is not None and len(self.graph_list) * 2.0**lossy > MOST_STATES:
+            wanted = f"has no prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
+            wanted += f"{MOST_STATES} with those of the graph"
+            lines.append(problem("noise.burst", noise.burst, wanted, "remove it, or give fewer links a loss"))
+        kept = self.agents * (noise.delay + 2) + lossy * (noise.delay + 1) * noise.holds
+        by_message = noise.holds or (self.run.pace == "realtime" and noise.steps_only)
+        if by_message and kept > MOST_VALUES:
+            wanted = f"has no prediction: {kept} values are kept from step to step, expected at most {MOST_VALUES}"
+            lines.append(problem("noise.on_loss", noise.on_loss, wanted, "use fewer agents or links, or own values"))
         return lines
-
-    def _only_lockstep(self, keys: Sequence[str]) -> list[str]:
-        noise = {**self.noise.model_dump(), "loss": self.noise.loss.short() if self.noise.loss.any else 0}
-        return [
-            problem(f"noise.{key}", noise[key], "not available in real time yet", "use 0, or run.pace: lockstep")
-            for key in keys
-            if noise[key]
-        ]
 
     def require_available(self, purpose: Purpose = "run") -> None:
         """Raise an error if the experiment asks for something that this version cannot do.

@@ -123,7 +123,7 @@ def loss_matrix(
     Also the links in ``loss``, which has numbers of agents, that are in no graph or are repeated.
     """
     agents, found = graphs[0].agents, []
-    heard = _heard(graphs, time)
+    heard = heard_links(graphs, time)
     matrix = np.where(np.eye(agents, dtype=np.bool_), 0.0, loss.default)
     seen: set[tuple[int, int]] = set()
     directed = [("arcs", int(i), int(j), p) for i, j, p in loss.arcs]
@@ -141,8 +141,8 @@ def loss_matrix(
     return matrix, found
 
 
-def _heard(graphs: Sequence[Graph], time: Time) -> BoolArray:
-    """(m, m) whether agent i can hear agent j in some graph: in discrete time, with exp(-Z), over any number of arcs."""
+def heard_links(graphs: Sequence[Graph], time: Time) -> BoolArray:
+    """(m, m) whether agent i hears agent j in some graph: in discrete time, with exp(-Z), over many arcs, too."""
     heard = np.any([graph.adjacency > 0 for graph in graphs], axis=0)
     if time == "discrete":
         heard = np.any([[hops(graph.adjacency > 0, [i]) > 0 for i in range(graph.agents)] for graph in graphs], axis=0)

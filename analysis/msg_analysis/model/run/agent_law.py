@@ -16,28 +16,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import lru_cache
-
-import numpy as np
+from collections.abc import Sequence
 
 from msg_analysis.model.arithmetic.payload import combine, from_payload, to_payload
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.experiment.protocol_binding import AgentProtocol
+from msg_analysis.model.run.agent_air import AgentAir
 from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.step.air import LOST, Air
+from msg_analysis.model.step.air import NOTHING
 from msg_analysis.model.step.process_noise import ProcessNoise
 from msg_analysis.model.step.step_model import StepModel, Wiring
 from msg_analysis.protocol import Heard
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.types import FloatArray
 
 
 class AgentLaw:
     """The state x(k) of one agent (index from 0) as a payload, and its next states.
 
-    ``heard`` has the steps of the values used in the step to x(k), or ``LOST``, by neighbour, ascending; empty where
-    all are of the step before.
+    ``heard`` of a step in lockstep has the steps of the values used in the step to x(k), or ``LOST``, by neighbour,
+    ascending; empty where none was lost.
     """
+
+    air: AgentAir | None = None  # None where messages have no noise, none is lost, and none is old
 
     def __init__(self, record: RunRecord, model: StepModel, agent: int) -> None:
         self.agent = agent
@@ -65,11 +65,14 @@ class AgentLaw:
         """Payload that is published of x(step)."""
         return state
 
-    def advance(self, mode: int, heard: list[bytes]) -> bytes:
+    def advance(self, mode: int, heard: list[bytes], steps: Sequence[int] | None = None) -> bytes:
         """x(k+1) from x(k) under g(k) = ``mode`` (from 0).
 
-        ``heard`` has what the neighbours of this mode, ascending, published of x_j(k).
+        ``heard`` has what the neighbours of this mode, ascending, published: in lockstep in the steps that ``air``
+        needs, or k; in real time in ``steps``, where NOTHING stands for the own value.
         """
+        if steps is not None:
+            heard = [self.state if step == NOTHING else value for step, value in zip(steps, heard, strict=True)]
         before = self._own[mode]
         values = [*heard[:before], self.state, *heard[before:]]
         self.state = combine(self._weights[mode], values, self._drives[mode][self.step % STEPS_PER_BLOCK])
@@ -85,36 +88,22 @@ class AgentLaw:
 
 
 class AgentLawOnAir(AgentLaw):
-    """The same with noise or loss on the air: see ``model.step.air``."""
+    """The same with noise, loss or delay on the air: see ``model.step.air``."""
 
     def __init__(self, record: RunRecord, model: StepModel, agent: int) -> None:
         super().__init__(record, model, agent)
-        self._air = air = Air(record.experiment)
+        self.air: AgentAir = AgentAir(record.experiment, model, agent)
         self._neighbours = [self.neighbours(mode) for mode in range(model.modes)]
-        self._link = _links(air, model, agent)
 
     def published(self, step: int, state: bytes) -> bytes:
         """See AgentLaw."""
-        if not self._air.broadcast:
-            return state
-        return to_payload(self._air.published(self.agent, step, from_payload(state)))
+        return self.air.published(step, from_payload(state)) if self.air.broadcast else state
 
-    def advance(self, mode: int, heard: list[bytes]) -> bytes:
-        """See AgentLaw. Own values stand for those that were lost."""
-        step, own = self.step, self.state
-        block, within = divmod(step, STEPS_PER_BLOCK)
-        used: list[int] = []
-        values: list[bytes] = []
-        for sender, value in zip(self._neighbours[mode], heard, strict=True):
-            noise, losses = self._link(sender, block)
-            lost = losses[within]
-            used.append(LOST if lost else step)
-            if lost:
-                values.append(own)
-            else:
-                values.append(value if noise is None else to_payload(from_payload(value) + noise[within]))
-        self.heard = tuple(used) if LOST in used else ()
-        return super().advance(mode, values)
+    def advance(self, mode: int, heard: list[bytes], steps: Sequence[int] | None = None) -> bytes:
+        """See AgentLaw. The own value stands for those that were lost."""
+        own = self.state
+        values, self.heard = self.air.receive(self._neighbours[mode], self.step, heard, steps)
+        return super().advance(mode, [own if value is None else value for value in values])
 
 
 class ProtocolLaw:
@@ -139,8 +128,8 @@ class ProtocolLaw:
         for shared in (*self._neighbours, *self._weights):
             shared.flags.writeable = False
         self._noises = self._draw(0)
-        self._air = Air(experiment)
-        self._link = _links(self._air, model, agent)
+        self.air = air = AgentAir(experiment, model, agent)
+        self._plain = not (air.link or air.loss or air.delay)
 
     def resume(self, step: int, state: bytes) -> None:
         """See AgentLaw."""
@@ -154,16 +143,18 @@ class ProtocolLaw:
     def published(self, step: int, state: bytes) -> bytes:
         """See AgentLaw."""
         value = self._protocol.publish(step, from_payload(state).reshape(self._shape))
-        return to_payload(self._air.published(self.agent, step, value) if self._air.broadcast else value)
+        return self.air.published(step, value)
 
-    def advance(self, mode: int, heard: list[bytes]) -> bytes:
+    def advance(self, mode: int, heard: list[bytes], steps: Sequence[int] | None = None) -> bytes:
         """See AgentLaw."""
         within = self.step % STEPS_PER_BLOCK
         agents, weights = self._neighbours[mode], self._weights[mode]
+        if not self._plain or steps is not None:
+            found, self.heard = self.air.receive(agents.tolist(), self.step, heard, steps)
+            came = [d for d, value in enumerate(found) if value is not None]
+            heard = [value for value in found if value is not None]
+            agents, weights = agents[came], weights[came]
         values = from_payload(b"".join(heard)).reshape(len(heard), self._shape[1])
-        self.heard = ()
-        if self._air.link or self._air.loss:
-            agents, weights, values = self._receive(mode, values)
         state = from_payload(self.state).reshape(self._shape)
         message = Heard(agents, weights, values)
         self.state = to_payload(self._protocol.step(self.step, mode, state, message, self._noises[mode][within]))
@@ -179,34 +170,10 @@ class ProtocolLaw:
             noise.flags.writeable = False
         return noises
 
-    def _receive(self, mode: int, values: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Of the messages that come through the air: senders, weights, and values with the noise of their links."""
-        block, within = divmod(self.step, STEPS_PER_BLOCK)
-        values, came = values.copy(), np.ones(len(values), dtype=np.bool_)
-        for d, sender in enumerate(self._neighbours[mode]):
-            noise, losses = self._link(int(sender), block)
-            came[d] = not losses[within]
-            if noise is not None:
-                values[d] += noise[within]
-        if not came.all():
-            self.heard = tuple(self.step if there else LOST for there in came)
-        return self._neighbours[mode][came], self._weights[mode][came], values[came]
-
-
-def _links(air: Air, model: Wiring, agent: int) -> Callable[[int, int], tuple[FloatArray | None, Sequence[bool]]]:
-    """Of a sender and a block of steps: link noise, None without, and which messages to the agent are lost."""
-
-    @lru_cache(maxsize=max(1, int(model.listens()[agent].sum())))
-    def link(sender: int, block: int) -> tuple[FloatArray | None, Sequence[bool]]:
-        noise = air.link_noise(agent, sender, block) if air.link else None
-        return noise, air.losses(agent, sender, block).tolist()
-
-    return link
-
 
 def agent_law(record: RunRecord, model: Wiring, agent: int) -> AgentLaw | ProtocolLaw:
     """The law of one agent (index from 0) of a run; ``model`` is that of the record."""
     if not isinstance(model, StepModel):
         return ProtocolLaw(record, model, agent)
-    kind = AgentLawOnAir if record.experiment.noise.on_air else AgentLaw
+    kind = AgentLawOnAir if record.experiment.noise.steps_only else AgentLaw
     return kind(record, model, agent)

@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Noise and loss on the air: what happens to a value between the agent that publishes it and an agent that uses it.
+"""The air: what happens to a value between the agent that publishes it and an agent that uses it.
 
-In the step from x(k), agent i uses y_ij(k) = x_j(k) + b_j(k) + l_ij(k) for its neighbour j. Broadcast noise b_j is
-added when the value is published, so it is the same for all receivers; link noise l_ij is added by the receiver. If the
-message is lost, x_i(k) takes the place of y_ij(k), so there is no coupling in that step. A message carries all its
-replicas, which are lost together. The agent uses its own value without noise.
+The message of step k of agent j says x_j(k) + b_j(k); agent i receives y_ij(k) = x_j(k) + b_j(k) + l_ij(k), or nothing
+where it is lost, with all its replicas. Noise and loss belong to the message: used twice, it has the same noise.
+With n the step of the newest message, i uses that of step s = max(0, n - delay). If it is lost, x_i(k) takes its place
+(own), or the newest one before that is not lost (hold; the first one never is).
 """
 
 from __future__ import annotations
@@ -26,25 +26,35 @@ from functools import lru_cache
 
 import numpy as np
 
-from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, generator, link_number, normals
+from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, link_number, normals
 from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.types import BoolArray, FloatArray
+from msg_analysis.model.step.losses import Losses
+from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 LOST = 2**64 - 1
 """Value in ``heard`` of a state message for a lost message. No step of a run has this number."""
+
+NOTHING = -1
+"""In place of the step of a message: none, so that the agent uses its own value."""
 
 
 class Air:
     """The random numbers of noise and loss on the air, block after block of steps.
 
     They do not depend on the graph: they are drawn for a link and a step whether that step uses the link or not.
+    ``start``: step of the first messages; negative for a past before the run.
     """
 
-    def __init__(self, experiment: ValidExperiment) -> None:
+    def __init__(self, experiment: ValidExperiment, start: int = 0) -> None:
         noise = experiment.noise
-        self.broadcast, self.link, self.loss = noise.broadcast, noise.link, float(experiment.loss.max())
+        self.broadcast, self.link, self.loss = noise.broadcast, noise.link, noise.loss.any
+        self.delay, self.holds = noise.delay, noise.holds
+        self.start = start
         self._seed = experiment.run.seed
         self._shape = (STEPS_PER_BLOCK, experiment.run.replicas)
+        self._losses = Losses(experiment)
+        # Of each link, the block whose sources were found last, and the last one of them.
+        self._ends: dict[tuple[int, int], tuple[int, int]] = {}
         # The step that an agent makes and the step of the state that it publishes may be in two blocks.
         self._broadcast_block = lru_cache(maxsize=2)(self.broadcast_noise)
 
@@ -58,8 +68,32 @@ class Air:
 
     def losses(self, receiver: int, sender: int, block: int) -> BoolArray:
         """(STEPS_PER_BLOCK,): which messages from sender to receiver (indices from 0) are lost in a block."""
-        random = generator(self._seed, Stream.LOSS, link_number(receiver, sender), block)
-        return random.random(STEPS_PER_BLOCK) < self.loss
+        lost = self._losses.block(receiver, sender, block)
+        if self.holds and block == self.start // STEPS_PER_BLOCK:
+            lost[self.start % STEPS_PER_BLOCK] = False
+        return lost
+
+    def sources(self, receiver: int, sender: int, block: int) -> IntArray:
+        """(STEPS_PER_BLOCK,) of a run: the step of the message that is used where that of each step should be.
+
+        NOTHING where the receiver uses its own value.
+        """
+        steps = block * STEPS_PER_BLOCK + np.arange(STEPS_PER_BLOCK)
+        came = np.where(self.losses(receiver, sender, block), NOTHING, steps)
+        if not self.holds:
+            return came
+        link = receiver, sender
+        known, held = self._ends.get(link, (None, NOTHING))
+        before = block
+        if known != block - 1:
+            held = NOTHING
+        while came[0] == NOTHING and held == NOTHING:
+            before -= 1
+            kept = np.flatnonzero(~self.losses(receiver, sender, before))
+            held = before * STEPS_PER_BLOCK + int(kept[-1]) if len(kept) else NOTHING
+        found = np.maximum.accumulate(np.maximum(came, held))
+        self._ends[link] = block, int(found[-1])
+        return found
 
     def published(self, agent: int, step: int, state: FloatArray) -> FloatArray:
         """What an agent (index from 0) publishes of its state (replicas,) of a step.

@@ -12,79 +12,124 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What all agents hear in steps with noise or loss on the air: ``air`` for all at once, for the twin."""
+"""What all agents hear in steps with noise, loss or delay on the air: ``air`` for all at once, for the twin."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
 from msg_analysis.model.arithmetic.many_steps import Reception
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.air import Air
+from msg_analysis.model.step.air import NOTHING, Air
 from msg_analysis.model.step.neighbours import neighbour_tables
-from msg_analysis.model.step.step_model import StepModel
-from msg_analysis.types import BoolArray, FloatArray, IntArray
+from msg_analysis.model.step.phases import phases
+from msg_analysis.model.step.step_model import Wiring
+from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
+
+Array = TypeVar("Array", bound=AnyArray)
+
+
+def ahead(experiment: ValidExperiment) -> IntArray:
+    """(m, m) by receiver and sender: 1 where the sender steps first, in real time with ideal timers, else 0."""
+    if experiment.run.pace == "lockstep":
+        return np.zeros((experiment.agents, experiment.agents), dtype=np.int64)
+    phase = phases(experiment)
+    return (phase < phase[:, None]).astype(np.int64)
 
 
 class AirReception:
-    """The reception of block after block of steps; with ``logged_steps`` (N), also what is logged of it."""
+    """The reception of block after block of steps, from x(first) = ``start`` (m, R) on."""
 
-    def __init__(self, experiment: ValidExperiment, model: StepModel, logged_steps: int | None = None) -> None:
-        self._air = Air(experiment)
-        self._model = model
-        self._replicas = experiment.run.replicas
-        links = np.argwhere(model.listens())  # (links, 2): receiver, sender
-        self._pairs: list[list[int]] = links.tolist()
-        # Number of each link; the number of links where there is none, for own values and padding.
+    def __init__(self, experiment: ValidExperiment, model: Wiring, start: FloatArray, first: int = 0) -> None:
+        self._air = air = Air(experiment, first)
+        self._first = first
+        links = np.argwhere(model.listens())  # (L, 2): receiver, sender
+        self._pairs: list[tuple[int, int]] = [(i, j) for i, j in links.tolist()]
+        self._receivers, self._senders = links.T.copy()
+        self._agents, self._replicas = model.agents, experiment.run.replicas
         self._numbers = np.full((model.agents, model.agents), len(links))
         self._numbers[links[:, 0], links[:, 1]] = np.arange(len(links))
-        self._published: FloatArray | None = None
-        if logged_steps is not None and self._air.broadcast:
-            self._published = np.empty((logged_steps + 1, model.agents, self._replicas))
-        self._lost_blocks: list[BoolArray] | None = None if logged_steps is None else []
+        self._ahead = ahead(experiment)[links[:, 0], links[:, 1]]
+        self._held: FloatArray | None = None
+        if air.holds:
+            begin = np.array([first])
+            self._held = start[self._senders].copy()
+            if air.broadcast:
+                self._held += self._broadcast(begin)[self._senders, 0]
+            if air.link:
+                self._held += self._link(begin)[:, 0]
 
-    def block(self, number: int) -> Reception:
-        """Of the steps of a block."""
-        air, count = self._air, len(self._pairs)
-        own = np.ones((count + 1, STEPS_PER_BLOCK), dtype=np.bool_)
-        for link, (i, j) in enumerate(self._pairs):
-            own[link] = air.losses(i, j, number) if air.loss else False
-        broadcast = link_noise = None
-        if air.broadcast:
-            broadcast = np.stack([air.broadcast_noise(i, number) for i in range(self._model.agents)])
-        if air.link:
-            # The last row is never used: it stands for own values.
-            link_noise = np.zeros((count + 1, STEPS_PER_BLOCK, self._replicas))
-            for link, (i, j) in enumerate(self._pairs):
-                link_noise[link] = air.link_noise(i, j, number)
-        return Reception(self._numbers, own, broadcast, link_noise)
+    def block(self, begin: int, count: int) -> Reception:
+        """Of the steps begin, ..., begin + count - 1."""
+        air = self._air
+        latest = begin + count + int(self._ahead.max(initial=0))
+        # Before the start, the first message stands for earlier ones.
+        steps = np.maximum(self._first, np.arange(begin, latest) - air.delay)
+        lost = np.zeros((len(self._pairs) + 1, len(steps)), dtype=np.bool_)
+        for link, (i, j) in enumerate(self._pairs if air.loss else ()):
+            lost[link] = _of_steps(partial(air.losses, i, j), steps)
+        return Reception(
+            links=self._numbers,
+            first=np.searchsorted(self._receivers, np.arange(self._agents + 1)),
+            senders=self._senders,
+            ahead=self._ahead,
+            delay=air.delay,
+            lost=lost,
+            broadcast=self._broadcast(steps) if air.broadcast else None,
+            link=self._link(steps) if air.link else None,
+            held=self._held,
+        )
 
-    def note(self, first: int, before: FloatArray, made: FloatArray, reception: Reception) -> None:
-        """Log the reception of the steps of a block from x(first) = ``before`` on, which made the states (K, m, R)."""
-        if self._published is not None:
-            assert reception.broadcast is not None
-            states, count = np.concatenate([before[None], made[:-1]]), len(made)
-            self._published[first : first + count] = states + reception.broadcast[:, :count].transpose(1, 0, 2)
-        if self._lost_blocks is not None:
-            self._lost_blocks.append(reception.own)
+    def _broadcast(self, steps: IntArray) -> FloatArray:
+        noise = self._air.broadcast_noise
+        return np.stack([_of_steps(partial(noise, i), steps) for i in range(self._agents)])
 
-    def log(self, last: FloatArray, modes: IntArray) -> tuple[FloatArray | None, BoolArray | None]:
-        """``Trajectory.published`` and ``Trajectory.lost`` of the run with these graphs (N,), which ended with x(N).
+    def _link(self, steps: IntArray) -> FloatArray:
+        air, shape = self._air, (len(self._pairs), len(steps), self._replicas)
+        noises = [_of_steps(partial(air.link_noise, i, j), steps) for i, j in self._pairs]
+        return np.array(noises).reshape(shape)  # there may be no link
 
-        None where there is no broadcast noise, or no loss.
-        """
-        if self._published is not None:
-            self._published[-1] = [self._air.published(i, len(modes), state) for i, state in enumerate(last)]
-        return self._published, self._losses(modes) if self._air.loss else None
 
-    def _losses(self, modes: IntArray) -> BoolArray:
-        assert self._lost_blocks is not None
-        agents = np.arange(self._model.agents)
-        numbers = self._numbers[agents[:, None], neighbour_tables(self._model).senders]  # (n, m, D)
-        lost = np.empty((len(modes), *numbers.shape[1:]), dtype=np.bool_)
-        for block, drawn in enumerate(self._lost_blocks):
-            first, last = block * STEPS_PER_BLOCK, min(len(modes), (block + 1) * STEPS_PER_BLOCK)
-            drawn[-1] = False  # padding, no link
-            lost[first:last] = drawn[numbers[modes[first:last]], np.arange(last - first)[:, None, None]]
-        return lost
+def _of_steps(block: Callable[[int], Array], steps: IntArray) -> Array:
+    """Entries of these steps, ascending, of what a function gives for every block of steps."""
+    numbers = steps // STEPS_PER_BLOCK
+    parts = [block(int(number))[steps[numbers == number] % STEPS_PER_BLOCK] for number in np.unique(numbers)]
+    return np.concatenate(parts)  # type: ignore[return-value]
+
+
+def add_broadcast_noise(experiment: ValidExperiment, states: FloatArray) -> FloatArray:
+    """(N + 1, m, R) what the agents publish of x(0..N), their values."""
+    air, published = Air(experiment), np.empty(states.shape)
+    for first in range(0, len(states), STEPS_PER_BLOCK):
+        now = states[first : first + STEPS_PER_BLOCK]
+        for i in range(states.shape[1]):
+            noise = air.broadcast_noise(i, first // STEPS_PER_BLOCK)[: len(now)]
+            published[first : first + len(now), i] = now[:, i] + noise
+    return published
+
+
+def sources(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> tuple[IntArray, BoolArray]:
+    """``used`` and ``lost`` of ``Trajectory``, of a run with these graphs (N,) in which all steps are made in time."""
+    air, lead, tables = Air(experiment), ahead(experiment), neighbour_tables(model)
+    used = np.full((len(modes), *tables.senders.shape[1:]), NOTHING, dtype=np.int64)
+    lost = np.zeros(used.shape, dtype=np.bool_)
+    for i, j in np.argwhere(model.listens()).tolist():
+        steps = np.maximum(0, np.arange(len(modes)) + lead[i, j] - air.delay)
+        found = _of_steps(partial(air.sources, i, j), steps) if air.loss else steps
+        for mode in range(model.modes):
+            place = np.flatnonzero(tables.senders[mode, i, : tables.count[mode, i]] == j)
+            if len(place):
+                at = modes == mode
+                used[at, i, place[0]] = found[at]
+                lost[at, i, place[0]] = found[at] != steps[at]
+    return used, lost
+
+
+def lost_messages(experiment: ValidExperiment, receiver: int, sender: int, count: int) -> BoolArray:
+    """(count,) whether the messages of the first steps of a run, from sender to receiver, are lost."""
+    return _of_steps(partial(Air(experiment).losses, receiver, sender), np.arange(count))

@@ -31,12 +31,10 @@ import numpy as np
 import scipy.linalg
 
 from msg_analysis.errors import InputError
+from msg_analysis.model.experiment.experiment import MOST_STATES, MOST_VALUES
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.theory.system.loss_events import LossEvents
 from msg_analysis.types import BoolArray, FloatArray, IntArray
-
-MAX_ENTRIES = 1500  # of the stack: about ten minutes
-MAX_MODES = 512  # graphs times states of the channels, with losses in bursts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,11 +121,10 @@ class _Stack:
         if not self.sources or not (sources.sum(axis=0) > 1).any():
             self.sources = []
         self.copies = np.array(agents + [-1] * len(self.sources), dtype=np.int64)
-        if len(agents) > MAX_ENTRIES:
+        if len(agents) > MOST_VALUES:
             raise InputError(
-                f"noise.on_loss, noise.delay: {len(held)} links of {m} agents make {len(agents)} values that are kept "
-                f"from step to step; at most {MAX_ENTRIES} are predicted: use fewer agents or links, or noise.on_loss: "
-                "own without noise.delay"
+                f"noise.on_loss: {len(held)} links of {m} agents make {len(agents)} values that are kept from step to "
+                f"step; at most {MOST_VALUES} are predicted: use fewer agents or links, or own values"
             )
 
     @property
@@ -306,10 +303,10 @@ def _gilbert(probability: float, burst: float) -> tuple[FloatArray, FloatArray]:
 
 def _channel_states(step: StepModel, channels: int) -> FloatArray:
     """(2^c, c): 1.0 where a channel loses, for every combination of states, in the order of Kronecker products."""
-    if step.modes * 2.0**channels > MAX_MODES:
+    if step.modes * 2.0**channels > MOST_STATES:
         raise InputError(
             f"noise.burst: {step.modes} graphs and {channels} links that lose messages make {step.modes} * "
-            f"2^{channels} states of the network; at most {MAX_MODES} are predicted: give a loss to fewer links "
+            f"2^{channels} states of the network; at most {MOST_STATES} are predicted: give a loss to fewer links "
             "(noise.loss: arcs), or leave noise.burst out"
         )
     return np.array(

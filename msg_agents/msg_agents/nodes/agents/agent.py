@@ -16,11 +16,13 @@
 
 from __future__ import annotations
 
+import sys
 import time
+import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -33,6 +35,7 @@ from msg_agents.recovery.checkpoint import Checkpoint
 from msg_agents.stepping.stall_detection import StallDetector
 from msg_agents.stepping.turn_queue import TurnQueue
 from msg_analysis.errors import InputError
+from msg_analysis.model.experiment.protocol_binding import ProtocolError
 from msg_analysis.model.run.agent_law import agent_law
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.step_model import Wiring
@@ -146,6 +149,16 @@ class Agent(NetworkNode):
     def step(self) -> int:
         """The current step."""
         return self._law.step
+
+    def _options(self) -> dict[str, Any]:
+        """What AgentInputs takes."""
+        return {
+            "agent": self._law.agent,
+            "steps": self.record.experiment.steps,
+            "inputs": self._inputs,
+            "peers": self._peers,
+            "start": self._law.step,
+        }
 
     def connect(self, colleagues: Mapping[int, Agent]) -> None:
         """Connect to the peers in this process (by index) by direct calls."""
@@ -303,6 +316,12 @@ class Agent(NetworkNode):
     def learn(self, graph: ActiveGraph) -> str | None:
         """Take a sojourn of the graph; the reason if it is refused, else None."""
         raise NotImplementedError
+
+    def _fail(self, error: ProtocolError) -> None:
+        """End the run, since a protocol has failed."""
+        if not self.done.done():
+            traceback.print_exception(error, file=sys.stderr)  # in full in the log of the process
+        self._group.fail(error)
 
     def _report(self) -> None:
         self._reported = self._law.step

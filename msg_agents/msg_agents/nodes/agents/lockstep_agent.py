@@ -16,16 +16,17 @@
 
 from __future__ import annotations
 
-import sys
 import time
-import traceback
 from typing import Any
 
 from msg_agents.nodes.agents.agent import Agent
 from msg_agents.nodes.diagnostics import Health
 from msg_agents.nodes.ros.timers import after
+from msg_agents.stepping.look_back import LookBackSynchronizer
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, Synchronizer
+from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.protocol_binding import ProtocolError
+from msg_analysis.model.run.agent_air import AgentAir
 from msg_analysis.wire.messages import ActiveGraph
 from msg_analysis.wire.refusals import Refusal
 
@@ -39,13 +40,23 @@ class LockstepAgent(Agent):
         super().__init__(**options)
         self._turns = self._group.turns
         self._will_report = False  # whether ``_report_later`` will be called
-        self._synchronizer: Synchronizer[bytes] = Synchronizer(
-            agent=self._law.agent,
-            steps=self.record.experiment.steps,
-            inputs=self._inputs,
-            peers=self._peers,
-            start=self._law.step,
-        )
+        air, options = self._law.air, self._options()
+        self._synchronizer: Synchronizer[bytes]
+        if air and air.looks_back:
+            self._require_kept_values(air)
+            self._synchronizer = LookBackSynchronizer(needed=air.needed, delay=air.delay, **options)
+        else:
+            self._synchronizer = Synchronizer(**options)
+
+    def _require_kept_values(self, air: AgentAir) -> None:
+        """InputError if the agent comes back, and its peers have no longer a value that it was holding."""
+        step, kept = self._law.step, self._published.capacity - 2 * LOCKSTEP_WINDOW  # they may be behind, or ahead
+        oldest = air.oldest_needed(step, self._peers)
+        if self.resumed and oldest < step - kept:
+            raise InputError(
+                f"{self.get_name()}: cannot come back at step {step}: it held a value of step {oldest}, and agents "
+                f"keep {self._published.capacity} states: lower noise.delay, noise.burst, noise.loss, or run.replicas"
+            )
 
     def begin(self) -> None:
         """See Agent."""
@@ -53,8 +64,9 @@ class LockstepAgent(Agent):
         self._turns.join(self)
 
     def _missed_since(self) -> int:
-        """See Agent. The states of the window and one step more: no peer is further behind."""
-        return max(0, self._law.step - LOCKSTEP_WINDOW - 1)
+        """See Agent. What is used from one step before the window on: no peer is further behind."""
+        first, air = max(0, self._law.step - LOCKSTEP_WINDOW - 1), self._law.air
+        return air.oldest_needed(first, self._peers) if air else first
 
     def health(self) -> Health:
         """See NetworkNode. A stalled agent says what it waits for, and asks for it again from time to time."""
@@ -96,9 +108,7 @@ class LockstepAgent(Agent):
         try:
             self._advance()
         except ProtocolError as error:
-            if not self.done.done():
-                traceback.print_exception(error, file=sys.stderr)  # in full in the log of the process
-            self._group.fail(error)
+            self._fail(error)
 
     def _advance(self) -> None:
         synchronizer, law = self._synchronizer, self._law

@@ -24,9 +24,10 @@ from msg_agents.nodes.agents.agent import Agent
 from msg_agents.nodes.diagnostics import Health
 from msg_agents.nodes.ros.timers import DueTimer
 from msg_agents.stepping.agent_inputs import NOTHING
-from msg_agents.stepping.newest_values import NewestValues
+from msg_agents.stepping.newest_values import NewestOnAir, NewestValues
 from msg_agents.stepping.realtime_schedule import CLOCK_MARGIN, Schedule
 from msg_analysis.model.arithmetic.step_clock import SECOND
+from msg_analysis.model.experiment.protocol_binding import ProtocolError
 from msg_analysis.model.step.air import LOST
 from msg_analysis.model.step.phases import phases
 from msg_analysis.wire import topics
@@ -52,14 +53,13 @@ class RealtimeAgent(Agent):
         self._dt = experiment.step_length
         self._schedule: Schedule | None = None
         self._timer = DueTimer(self, self._advance)
-        self._newest: NewestValues[Value] = NewestValues(
-            agent=self._law.agent,
-            steps=experiment.steps,
-            inputs=self._inputs,
-            peers=self._peers,
-            reach=self._reach,
-            start=self._law.step,
-        )
+        air, options = self._law.air, self._options() | {"reach": self._reach}
+        self._newest: NewestValues[Value]
+        if air and (air.loss or air.delay):
+            holds = experiment.noise.holds
+            self._newest = NewestOnAir(delay=air.delay, lost=air.lost, holds=holds, **options)
+        else:
+            self._newest = NewestValues(**options)
         self._made = stamp_ns(self._resumed) if self._resumed else 0  # simulated time [ns] of the newest state
         # The stamps of others may be so much ahead of our clock.
         self._margin = round(CLOCK_MARGIN * SECOND * self._speed)
@@ -101,7 +101,14 @@ class RealtimeAgent(Agent):
             self._timer.set(self._schedule.clock_time(self._schedule.next_step(now, after=self._law.step)))
 
     def _advance(self) -> None:
-        """Make every step that is due. Hot path."""
+        """Make every step that is due."""
+        try:
+            self._make_due_steps()
+        except ProtocolError as error:
+            self._fail(error)
+
+    def _make_due_steps(self) -> None:
+        """Hot path."""
         schedule, newest, law = self._schedule, self._newest, self._law
         assert schedule is not None
         now = self._timer.now()
@@ -128,8 +135,7 @@ class RealtimeAgent(Agent):
         # A message can arrive before our clock shows its stamp (``/clock`` is late, or clocks of hosts disagree). The
         # new state is stamped later than its inputs all the same (up to the margin): the log is in causal order.
         self._made = max(now, self._made + 1, min(newest, now + self._margin) + 1)
-        own = law.state
-        law.advance(mode, [value[0] if value else own for _, value in inputs])
+        law.advance(mode, [value[0] if value else b"" for _, value in inputs], [step for step, _ in inputs])
         steps = [LOST if step == NOTHING else step for step, _ in inputs]
         message = self._codec.wrap(law.step, mode + 1, law.state, steps, self._made)
         self._published.write(law.step, message)

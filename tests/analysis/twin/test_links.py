@@ -1,0 +1,157 @@
+"""The twin with all that can happen to messages, in both paces: against loops over numbers, from the definitions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from links_by_hand import assert_by_hand
+
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.model.arithmetic import many_steps
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.agent_law import agent_law
+from msg_analysis.model.step.air import LOST
+from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import simulate
+
+BY_LINK = {"default": 0.1, "edges": [[2, 3, 0.6]], "arcs": [[1, 2, 0.0], [2, 1, 0.8]]}
+AIRS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "noisy": {"broadcast": 0.3, "link": 0.2},
+    "own": {"loss": 0.3},
+    "hold": {"loss": 0.4, "on_loss": "hold"},
+    "bursts": {"loss": 0.3, "burst": 6.0, "link": 0.2},
+    "bursts, hold": {"loss": 0.5, "burst": 9.5, "on_loss": "hold", "broadcast": 0.3},
+    "even losses": {"loss": 0.45, "burst": 1.0},
+    "by link": {"loss": BY_LINK, "on_loss": "hold", "broadcast": 0.3, "link": 0.2},
+    "late": {"delay": 3},
+    "late and lost": {"delay": 2, "loss": 0.3, "broadcast": 0.3, "link": 0.2},
+    "all": {"delay": 2, "loss": BY_LINK, "burst": 7.0, "on_loss": "hold", "broadcast": 0.3, "link": 0.2},
+    "later than a block": {"delay": 300, "loss": 0.5, "on_loss": "hold", "link": 0.2},
+}
+CORRELATED = [[0.5, 0.1, 0.0, 0.0], [0.0, 0.4, 0.0, -0.3], [0.0, 0.0, 0.6, 0.0], [0.2, 0.0, 0.0, 0.5]]
+LAWS: dict[str, dict[str, Any]] = {
+    "consensus": {"graphs": {"a": {"path": [1, 2, 3, 4]}, "b": {"arcs": [[1, 3, 0.5], [4, 1], [2, 4], [2, 1]]}}},
+    "correlated": {"process": {"a": CORRELATED, "b": [0.5, 0.1, 0.0, 1.0]}},
+    "tracking": {"problem": "tracking", "leaders": {"agents": [2], "gain": 0.7, "reference": 2.5}},
+    "grounded": {"problem": "tracking", "leaders": {"agents": [3], "gain": "inf", "reference": -1.0}},
+    "discrete": {"time": "discrete"},
+    "metropolis": {"protocol": {"name": "metropolis", "laziness": 0.2}},
+    "saturated": {"protocol": {"name": "saturated"}},
+    "integral_action": {"protocol": {"name": "integral_action"}},
+}
+PACES = ("lockstep", "realtime")
+
+
+def experiment(law: str, air: str, pace: str = "lockstep", **run: Any) -> ValidExperiment:
+    document: dict[str, Any] = {
+        "name": "links",
+        "agents": 4,
+        "graphs": {"a": {"path": [1, 2, 3, 4]}, "b": {"edges": [[1, 2, 0.5], [2, 3], [1, 4, 2.0]]}},
+        **LAWS[law],
+    }
+    discrete = document.get("time") == "discrete"
+    chain = {"transition": [[0.9, 0.1], [0.3, 0.7]]} if discrete else {"generator": [[-1.0, 1.0], [2.0, -2.0]]}
+    dt = 1.0 if discrete else 0.05
+    times = {"dt": dt, "duration": 340 * dt, "replicas": 2, "seed": 5, "pace": pace, "start": [1.0, -2.0, 0.5, 3.0]}
+    noise = {"process": document.pop("process", 0.5), **AIRS[air]}
+    return ValidExperiment.parse(document | {"switching": chain, "noise": noise, "run": times | run})
+
+
+@pytest.mark.parametrize("air", AIRS)
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("pace", PACES)
+def test_equals_loops_over_numbers_to_the_last_bit(pace: str, law: str, air: str) -> None:
+    assert_by_hand(simulate(experiment(law, air, pace)))
+
+
+@pytest.mark.parametrize("air", ["all", "late and lost", "bursts, hold"])
+@pytest.mark.parametrize("pace", PACES)
+def test_so_does_numpy(pace: str, air: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(many_steps, "COMPILED", False)
+    assert_by_hand(simulate(experiment("consensus", air, pace)))
+
+
+@pytest.mark.parametrize("pace", PACES)
+def test_a_past_ends_where_the_run_begins(pace: str) -> None:
+    """The stationary start, from steps with negative numbers; the messages of a run begin with its x(0)."""
+    what = experiment("consensus", "all", pace, start="stationary")
+    trajectory = simulate(what)
+    assert_by_hand(trajectory)
+    assert not np.array_equal(trajectory.states[0], simulate(experiment("consensus", "plain", pace)).states[0])
+
+
+@pytest.mark.parametrize("law", ["consensus", "integral_action"])
+@pytest.mark.parametrize("air", ["all", "late and lost", "bursts", "hold"])
+@pytest.mark.parametrize("resumed", [0, 1, 255, 256, 300])
+def test_agents_alone_equal_the_whole(law: str, air: str, resumed: int) -> None:
+    """Also those that go on from some step, and know nothing of what was before."""
+    trajectory = simulate(experiment(law, air))
+    published = trajectory.states if trajectory.published is None else trajectory.published
+    delay = trajectory.record.experiment.noise.delay
+    for i in range(4):
+        agent = agent_law(trajectory.record, trajectory.record.model, i)
+        if resumed:
+            agent.resume(resumed, trajectory.states[resumed, i].tobytes())
+        for k, g in list(enumerate(trajectory.modes.tolist()))[resumed:]:
+            assert agent.published(k, agent.state) == published[k, i].tobytes()
+            senders = agent.neighbours(g)
+            assert agent.air is not None
+            heard = [published[agent.air.needed(j, k), j].tobytes() for j in senders]
+            assert agent.advance(g, heard) == trajectory.states[k + 1, i].tobytes()
+            newest = max(0, k - delay)
+            used = (
+                [newest] * len(senders) if trajectory.used is None else trajectory.used[k, i, : len(senders)].tolist()
+            )
+            if trajectory.lost is not None and trajectory.used is None:
+                used = [-1 if gone else newest for gone in trajectory.lost[k, i, : len(senders)]]
+            expected = tuple(LOST if step < 0 else step for step in used)
+            assert agent.heard == (() if set(used) <= {newest} else expected)
+
+
+@pytest.mark.parametrize("air", AIRS)
+@pytest.mark.parametrize("law", ["consensus", "integral_action"])
+@pytest.mark.parametrize("pace", PACES)
+def test_bags_keep_all_of_it(pace: str, law: str, air: str, tmp_path: Any) -> None:
+    """Written, read and checked."""
+    twin = simulate(experiment(law, air, pace))
+    write_trajectory(twin, tmp_path / "bag")
+    read = read_bag(tmp_path / "bag")
+    outcome = check(read)
+    assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, twin.completeness.expected)
+    for key in ("states", "published", "lost", "used", "made", "agent_modes"):
+        one, other = getattr(twin, key), getattr(read, key)
+        if key != "agent_modes" or one is not None:
+            assert (one is None) == (other is None), key
+        if one is not None:
+            np.testing.assert_array_equal(one, other, err_msg=key)
+
+
+def test_another_value_than_the_last_one_heard_is_found(tmp_path: Any) -> None:
+    twin = simulate(experiment("consensus", "hold"))
+    assert twin.used is not None
+    place = tuple(int(i) for i in np.argwhere(twin.used > 3)[40])
+    step, agent, which = place
+    twin.used[place] -= 1
+    write_trajectory(twin, tmp_path / "bag")
+    difference = check(read_bag(tmp_path / "bag")).difference
+    sender = int(twin.record.model.neighbours(int(twin.modes[step]), agent)[which]) + 1
+    assert difference == (
+        f"the value of agent {sender} that agent {agent + 1} used in step {step}: logged as that of step "
+        f"{twin.used[place]}, the seed gives step {twin.used[place] + 1}"
+    ) or (difference or "").startswith(f"the message of agent {sender} to agent {agent + 1} in step {step}")
+
+
+def test_a_lost_message_that_was_used_in_real_time_is_found(tmp_path: Any) -> None:
+    twin = simulate(experiment("consensus", "own", "realtime"))
+    assert twin.used is not None
+    step, agent, which = (int(i) for i in np.argwhere((twin.used[1:] < 0) & (twin.used[:-1] >= 0))[0] + [1, 0, 0])
+    model = twin.record.model
+    if which < len(model.neighbours(int(twin.modes[step]), agent)):
+        twin.used[step, agent, which] = step
+        difference = check(twin).difference
+        assert difference is not None
+        assert "which the seed loses" in difference or "the law gives" in difference

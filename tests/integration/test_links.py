@@ -1,0 +1,148 @@
+"""Networks of processes with all that can happen to messages, in both paces: complete, and equal to the twin."""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import subprocess
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.twin.check import check
+
+LOCKSTEP: dict[str, Any] = {"duration": 40, "replicas": 4}  # 800 steps
+REALTIME: dict[str, Any] = {"pace": "realtime", "speed": 5, "dt": 0.05, "duration": 20}  # 100 steps a second for 4 s
+BY_LINK = {"default": 0.1, "edges": [[2, 3, 0.7]], "arcs": [[1, 2, 0.4]]}
+MESSAGES: dict[str, dict[str, Any]] = {
+    "own": {"broadcast": 0.3, "link": 0.2, "loss": 0.3},
+    "hold": {"broadcast": 0.3, "link": 0.2, "loss": 0.4, "on_loss": "hold"},
+    "late": {"broadcast": 0.3, "delay": 2},
+    "bursts": {"link": 0.2, "loss": 0.4, "burst": 12},
+    "all": {"broadcast": 0.3, "link": 0.2, "delay": 3, "loss": BY_LINK, "burst": 20, "on_loss": "hold"},
+}
+LAWS: dict[str, dict[str, Any]] = {
+    "consensus": {},
+    "leaders": {"problem": "tracking", "leaders": {"agents": [1, 4], "gain": 0.7, "reference": 2.0}},
+    "grounded": {"problem": "tracking", "leaders": {"agents": [2], "gain": "inf", "reference": 1.0}},
+    "metropolis": {"protocol": {"name": "metropolis", "laziness": 0.3}},
+    "saturated": {"protocol": {"name": "saturated"}},
+    "integral_action": {"protocol": {"name": "integral_action"}},
+}
+PROCESSES = ("one_per_agent", 2, 1)
+
+
+def changes(law: str, messages: str, run: dict[str, Any]) -> dict[str, Any]:
+    start = {} if law in ("consensus", "leaders", "grounded", "metropolis") else {"start": [1.0, -1.0, 2.0, 0.0, 3.0]}
+    return {**LAWS[law], "noise": {"process": 1.0, **MESSAGES[messages]}, "run": {**run, **start}}
+
+
+def assert_equal(trajectory: Trajectory) -> None:
+    """Complete, and what the law and the seed give, to the last bit."""
+    assert trajectory.completeness.complete
+    assert trajectory.completeness.duplicates == 0
+    assert trajectory.completeness.refused == {}
+    outcome = check(trajectory)
+    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert outcome.compared == trajectory.completeness.expected
+
+
+@pytest.mark.parametrize(
+    ("law", "messages", "processes"),
+    [
+        ("consensus", "all", "one_per_agent"),
+        ("leaders", "bursts", 2),
+        ("grounded", "hold", 2),
+        ("metropolis", "late", "one_per_agent"),
+        ("integral_action", "all", 2),
+    ],
+)
+def test_lockstep(network: Any, law: str, messages: str, processes: Any) -> None:
+    result = network.run(network.experiment(**changes(law, messages, LOCKSTEP | {"processes": processes})))
+    assert result.failures == []
+    assert_equal(result.trajectory)
+
+
+@pytest.mark.parametrize(
+    ("law", "messages", "processes"),
+    [
+        ("consensus", "own", 2),
+        ("leaders", "hold", "one_per_agent"),
+        ("consensus", "late", 2),
+        ("grounded", "all", 2),
+        ("saturated", "own", 2),
+        ("integral_action", "all", "one_per_agent"),
+    ],
+)
+def test_real_time(network: Any, law: str, messages: str, processes: Any) -> None:
+    """What was used is what the rules allow: nothing that was lost, and nothing newer than the delay."""
+    result = network.run(network.experiment(**changes(law, messages, REALTIME | {"processes": processes})))
+    assert result.failures == []
+    assert_equal(result.trajectory)
+    trajectory = result.trajectory
+    assert trajectory.used is not None
+    assert (trajectory.used >= 0).any()
+    noise = trajectory.record.experiment.noise
+    if noise.loss.any and not noise.holds:
+        assert (trajectory.used[100:, 3, 0] < 0).any()  # agent 4 hears agent 3 in every graph
+    if noise.holds:
+        assert (trajectory.used[100:, 3, 0] >= 0).all()
+
+
+def test_a_protocol_that_is_not_linear_in_real_time(network: Any) -> None:
+    """On plain links."""
+    what = network.experiment(**LAWS["saturated"], run={**REALTIME, "start": "zero", "processes": 2})
+    result = network.run(what)
+    assert result.failures == []
+    assert_equal(result.trajectory)
+
+
+def killed_and_back(network: Any, run: subprocess.Popen[str], chance: random.Random, kills: int) -> Trajectory:
+    network.wait_until_moving()
+    for _ in range(kills):
+        victims = network.wait_for(lambda: network.processes("agent"), 30, "a living agent")
+        chance.choice(victims).kill(signal.SIGKILL)
+    stdout, stderr = run.communicate(timeout=180)
+    assert run.returncode == 0, stderr
+    result = json.loads(stdout)
+    assert len(result["restarts"]) >= 1
+    return read_bag(result["bag"])
+
+
+@pytest.mark.parametrize("processes", ["one_per_agent", 2])
+def test_killed_agents_hold_again_what_they_held(network: Any, processes: Any) -> None:
+    """Bursts of 200 messages: an agent that comes back needs values from long before it was killed."""
+    held = MESSAGES["all"] | {"delay": 2, "loss": 0.5, "burst": 200}
+    file = network.file(noise={"process": 1.0, **held}, run={"duration": 400, "replicas": 16, "processes": processes})
+    trajectory = killed_and_back(network, network.record(file, "--restarts", "4", "--json"), random.Random(1), 2)
+    assert_equal(trajectory)
+    assert trajectory.used is not None
+    ages = np.arange(len(trajectory.used))[:, None, None] - trajectory.used
+    assert ages[trajectory.used >= 0].max() > 200
+
+
+def test_any_of_them_with_kills(network: Any, repetition: int, rng: random.Random) -> None:
+    """One of all combinations, with an agent killed in every other repetition."""
+    law, messages, pace = rng.choice(list(LAWS)), rng.choice(list(MESSAGES)), rng.choice([LOCKSTEP, REALTIME])
+    longer = pace | {"processes": rng.choice(PROCESSES), "replicas": 8}
+    if pace is LOCKSTEP:
+        longer["duration"] = 200
+    print(law, messages, longer)
+    file = network.file(**changes(law, messages, longer))
+    run = network.record(file, "--restarts", "3", "--json")
+    if repetition % 2 == 0:
+        assert_equal_but_for_restarts(killed_and_back(network, run, rng, 1))
+        return
+    stdout, stderr = run.communicate(timeout=180)
+    assert run.returncode == 0, stderr
+    assert_equal(read_bag(json.loads(stdout)["bag"]))
+
+
+def assert_equal_but_for_restarts(trajectory: Trajectory) -> None:
+    """As above; in real time a state that was sent again may have come twice."""
+    assert trajectory.completeness.complete
+    assert check(trajectory).difference is None
