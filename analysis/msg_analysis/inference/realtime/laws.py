@@ -106,7 +106,9 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
         means = sequential
         pattern = Law(Estimate(error.measured), None, f"not available: {reason}")
     late = timing.missed_share > MAX_MISSED
-    law = _sequential(error, p, level, _departures(timing), effect, late)
+    # Where agents keep values from step to step, the sequential law has no standard error of its own.
+    untested = p is None and observation.prediction.system.readout is not None and pattern.supported
+    law = _sequential(error, 1.0 if untested else p, level, _departures(timing), effect, late)
     return means, Laws(pattern, law, _continuous(observation, error, level, late))
 
 

@@ -26,7 +26,8 @@ from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.phases import phases
 from msg_analysis.model.step.sequential_law import ideal_uses
-from msg_analysis.types import AnyArray, FloatArray
+from msg_analysis.twin.ideal_timers import ideal_log
+from msg_analysis.types import AnyArray, FloatArray, IntArray
 
 BINS = 60
 
@@ -62,8 +63,8 @@ class Timing:
     jitter_ms: Quantiles  # |time between two successive steps of an agent - period|
     staleness_ms: Quantiles  # age of the values at the time of use
     staleness_steps: Quantiles  # step of the new state - step of the value; 0 or 1 with ideal timers
-    uses: int  # neighbours' values that steps needed, those never heard included
-    ideal_uses: int  # uses of the value that ideal timers would have used
+    uses: int  # neighbours' values that steps needed, those never heard or lost included
+    ideal_uses: int  # uses of the value that ideal timers would have used, the own one for a lost one included
     never_heard: int  # uses in which nothing had been heard yet of the neighbour
     outdated_graphs: int  # steps made with another graph than the network's at that time
     histogram: tuple[FloatArray, AnyArray]  # of lateness: edges [ms] (BINS + 1,) and counts (BINS,); covers all values
@@ -126,7 +127,7 @@ def measure_timing(observation: Observation) -> Timing:
     made = timers.made[timers.used, tables.senders[timers.graphs, agents]]
     age = (timers.made[1:, :, None] - made)[heard] * milliseconds
     behind = (np.arange(1, steps + 1)[:, None, None] - timers.used)[heard]
-    ideal = ideal_uses(step, phase)[timers.graphs, agents] + np.arange(steps)[:, None, None]
+    ideal = _ideal(observation, phase)
     jitter = np.abs(np.diff(timers.made[1:], axis=0) - period) * milliseconds
     return Timing(
         period_ms=period * milliseconds,
@@ -137,12 +138,24 @@ def measure_timing(observation: Observation) -> Timing:
         staleness_ms=Quantiles.of(age),
         staleness_steps=Quantiles.of(behind),
         uses=int(there.sum()),
-        ideal_uses=int((heard & (timers.used == ideal)).sum()),
-        never_heard=int((there & ~heard).sum()),
+        ideal_uses=int((there & (timers.used == ideal)).sum()),
+        never_heard=int((there & ~heard & (ideal >= 0)).sum()),
         outdated_graphs=int((timers.graphs != observation.modes[:, None]).sum()),
         histogram=_histogram(late_ms),
         ages=_histogram(age),
     )
+
+
+def _ideal(observation: Observation, phase: FloatArray) -> IntArray:
+    """(N, m, D) steps of the values that ideal timers would have used; -1: the own value, -2: not known."""
+    timers, step, experiment = observation.timers, observation.step, observation.prediction.experiment
+    assert timers is not None
+    if not experiment.noise.steps_only:
+        steps = np.arange(len(timers.graphs))[:, None, None]
+        return np.asarray(ideal_uses(step, phase)[timers.graphs, np.arange(step.agents)] + steps)
+    # Which messages are lost is in the seed; under another graph than the network's the neighbours are others.
+    used = ideal_log(experiment, step, observation.modes)[1]
+    return np.where((timers.graphs == observation.modes[:, None])[:, :, None], used, -2)
 
 
 def _histogram(values: AnyArray) -> tuple[FloatArray, AnyArray]:
