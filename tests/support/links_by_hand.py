@@ -15,7 +15,7 @@ from msg_analysis.model.step.step_model import StepModel
 
 BLOCK = 256
 PROCESS, BROADCAST, LINK, LOSS = 3, 4, 5, 6  # numbers of the streams
-FORGOTTEN = 24  # blocks after which no burst of these tests goes on
+FORGOTTEN = 4  # blocks after which no burst of these tests goes on
 
 
 class Links:

@@ -82,8 +82,8 @@ def run_file(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("changes", "options", "words"),
     [
-        ({"run": {"pace": "realtime"}, "noise": {"link": 0.1}}, [], ["noise.link: 0.1", "real time", "lockstep"]),
-        ({"noise": {"delay": 2}}, [], ["noise.delay", "2"]),
+        ({"noise": {"loss": 0.5, "burst": 1}}, [], ["noise.burst: 1", "p / (1 - p)"]),
+        ({"noise": {"loss": {"arcs": [[1, 4, 0.5]]}}}, [], ["noise.loss.arcs: [1, 4]", "4 hears 1"]),
         ({"run": {"dt": 0.3, "duration": 5}}, [], ["run.duration"]),
         ({"unknown": 1}, [], ["unknown"]),
         (
@@ -91,8 +91,7 @@ def run_file(tmp_path: Path) -> Path:
             [],
             ["run.processes", "at most 200"],
         ),
-        ({"noise": {"loss": 0.1}}, ["--pace", "realtime"], ["noise.loss: 0.1", "real time"]),
-        ({"noise": {"delay": 1}}, ["--pace", "realtime"], ["noise.delay: 1"]),
+        ({"noise": {"loss": 1.5}}, ["--pace", "realtime"], ["noise.loss: 1.5"]),
         ({}, ["--pace", "realtime", "--speed", "0"], ["run.speed: 0", "> 0"]),
         ({}, ["--pace", "fast"], ["error: --pace: run.pace", "fast"]),
         ({}, ["--processes", "many", "--seed", "1"], ["error: --processes: run.processes", "many"]),

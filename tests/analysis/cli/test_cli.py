@@ -128,13 +128,10 @@ def test_bad_files_are_errors_of_the_user(command: str, tmp_path: Path) -> None:
 
 def test_what_is_not_available_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "file.yaml"
-    file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nnoise: {delay: 2}\n")
-    late = call("simulate", file, "--out", tmp_path / "out")
-    assert late.exit_code == 2
-    assert "noise.delay: 2: not available" in late.stderr
-    assert not (tmp_path / "out").exists()
-    file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nnoise: {loss: 0.1}\nrun: {pace: realtime}\n")
-    assert "noise.loss: 0.1: not available in real time yet" in call("predict", file).stderr
+    file.write_text("name: a\ngraphs: {all: {complete: true}}\nagents: 6\nnoise: {loss: 0.1, burst: 3}\n")
+    large = call("predict", file)
+    assert large.exit_code == 2
+    assert "noise.burst: 3.0: has no prediction: 2^30 states of 30 links" in large.stderr
 
 
 def test_real_time_is_predicted_in_turn(tmp_path: Path) -> None:

@@ -213,20 +213,21 @@ def test_the_order_of_the_graphs_matters() -> None:
     assert small(graphs=a, switching=switching) == small(graphs=dict(a), switching=switching)
 
 
-def test_what_is_not_available_yet_is_listed() -> None:
+def test_everything_runs_and_what_is_too_large_has_no_prediction() -> None:
     assert small().unavailable() == []
-    small().require_available()
-    noisy = small(noise={"broadcast": 0.1, "link": 0.2, "loss": 0.3, "delay": 2}, run={"pace": "realtime"})
-    keys = [f"noise.{key}" for key in ("broadcast", "link", "loss", "delay")]
-    assert [line.split(":")[0] for line in noisy.unavailable("predict")] == keys
-    assert [line.split(":")[0] for line in noisy.unavailable()] == keys
-    assert noisy.unavailable()[2] == "noise.loss: 0.3: not available in real time yet: use 0, or run.pace: lockstep"
-    small(run={"pace": "realtime", "speed": 5}).require_available()
-    with pytest.raises(NotAvailableError, match=r"noise\.delay: 2"):
+    noise = {"broadcast": 0.1, "link": 0.2, "loss": 0.3, "delay": 2, "on_loss": "hold", "burst": 5}
+    for pace in ("lockstep", "realtime"):
+        noisy = small(noise=noise, run={"pace": pace})
         noisy.require_available()
-    small(run={"pace": "realtime"}).require_available()
-    small(noise={"broadcast": 0.1, "link": 0.2, "loss": 0.3}).require_available()
-    small(noise={"loss": 0.3, "delay": 2}).require_available("predict")
+        noisy.require_available("predict")
+        assert noisy.unpredictable() is None
+    large = small(graphs={"all": {"complete": True}}, agents=5, noise=noise)
+    large.require_available()
+    (line,) = large.unavailable("predict")
+    assert line.startswith("noise.burst: 5.0: has no prediction: 2^20 states of 20 links")
+    assert large.unpredictable() == line
+    with pytest.raises(NotAvailableError, match=r"noise\.burst: 5"):
+        large.require_available("predict")
 
 
 def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path: Path) -> None:

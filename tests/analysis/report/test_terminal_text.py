@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.experiment.protocol_binding import ProtocolInfo
 from msg_analysis.report.documents.info import describe_experiment
 from msg_analysis.report.terminal import bag_text, comparison_text, experiment_text, theory_text
 from msg_analysis.theory.graph_indices import algebraic_connectivity
@@ -166,10 +167,12 @@ def test_experiment_explained() -> None:
         assert part in output
 
 
-def test_experiment_that_cannot_be_run_yet() -> None:
-    document = describe_experiment(ValidExperiment.parse(DOCUMENT | {"noise": {"delay": 1}}))
-    assert document["predicted_system_error"] > 0
-    assert "noise.delay: 1: not available in runs yet" in shown(experiment_text.print_experiment, document)
+def test_experiment_that_cannot_be_run_here() -> None:
+    """One of a bag, whose protocol is not installed."""
+    used = ProtocolInfo("mine", "pack", "1.2", linear=True)
+    what = ValidExperiment.parse(DOCUMENT | {"protocol": {"name": "mine"}}, recorded=used)
+    text = shown(experiment_text.print_experiment, describe_experiment(what))
+    assert 'protocol.name: "mine": expected an available protocol' in text
 
 
 def test_noise_by_graph_and_delay_explained() -> None:

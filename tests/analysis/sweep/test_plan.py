@@ -156,10 +156,11 @@ def test_every_point_is_checked_before_anything_runs(tmp_path: Path, over: Any, 
 
 
 def test_what_this_version_cannot_do_is_refused(tmp_path: Path) -> None:
+    what = EXPERIMENT | {"protocol": {"name": "saturated"}, "run": EXPERIMENT["run"] | {"start": "zero"}}
     over = {"noise.delay": [0, 1]}
-    assert len(load(tmp_path, over=over).points) == 2  # predicted, exactly
-    text = complaint(tmp_path, over=over, kind="simulate")
-    assert "point 2 (noise.delay = 1): noise.delay: 1: not available in runs yet" in text
+    assert len(load(tmp_path, experiment=what, over=over, kind="simulate").points) == 2
+    text = complaint(tmp_path, experiment=what, over=over, kind="predict")
+    assert 'every point: protocol.name: "saturated": expected a linear protocol' in text
 
 
 @pytest.mark.parametrize(
