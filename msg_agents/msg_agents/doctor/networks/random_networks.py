@@ -66,6 +66,7 @@ def random_document(seed: int) -> Document:
         "start": draw.choice(["stationary", "zero", [_rounded(draw.uniform(-9.0, 9.0)) for _ in range(agents)]]),
         "processes": draw.choice(["auto", "one_per_agent", draw.randint(1, agents)]),
     }
+    _complicate(random.Random(f"links {seed}"), document)
     return document
 
 
@@ -171,6 +172,21 @@ def _noise(draw: random.Random, agents: int, names: Sequence[str]) -> Document:
         if draw.random() < 0.25:
             section[kind] = _rounded(draw.uniform(0.01, most))
     return section
+
+
+def _complicate(draw: random.Random, document: Document) -> None:
+    """Delays, and losses in bursts or replaced by the last value heard, in some of the networks."""
+    noise, run = document["noise"], document["run"]
+    if draw.random() < 0.25:
+        noise["delay"] = draw.choice([1, 2, 3, 20])
+    if "loss" not in noise or draw.random() < 0.25:
+        return
+    if draw.random() < 0.6:
+        noise["on_loss"] = "hold"
+    if draw.random() < 0.5:
+        noise["burst"] = _rounded(1.0 + 1.1 * noise["loss"] / (1.0 - noise["loss"]) + 10 ** draw.uniform(0.0, 2.3))
+    if run["start"] == "stationary":  # a past may be too long, and there need not be a prediction in its place
+        run["start"] = "zero"
 
 
 def _gain(draw: random.Random, agents: int) -> Any:
