@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import signal
 import subprocess
 from typing import Any
@@ -123,6 +124,20 @@ def test_killed_agents_hold_again_what_they_held(network: Any, processes: Any) -
     assert trajectory.used is not None
     ages = np.arange(len(trajectory.used))[:, None, None] - trajectory.used
     assert ages[trajectory.used >= 0].max() > 200
+
+
+def test_a_value_that_was_held_for_too_long(network: Any) -> None:
+    """Of links that are nearly always silent: nobody has the values any more that a killed agent was holding."""
+    held = {"loss": 0.5, "burst": 1e6, "on_loss": "hold"}
+    file = network.file(noise={"process": 1.0, **held}, run={"duration": 10_000, "start": "zero", "processes": 2})
+    run = network.record(file, "--restarts", "2")
+    network.wait_for(lambda: network.recorded_bytes() > 5_000_000, 120, "more steps than are kept")
+    next(one for one in network.processes("agent") if one.agent == 3).kill()
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert "Traceback" not in stderr
+    words = r"failed: agents_3_to_5: .*agent_\d: cannot come back at step \d+: it held a value of step \d+, and agents "
+    assert re.search(words + r"keep \d+ states: lower noise\.delay, noise\.burst", stderr), stderr
 
 
 def test_any_of_them_with_kills(network: Any, repetition: int, rng: random.Random) -> None:

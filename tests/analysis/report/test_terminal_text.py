@@ -10,6 +10,7 @@ from rich.console import Console
 
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.protocol_binding import ProtocolInfo
+from msg_analysis.report.documents.explanation import explain
 from msg_analysis.report.documents.info import describe_experiment
 from msg_analysis.report.terminal import bag_text, comparison_text, experiment_text, theory_text
 from msg_analysis.theory.graph_indices import algebraic_connectivity
@@ -279,3 +280,30 @@ def test_real_time() -> None:
     assert "not decided" in output
     assert "the reasons" in output
     assert "Timing" not in shown(comparison_text.print_comparison, comparison("agrees", 3, 2.0))
+
+
+def test_losses_by_link() -> None:
+    loss = {"default": 0.2, "edges": [[2, 3, 0.6]], "arcs": [[1, 2, 0.05]]}
+    document = describe_experiment(ValidExperiment.parse(DOCUMENT | {"noise": {"loss": loss, "burst": 5}}))
+    output = " ".join(shown(experiment_text.print_experiment, document).split())
+    assert "loss 0.2 (2-3: 0.6, 1>2: 0.05), on_loss own, burst 5.0, delay 0" in output
+
+
+@pytest.mark.parametrize(
+    ("noise", "words"),
+    [
+        ({"loss": 0.3}, "; 30 % of the messages are lost."),
+        ({"loss": 0.3, "burst": 4}, "; 30 % of the messages are lost, on average 4 of a link in a row."),
+        (
+            {"loss": {"default": 0.1, "edges": [[1, 2, 0.5]]}, "on_loss": "hold"},
+            "; 10 % of the messages are lost, and 50 % of those of 1 link, and the last value that was heard takes the "
+            "place of a lost one.",
+        ),
+        (
+            {"loss": {"arcs": [[1, 2, 0.5], [2, 3, 0.25]]}, "delay": 2},
+            "; 0 % of the messages are lost, and 25 to 50 % of those of 2 links; received values are 2 steps old.",
+        ),
+    ],
+)
+def test_what_happens_to_messages_explained(noise: dict[str, Any], words: str) -> None:
+    assert any(sentence.endswith(words) for sentence in explain(ValidExperiment.parse(DOCUMENT | {"noise": noise})))

@@ -113,12 +113,9 @@ def _noise(experiment: ValidExperiment) -> str:
 def _losses(experiment: ValidExperiment) -> str:
     noise, loss = experiment.noise, experiment.noise.loss
     text = f"{100 * loss.default:.3g} % of the messages are lost"
-    listed_links = [*(f"{i} to {j}" for i, j, _ in loss.arcs), *(f"{i} and {j}" for i, j, _ in loss.edges)]
-    if listed_links:
-        largest, least = max(p for *_, p in (*loss.arcs, *loss.edges)), min(p for *_, p in (*loss.arcs, *loss.edges))
-        some = "1 link" if len(listed_links) == 1 else f"{len(listed_links)} links"
-        span = f"{100 * least:.3g}" if least == largest else f"{100 * least:.3g} to {100 * largest:.3g}"
-        text += f", and {span} % of those of {some}"
+    if special := [probability for *_, probability in (*loss.arcs, *loss.edges)]:
+        span = " to ".join(sorted({f"{100 * p:.3g}" for p in (min(special), max(special))}, key=float))
+        text += f", and {span} % of those of {len(special)} link{'s' if len(special) > 1 else ''}"
     if noise.burst is not None:
         text += f", on average {noise.burst:.3g} of a link in a row"
     return text + (", and the last value that was heard takes the place of a lost one" if noise.holds else "")

@@ -42,7 +42,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
         text = f"{named}, gain {leaders['gain']}, reference {leaders['reference']}"
         facts.add_row("leaders", Text(text))
     add_protocol(facts, document.get("protocol"))
-    facts.add_row("noise", ", ".join(f"{key} {_short(value)}" for key, value in document["noise"].items()))
+    facts.add_row("noise", Text(_noise(document["noise"], names)))
     facts.add_row("steps", f"{run['steps']} of {number_text(run['dt'])}, {number_text(run['duration'])} units of time")
     facts.add_row("stability limit of dt", number_text(document["stability_limit"]))
     facts.add_row("replicas", str(run["replicas"]))
@@ -100,6 +100,18 @@ def _short(value: Any) -> str:
             return f"matrix {len(value)} x {len(value[0])}"
         return f"[{listed(value)}]"
     return str(value)
+
+
+def _noise(noise: dict[str, Any], names: Sequence[str] | None) -> str:
+    """Every key with its value; what belongs to losses only where there are some."""
+    shown = {key: _short(value) for key, value in noise.items() if noise["loss"] or key not in ("on_loss", "burst")}
+    if isinstance(noise["loss"], dict):
+        links = [
+            (i, sign, j, p) for key, sign in (("edges", "-"), ("arcs", ">")) for i, j, p in noise["loss"].get(key, [])
+        ]
+        special = [f"{agent_name(i, names)}{sign}{agent_name(j, names)}: {p:g}" for i, sign, j, p in links]
+        shown["loss"] = f"{noise['loss']['default']:g} ({listed(special)})"
+    return ", ".join(f"{key} {value}" for key, value in shown.items())
 
 
 def _links(graph: dict[str, Any], names: Sequence[str] | None) -> str:

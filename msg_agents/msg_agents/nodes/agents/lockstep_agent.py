@@ -51,7 +51,7 @@ class LockstepAgent(Agent):
     def _require_kept_values(self, air: AgentAir) -> None:
         """InputError if the agent comes back, and its peers have no longer a value that it was holding."""
         step, kept = self._law.step, self._published.capacity - 2 * LOCKSTEP_WINDOW  # they may be behind, or ahead
-        oldest = air.oldest_needed(step, self._peers)
+        oldest = min((air.needed(j, step) for row in self._inputs for j in row), default=step)
         if self.resumed and oldest < step - kept:
             raise InputError(
                 f"{self.get_name()}: cannot come back at step {step}: it held a value of step {oldest}, and agents "
