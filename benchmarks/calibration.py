@@ -133,6 +133,22 @@ SHORT: dict[str, Mapping[str, Any]] = {
     for name, law in short(duration).items()
 }
 
+NOISY = {"process": 1.0, "broadcast": 0.2, "link": 0.3, "loss": 0.3}
+
+
+def messages(noise: Mapping[str, Any], pace: str) -> dict[str, Any]:
+    """Example 1 of the paper, with messages that are noisy and lost."""
+    law = line_ring(duration=100.0) | {"name": "messages", "noise": noise}
+    return law | {"run": law["run"] | {"pace": pace}}
+
+
+MESSAGES: dict[str, Mapping[str, Any]] = {
+    "real time, own value in place of a lost one": messages(NOISY, "realtime"),
+    "real time, last value held": messages(NOISY | {"on_loss": "hold"}, "realtime"),
+    "lockstep, last value held": messages(NOISY | {"on_loss": "hold"}, "lockstep"),
+    "lockstep, two links, bursts of 5": messages(NOISY | {"loss": {"edges": [[1, 2, 0.3]]}, "burst": 5}, "lockstep"),
+}
+
 LONG: dict[str, Any] = {"duration": 1000.0, "replicas": 16}
 
 
@@ -167,8 +183,8 @@ FALSE: dict[str, tuple[Mapping[str, Any], tuple[str, int | None, list[int] | Non
 @functools.cache
 def experiment(case: str) -> tuple[ValidExperiment, ValidExperiment]:
     """What is run, and what the record claims."""
-    if case in TRUE or case in SHORT:
-        true = ValidExperiment.parse((TRUE | SHORT)[case])
+    if case in TRUE or case in SHORT or case in MESSAGES:
+        true = ValidExperiment.parse((TRUE | SHORT | MESSAGES)[case])
         return true, true
     return ValidExperiment.parse(FALSE[case][0]), ValidExperiment.parse(line_ring(**LONG))
 
@@ -177,7 +193,7 @@ def one_run(job: tuple[str, int], _stopping: Callable[[], bool]) -> dict[str, An
     """Simulate and compare a run; what is kept of it."""
     case, number = job
     # Runs of different experiments with equal seeds would have the same noise.
-    seed = 100_000 * [*TRUE, *FALSE, *SHORT].index(case) + number
+    seed = 100_000 * [*TRUE, *FALSE, *SHORT, *MESSAGES].index(case) + number
     true, claimed = (each.with_run(seed=seed) for each in experiment(case))
     record = new_record(claimed)
     trajectory = simulate(true, record=RunRecord(record.run, true, record.start))
@@ -196,13 +212,13 @@ def summary(case: str, comparison: Comparison) -> dict[str, Any]:
     )
     assert predicted is not None
     assert batch is not None
-    assert given is not None
     kept: dict[str, Any] = {
         "system": covers(comparison.system_error),
         "nodes": [covers(node) for node in comparison.node_errors],
-        "given": covers(given.system_error),
-        "given_nodes": [covers(node) for node in given.node_errors],
-        "ratio": given.variance_ratio,
+        # In real time the errors themselves are those given the log.
+        "given": covers(given.system_error if given else comparison.system_error),
+        "given_nodes": [covers(node) for node in (given.node_errors if given else comparison.node_errors)],
+        "ratio": given.variance_ratio if given else None,
         "batch": batch[0] <= predicted <= batch[1],
         "disagrees": comparison.verdict == "disagrees",
         "order": order is not None and any(pair.predicted is False for pair in order.distinctions),
@@ -297,17 +313,7 @@ def tables(results: Mapping[str, list[dict[str, Any]]]) -> str:
     for case in SHORT:
         keys = ("given", "given_nodes", "system", "nodes", "disagrees")
         lines.append(f"| {case} | {' | '.join(percent(part(results[case], key)) for key in keys)} |")
-    lines += ["", "| false alarms, test by test: share of p below 5 % (below 1 %) | |", "|---|---|"]
-    for case in TRUE:
-        values: dict[str, list[float]] = {}
-        for one in results[case]:
-            for name, p in one["p"].items():
-                values.setdefault(name.partition(" of agent")[0], []).append(p)
-        shown = ", ".join(
-            f"{name} {100 * np.mean(np.array(p) < 0.05):.1f} ({100 * np.mean(np.array(p) < 0.01):.1f})"
-            for name, p in values.items()
-        )
-        lines.append(f"| {case} | {shown} |")
+    lines += test_by_test(results, TRUE)
     lines += [
         "",
         "| what is wrong, 1000 units, 16 replicas | runs | found | blamed first | rejected by (share of the runs) |",
@@ -324,13 +330,41 @@ def tables(results: Mapping[str, list[dict[str, Any]]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def test_by_test(results: Mapping[str, list[dict[str, Any]]], cases: Mapping[str, Any]) -> list[str]:
+    """Lines of the table of p-values."""
+    lines = ["", "| false alarms, test by test: share of p below 5 % (below 1 %) | |", "|---|---|"]
+    for case in cases:
+        values: dict[str, list[float]] = {}
+        for one in results[case]:
+            for name, p in one["p"].items():
+                values.setdefault(name.partition(" of agent")[0], []).append(p)
+        shown = ", ".join(
+            f"{name} {100 * np.mean(np.array(p) < 0.05):.1f} ({100 * np.mean(np.array(p) < 0.01):.1f})"
+            for name, p in values.items()
+        )
+        lines.append(f"| {case} | {shown} |")
+    return lines
+
+
+def message_tables(results: Mapping[str, list[dict[str, Any]]]) -> str:
+    """Those of runs with noise and losses, as Markdown."""
+    count = min(len(results[case]) for case in MESSAGES)
+    lines = [f"| {count} runs each | system error | node errors | false alarms |", "|---|---:|---:|---:|"]
+    for case in MESSAGES:
+        keys = ("given", "given_nodes", "disagrees")
+        lines.append(f"| {case} | {' | '.join(percent(part(results[case], key)) for key in keys)} |")
+    return "\n".join(lines + test_by_test(results, MESSAGES)) + "\n"
+
+
 def complaints(results: Mapping[str, list[dict[str, Any]]]) -> list[str]:
     """What is not as it must be: coverage 93.5 to 96.5 %, false alarms at most 1.9 %, 80 % of the blame right.
+
+    With noise and losses, of which there are fewer runs: coverage 93 to 97 %, false alarms 0.3 to 2 %.
 
     The errors over all paths cover too much in short runs, and false alarms are rarer where hardly anything is tested.
     """
     found = []
-    for case in TRUE | SHORT:
+    for case in (TRUE | SHORT).keys() & results.keys():
         kept = results[case]
         for key in ("system", "nodes", "given", "given_nodes"):
             covered = part(kept, key)
@@ -341,7 +375,16 @@ def complaints(results: Mapping[str, list[dict[str, Any]]]) -> list[str]:
         if not (0.003 if case in TRUE else 0.0) <= alarms / len(kept) <= 0.019:
             chance = stats.binom.sf(alarms - 1, len(kept), 0.01) if alarms else stats.binom.cdf(0, len(kept), 0.01)
             found.append(f"{case}: {100 * alarms / len(kept):.1f} % false alarms (p {chance:.2g} at 1 %)")
-    for case in FALSE:
+    for case in MESSAGES.keys() & results.keys():
+        kept = results[case]
+        for key in ("given", "given_nodes"):
+            covered = part(kept, key)
+            if covered is None or not 0.93 <= covered <= 0.97:
+                found.append(f"{case}: {key}: {percent(covered)} covered")
+        alarms = sum(one["disagrees"] for one in kept)
+        if not 0.003 <= alarms / len(kept) <= 0.02:
+            found.append(f"{case}: {100 * alarms / len(kept):.1f} % false alarms")
+    for case in FALSE.keys() & results.keys():
         rejected = [one for one in results[case] if one["disagrees"]]
         if rejected and np.mean([one["right"] for one in rejected]) < 0.8:
             found.append(f"{case}: blame right in {100 * np.mean([one['right'] for one in rejected]):.0f} %")
@@ -362,15 +405,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Coverage, false alarms, power and blame of the comparison.")
     parser.add_argument("--runs", type=int, default=1000, help="of each law that is right; 1000 by default")
     parser.add_argument("--wrong-runs", type=int, default=100, help="of each law that is wrong; 100 by default")
+    parser.add_argument("--messages", type=int, help="so many runs with noise and losses, and nothing else")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--write", action="store_true", help=f"write the tables into {PAGE.relative_to(ROOT)}")
     arguments = parser.parse_args()
     runs = dict.fromkeys(TRUE | SHORT, arguments.runs) | dict.fromkeys(FALSE, arguments.wrong_runs)
+    if arguments.messages:
+        runs = dict.fromkeys(MESSAGES, arguments.messages)
     store = ROOT / "build/calibration" / version() / "runs.jsonl"
     results = run_all(runs, store, arguments.processes)
-    text = tables(results)
+    text = message_tables(results) if arguments.messages else tables(results)
     print(text)
-    if arguments.write:
+    if arguments.write and not arguments.messages:
         write(text, PAGE)
     found = complaints(results)
     print("\n".join(found), file=sys.stderr)

@@ -280,7 +280,7 @@ def _switching(accused: Accused, families: int, level: float) -> list[Cause]:
 def _loss_words(one: Selected, tally: LossTally) -> Cause:
     part, what = one.part, one.what
     receiver, sender = tally.pairs.T
-    chosen: Any = slice(None)
+    chosen = np.ones(len(receiver), dtype=np.bool_)
     agent, link, whose = None, None, "all messages"
     if part == "link":
         chosen = (sender == what[0]) & (receiver == what[1])
@@ -298,6 +298,9 @@ def _loss_words(one: Selected, tally: LossTally) -> Cause:
         f"{percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %) of {whose} are lost, "
         f"not {percent(expected)}"
     )
+    again = tally.after_losses(chosen)
+    if again:
+        words += f"; after a lost one, {percent(again[0])} are, not {percent(again[1])}"
     return Cause("loss", words, agent, link, None, share, interval, expected, math.exp(one.log_p))
 
 

@@ -165,18 +165,18 @@ def variances(squares: FloatArray, samples: int) -> Suspects:
 
 def losses(tally: LossTally) -> Suspects:
     """Log-odds of losing a message, link by link."""
-    pairs, messages, probability = tally.pairs, tally.messages, tally.probability
+    pairs = tally.pairs
+    score, information = tally.score()
+    # Other links say nothing; one that should lose nothing, but does, is all but impossible.
+    usable = (tally.probability > 0.0) | (tally.lost > 0)
+    information = np.where(usable & (information == 0.0), 1e-9 * tally.messages, information)
     identity = np.eye(len(pairs))
     classes = [
-        [Candidate("link", (int(j), int(i)), identity[a]) for a, (i, j) in enumerate(pairs)],
-        [Candidate("receiver", int(i), (pairs[:, 0] == i) * 1.0) for i in np.unique(pairs[:, 0])],
-        [Candidate("sender", int(j), (pairs[:, 1] == j) * 1.0) for j in np.unique(pairs[:, 1])],
-        [Candidate("all", None, np.ones(len(pairs)))],
+        [Candidate("link", (int(j), int(i)), identity[a]) for a, (i, j) in enumerate(pairs) if usable[a]],
+        [Candidate("receiver", int(i), (pairs[:, 0] == i) * usable.astype(float)) for i in np.unique(pairs[usable, 0])],
+        [Candidate("sender", int(j), (pairs[:, 1] == j) * usable.astype(float)) for j in np.unique(pairs[usable, 1])],
+        [Candidate("all", None, usable.astype(float))],
     ]
-    information = messages * probability * (1.0 - probability) / tally.inflation
-    score = (tally.lost - probability * messages) / tally.inflation
-    # A link that should lose nothing is impossible, not improbable: a chance of 1e-9 makes it nearly so.
-    information += np.where(probability == 0.0, 1e-9 * messages, 0.0)
     return Suspects(np.asarray(score), np.diag(information), classes)
 
 

@@ -110,6 +110,27 @@ class LossTally:
         self._successive += other._successive
         self._same_step += other._same_step
 
+    def score(self) -> tuple[FloatArray, FloatArray]:
+        """(links,) each: losses beyond the expected ones, and their information, of what says most about the chance.
+
+        In bursts, whose mean length is given, that are the messages after one that was not lost.
+        """
+        if self._bursts:
+            chance, tried, failed = self._chances[1], self._tried[1], self._failed[1]
+        else:
+            chance, tried, failed = self.probability, self.messages, self.lost
+        excess, variance = failed - chance * tried, tried * chance * (1.0 - chance)
+        # Where messages are counted several times, each counts for less.
+        return (excess, variance) if self._bursts else (excess / self.inflation, variance / self.inflation)
+
+    def after_losses(self, chosen: BoolArray) -> tuple[float, float] | None:
+        """Share of the messages after a lost one that were lost, too, and its expectation; None without bursts."""
+        tried = int(self._tried[0][chosen].sum())
+        if not self._bursts or not tried:
+            return None
+        failed, expected = self._failed[0][chosen].sum(), self._chances[0][chosen] @ self._tried[0][chosen]
+        return float(failed / tried), float(expected / tried)
+
     @property
     def inflation(self) -> FloatArray:
         """(links,): variance of the number of losses over that of independent ones."""

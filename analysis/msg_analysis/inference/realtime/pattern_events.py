@@ -149,7 +149,7 @@ class Periods:
         return self._step.agents + int(self._extra_ends[number + 1] - self._extra_ends[number])
 
     def start(self, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(S, S) each, of the stack at the start: second moment without noise, from that of the states (m, m); noise."""
+        """(S, S) each, of the stack at the start: without noise, from that of the states (m, m); of noise."""
         m = self._step.agents
         entries = np.concatenate([np.arange(m), self._extra[: self._extra_ends[1], 0]])
         owners = self._owners[entries]

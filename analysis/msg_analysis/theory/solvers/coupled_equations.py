@@ -81,6 +81,8 @@ class CoupledEquations:
         # Whether the preconditioner is A^-1.
         self.direct = system.modes == 1 and not system.lossy
         self.symmetric = np.array_equal(self.drift, self.drift.transpose(0, 2, 1))
+        # With messages one by one, matrices are large and often defective, and solves only precondition.
+        self._nearly = system.losses is not None
         self._levels = self._averages() if system.modes > 1 else []
         self.whole = self._levels[-1].solves if self._levels else self.modes
         if self.whole.amplification > MAX_AMPLIFICATION:
@@ -100,7 +102,7 @@ class CoupledEquations:
     def modes(self) -> LocalSolves:
         """The solves of single graphs."""
         if self._forward is None:
-            return LocalSolves(self.system.time, self.drift, self.leaving)
+            return LocalSolves(self.system.time, self.drift, self.leaving, nearly=self._nearly)
         return self._forward.modes if self.symmetric else self._forward.modes.transposed()
 
     @cached_property
@@ -181,7 +183,7 @@ class CoupledEquations:
                 drift = 0.5 * (drift + drift.transpose(0, 2, 1))  # to the last bit
             pairs = zip(average, groups, strict=True)
             leaving = np.array([law[g] @ self.rates[np.ix_(g, ~g)].sum(axis=1) for law, g in pairs])
-            levels.append(Level(average, members, LocalSolves(self.system.time, drift, leaving)))
+            levels.append(Level(average, members, LocalSolves(self.system.time, drift, leaving, nearly=self._nearly)))
         return levels
 
     def _local(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -31,6 +31,8 @@ from msg_analysis.types import AnyArray, ComplexArray, FloatArray
 
 # Largest condition of eigenvectors that are used: a solve has errors of its square times 1e-16, before refinement.
 MAX_CONDITION = 1e4
+MAX_CONDITION_NEARLY = 1e6  # the same where a solve need not be exact
+APART = 1e-6  # relative size of changes of the diagonal that keep eigenvectors apart
 MILD = 1e-4  # slowest decay, relative to the fastest, for which single precision suffices in a preconditioner
 EIGENVALUE_ROUNDING = 8.0 * float(np.finfo(float).eps)  # eigenvalues below this * dimension * largest one are 0
 
@@ -51,15 +53,24 @@ class LocalSolves:
 
     D: ``drift`` (k, d, d), treated as symmetric only if symmetric to the last bit; a: ``leaving`` (k,). Eigenvalues
     that are zero but for rounding (in a disconnected graph) count as zero: such directions are left at the rate a only,
-    however slow that is.
+    however slow that is. ``nearly``: a solve that is right to about ``APART`` will do, where that is much faster.
     """
 
     def __init__(
-        self, time: Time, drift: FloatArray, leaving: FloatArray, eigenvectors: Eigenvectors | None = None
+        self,
+        time: Time,
+        drift: FloatArray,
+        leaving: FloatArray,
+        eigenvectors: Eigenvectors | None = None,
+        *,
+        nearly: bool = False,
     ) -> None:
+        self._nearly = nearly
         self.time, self.drift, self.leaving = time, drift, leaving
         self.symmetric = np.array_equal(drift, drift.transpose(0, 2, 1))
         self.eigenvectors = eigenvectors or _eigenvectors(drift, symmetric=self.symmetric)
+        if self.eigenvectors is None and nearly:
+            self.eigenvectors = _eigenvectors(_separated(drift), symmetric=False, most=MAX_CONDITION_NEARLY)
         if self.eigenvectors is None:
             forms = [scipy.linalg.schur(d, output="complex") for d in drift]
             self._schur = np.stack([t for t, _ in forms]), np.stack([u for _, u in forms])
@@ -84,10 +95,10 @@ class LocalSolves:
     def transposed(self) -> LocalSolves:
         """The same for D^T."""
         if self.eigenvectors is None:
-            return LocalSolves(self.time, self.drift.transpose(0, 2, 1).copy(), self.leaving)
+            return LocalSolves(self.time, self.drift.transpose(0, 2, 1).copy(), self.leaving, nearly=self._nearly)
         values, vectors, inverse = self.eigenvectors
         swapped = Eigenvectors(values, inverse.transpose(0, 2, 1), vectors.transpose(0, 2, 1))
-        return LocalSolves(self.time, self.drift.transpose(0, 2, 1), self.leaving, swapped)
+        return LocalSolves(self.time, self.drift.transpose(0, 2, 1), self.leaving, swapped, nearly=self._nearly)
 
     def single(self) -> LocalSolves:
         """The same in single precision."""
@@ -153,7 +164,14 @@ class LocalSolves:
         return np.asarray(matrices - (left @ (right @ matrices)).real)
 
 
-def _eigenvectors(drift: FloatArray, *, symmetric: bool) -> Eigenvectors | None:
+def _separated(drift: FloatArray) -> FloatArray:
+    """The matrices with slightly different diagonals, so that hardly any has defective eigenvectors."""
+    size = np.abs(drift).max(axis=(1, 2), initial=0.0)
+    apart = APART * np.random.default_rng(0).uniform(-1.0, 1.0, drift.shape[1])
+    return np.asarray(drift + size[:, None, None] * np.diag(apart))
+
+
+def _eigenvectors(drift: FloatArray, *, symmetric: bool, most: float = MAX_CONDITION) -> Eigenvectors | None:
     """Well-conditioned ones, or None."""
     if symmetric:
         values, vectors = np.linalg.eigh(drift)
@@ -165,7 +183,7 @@ def _eigenvectors(drift: FloatArray, *, symmetric: bool) -> Eigenvectors | None:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
         condition = np.linalg.norm(vectors, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2))
-    if not (condition <= MAX_CONDITION * np.sqrt(drift.shape[1])).all():
+    if not (condition <= most * np.sqrt(drift.shape[1])).all():
         return None
     return Eigenvectors(values, vectors, inverse)
 
