@@ -180,7 +180,11 @@ def solve_transient(
         whole = unreduced_consensus(experiment)
     else:
         whole = systems.emulated(build_run_model(experiment), "tracking")
-    start = start_of(experiment, whole, system.lift @ steady @ system.lift.T)
+    stationary = system.lift @ steady @ system.lift.T
+    if system.messages is not None:  # the agents' mean is 0 at the start, not that of all numbers
+        place = whole.reduced(np.eye(experiment.agents)).T
+        stationary = place @ system.lifted(steady) @ place.T
+    start = start_of(experiment, whole, stationary)
     return SolvedTransient(transient(whole, start, _steps(times, unit)), system, steady, unit)
 
 

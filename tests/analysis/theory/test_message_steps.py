@@ -20,10 +20,12 @@ from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.step.phases import phases
 from msg_analysis.model.step.step_model import build_step_model
 from msg_analysis.theory.decay_rates import asymptotic_rates
+from msg_analysis.theory.leaders.selection import select_leaders, system_error
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict, stationary_start_factor
 from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.transient import solve_transient
+from msg_analysis.theory.two_topology import two_topology
 
 GRAPHS = {"a": {"arcs": [[1, 2], [2, 3, 0.7], [3, 1]]}, "b": {"edges": [[1, 2, 0.5]]}}
 PAIR = {"a": {"edges": [[1, 2]]}, "b": {"arcs": [[1, 2, 0.5]]}}
@@ -355,3 +357,49 @@ def test_too_many_values_or_channels_are_refused():
         predict(many)
     with pytest.raises(InputError, match=r"noise.burst: 2 graphs and 10 links .* 2\^10 states"):
         predict(line_ring(loss=0.1, burst=3))
+
+
+@pytest.mark.parametrize("case", ["held, by link, noisy", "real time, own", "real time, held", "held, bursts"])
+def test_unreduced_moments_have_the_same_disagreement(case):
+    experiment = parse(case)
+    times = np.arange(5) * experiment.step_length
+    whole = solve_transient(experiment, times, unreduced=True).course.mode_second_moments.sum(axis=1)
+    centre = np.eye(3) - 1 / 3
+    found = np.diagonal(centre @ whole @ centre, axis1=1, axis2=2)
+    np.testing.assert_allclose(found, solve_transient(experiment, times).course.node_errors, rtol=1e-9)
+
+
+@pytest.mark.parametrize("case", ["held, by link, noisy", "real time, own", "real time, held"])
+def test_closed_form_for_two_graphs(case):
+    """With losses that are kept from step to step, too; each graph must have an error of its own."""
+    graphs, noise, more = CASES[case]
+    pace = more.get("pace", "lockstep")
+    document = {
+        "name": "two",
+        "graphs": {"a": {"arcs": [[1, 2], [2, 3, 0.7], [3, 1]]}, "b": {"path": [1, 2, 3]}},
+        "switching": {"generator": [[-2.0, 2.0], [3.0, -3.0]]},
+        "noise": noise,
+        "run": {"dt": 0.3, "duration": 6, "pace": pace},
+    }
+    prediction = predict(ValidExperiment.parse(document))
+    assert graphs is GRAPHS
+    found = two_topology(prediction.system)
+    np.testing.assert_allclose(found.node_errors, prediction.emulated.node_errors, rtol=1e-9)
+
+
+@pytest.mark.parametrize("case", ["held, by link, noisy", "real time, own", "real time, held"])
+@pytest.mark.parametrize("gain", [0.8, math.inf])
+def test_leaders(case, gain):
+    """The value of a set is the prediction with these leaders; the oracle's for one of them."""
+    graphs, noise, more = CASES[case]
+    run = {"dt": 0.3, "duration": 6, "pace": more.get("pace", "lockstep"), "seed": 3}
+    document = {"name": "led", "graphs": graphs, "switching": {"generator": [[-2.0, 2.0], [3.0, -3.0]]}}
+    document |= {"noise": noise, "run": run}
+    consensus = ValidExperiment.parse(document)
+    leaders = {"problem": "tracking", "leaders": {"agents": [3], "gain": gain}}
+    tracking = ValidExperiment.parse(document | leaders)
+    found = system_error(consensus, [2], gain=gain)
+    assert found == pytest.approx(predict(tracking).emulated.system_error, rel=1e-10)
+    brute = Brute(case, tracking)
+    assert found == pytest.approx(brute.course([0.0] * 3, 400)[-1].sum(), rel=1e-9)
+    assert select_leaders(consensus, 1, gain=gain).sets[0][0] <= found
