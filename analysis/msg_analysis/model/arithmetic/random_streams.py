@@ -73,6 +73,16 @@ def link_number(receiver: int, sender: int) -> int:
 
 def normals(seed: int, stream: Stream, agent: int, block: int, shape: tuple[int, ...]) -> FloatArray:
     """Standard normal numbers of one block, of the given shape; other arguments as of ``generator``."""
+    return _reused_generator(seed, stream, agent, block).standard_normal(shape)
+
+
+def uniforms(seed: int, stream: Stream, agent: int, block: int, count: int) -> FloatArray:
+    """(count,) numbers of one block, uniform from 0 to 1; other arguments as of ``generator``."""
+    return _reused_generator(seed, stream, agent, block).random(count)
+
+
+def _reused_generator(seed: int, stream: Stream, agent: int, block: int) -> np.random.Generator:
+    """As ``generator``, valid until the next call in this thread."""
     own = _reused.generator
     own.bit_generator.state = {
         "bit_generator": "Philox",
@@ -82,7 +92,7 @@ def normals(seed: int, stream: Stream, agent: int, block: int, shape: tuple[int,
         "has_uint32": 0,
         "uinteger": 0,
     }
-    return own.standard_normal(shape)
+    return own
 
 
 class _Reused(threading.local):

@@ -79,23 +79,27 @@ class AgentAir:
     ) -> tuple[list[bytes | None], tuple[int, ...]]:
         """What is received of these senders in a step, None where the own value is used; and ``AgentLaw.heard``.
 
-        ``heard`` and ``steps`` as in ``AgentLaw.advance``.
+        ``heard`` and ``steps`` as in ``AgentLaw.advance``. Hot path.
         """
-        used = [self.source(j, step) for j in senders] if steps is None else steps
-        values = [
-            None if source == NOTHING else self._received(j, source, value)
-            for j, source, value in zip(senders, used, heard, strict=True)
-        ]
-        newest = max(0, step - self.delay)
-        if steps is not None or all(source == newest for source in used):
-            return values, ()
-        return values, tuple(LOST if source == NOTHING else source for source in used)
+        logged: tuple[int, ...] = ()
+        if steps is None:
+            newest = max(0, step - self.delay)
+            block, within = divmod(newest, STEPS_PER_BLOCK)
+            steps = [self._sources(sender, block)[within] for sender in senders]
+            if steps != [newest] * len(steps):
+                logged = tuple([LOST if source == NOTHING else source for source in steps])
+        values: list[bytes | None] = [*heard]
+        for d, source in enumerate(steps):
+            if source == NOTHING:
+                values[d] = None
+            elif self.link:
+                values[d] = self._received(senders[d], source, heard[d])
+        return values, logged
 
     def _received(self, sender: int, step: int, value: bytes) -> bytes:
         """A published value, a payload, with the noise of the link."""
-        if not self.link:
-            return value
-        return to_payload(from_payload(value) + self._noise(sender, step // STEPS_PER_BLOCK)[step % STEPS_PER_BLOCK])
+        block, within = divmod(step, STEPS_PER_BLOCK)
+        return to_payload(from_payload(value) + self._noise(sender, block)[within])
 
     def published(self, step: int, value: FloatArray) -> bytes:
         """The payload that is published of a value (replicas,)."""

@@ -97,8 +97,12 @@ class AirReception:
 
 def _of_steps(block: Callable[[int], Array], steps: IntArray) -> Array:
     """Entries of these steps, ascending, of what a function gives for every block of steps."""
-    numbers = steps // STEPS_PER_BLOCK
-    parts = [block(int(number))[steps[numbers == number] % STEPS_PER_BLOCK] for number in np.unique(numbers)]
+    numbers = range(int(steps[0]) // STEPS_PER_BLOCK, int(steps[-1]) // STEPS_PER_BLOCK + 1)
+    ends = np.searchsorted(steps, [number * STEPS_PER_BLOCK for number in (*numbers, numbers.stop)]).tolist()
+    parts = [
+        block(number)[steps[first:last] - number * STEPS_PER_BLOCK]
+        for number, first, last in zip(numbers, ends, ends[1:], strict=False)
+    ]
     return np.concatenate(parts)  # type: ignore[return-value]
 
 
@@ -118,15 +122,14 @@ def sources(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> tupl
     air, lead, tables = Air(experiment), ahead(experiment), neighbour_tables(model)
     used = np.full((len(modes), *tables.senders.shape[1:]), NOTHING, dtype=np.int64)
     lost = np.zeros(used.shape, dtype=np.bool_)
+    steps_of = [np.flatnonzero(modes == mode) for mode in range(model.modes)]
     for i, j in np.argwhere(model.listens()).tolist():
         steps = np.maximum(0, np.arange(len(modes)) + lead[i, j] - air.delay)
         found = _of_steps(partial(air.sources, i, j), steps) if air.loss else steps
-        for mode in range(model.modes):
-            place = np.flatnonzero(tables.senders[mode, i, : tables.count[mode, i]] == j)
-            if len(place):
-                at = modes == mode
-                used[at, i, place[0]] = found[at]
-                lost[at, i, place[0]] = found[at] != steps[at]
+        for mode, at in enumerate(steps_of):
+            for place in np.flatnonzero(tables.senders[mode, i, : tables.count[mode, i]] == j).tolist():
+                used[at, i, place] = found[at]
+                lost[at, i, place] = found[at] != steps[at]
     return used, lost
 
 

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, generator, link_number
+from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, link_number, uniforms
 from msg_analysis.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -72,8 +72,8 @@ class Losses:
 
     def _drawn(self, link: tuple[int, int], number: int) -> tuple[BoolArray, BoolArray]:
         """Of every message of a block, whether its number alone makes it lost, and whether it decides alone."""
-        drawn = generator(self._seed, Stream.LOSS, link_number(*link), number).random(STEPS_PER_BLOCK)
-        lost = drawn < self._low[link]
+        drawn = uniforms(self._seed, Stream.LOSS, link_number(*link), number, STEPS_PER_BLOCK)
+        lost: BoolArray = drawn < self._low[link]
         return lost, lost | (drawn >= self._high[link])
 
     def _end(self, link: tuple[int, int], number: int) -> bool:
