@@ -46,6 +46,7 @@ def make_bags(directory: Path) -> list[Path]:
     kinds: dict[str, dict[str, Any]] = {
         "plain": plain | {"run": run},
         "air": plain | {"run": run, "noise": {"broadcast": 0.1, "loss": 0.2}},
+        "held": plain | {"run": run, "noise": {"loss": 0.4, "on_loss": "hold", "delay": 2}},
         "realtime": plain | {"run": run | {"pace": "realtime"}},
     }
     bags = []

@@ -38,7 +38,7 @@ from msg_analysis.wire.schemas import AGENT_STATE, STRING
 
 STEPS, AGENTS, WIDTH, LOST = 5, 3, 2, 2**64 - 1
 NEIGHBOURS = ([0, 0, 0], [1, 2, 1], [2, 1, 1])  # how many: no graph, line, star
-KINDS = ("plain", "loss", "realtime")
+KINDS = ("plain", "loss", "realtime", "late", "hold")
 thorough = settings(
     max_examples=60,
     deadline=None,
@@ -54,8 +54,8 @@ def _record(kind: str) -> RunRecord:
         "switching": {"generator": [[-5, 5], [5, -5]]},
         "run": {"dt": 0.05, "duration": STEPS * 0.05, "replicas": WIDTH, "start": "zero"},
     }
-    if kind == "loss":
-        document["noise"] = {"loss": 0.3}
+    if kind in ("loss", "late", "hold"):
+        document["noise"] = {"loss": 0.3, "delay": int(kind == "late"), "on_loss": "hold" if kind == "hold" else "own"}
     if kind == "realtime":
         document["run"]["pace"] = "realtime"
     return RunRecord(uuid.UUID(int=7), ValidExperiment.parse(document), np.zeros((AGENTS, WIDTH)))
@@ -73,7 +73,7 @@ def _states(draw: st.DrawFn) -> AgentState:
 
     agent, step = mostly(st.integers(1, 3), st.integers(0, 5)), mostly(st.integers(0, STEPS), st.just(2**64 - 1))
     mode = mostly(st.integers(1, 2) if step else st.just(0), st.integers(0, 3))
-    near = st.sampled_from([(step - 1) % 2**64, LOST])
+    near = st.sampled_from([*[(step - 1) % 2**64, LOST] * 2, max(0, step - 2)])
     length = NEIGHBOURS[min(mode, 2)][min(max(agent, 1), 3) - 1]
     heard = mostly(st.lists(near, min_size=length, max_size=length), st.lists(st.integers(0, LOST), max_size=4))
     state = mostly(
@@ -105,8 +105,9 @@ def _rules(messages: list[Any], kind: str) -> dict[str, Any]:
         stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         heard = [int(step) for step in message.heard]
         expected = NEIGHBOURS[message.mode][message.agent - 1] if message.mode < 3 and 1 <= message.agent <= 3 else 0
-        possible = range(STEPS + 1) if kind == "realtime" else [message.step - 1]
-        possible = [*possible, *([] if kind == "plain" else [LOST])]
+        newest = max(0, message.step - 1 - (kind == "late"))
+        possible = {"realtime": range(STEPS + 1), "hold": range(min(newest, STEPS) + 1)}.get(kind, [newest])
+        possible = [*possible, *([] if kind in ("plain", "hold") else [LOST])]
         silent = not heard and kind != "realtime"
         reasons = {
             "other run": bytes(message.run) != RECORDS[kind].run.bytes,
@@ -139,18 +140,21 @@ def _rules(messages: list[Any], kind: str) -> dict[str, Any]:
     out: dict[str, Any] = {
         "states": np.full((*shape, WIDTH), np.nan),
         "agent_modes": np.full(shape, -1),
-        "used": np.full((*shape, 2), -1) if kind == "realtime" else None,
+        "used": np.full((*shape, 2), -1) if kind in ("realtime", "late", "hold") else None,
         "made": np.full(shape, -1) if kind == "realtime" else None,
-        "lost": np.zeros((*shape, 2), bool) if kind == "loss" else None,
+        "lost": np.zeros((*shape, 2), bool) if kind in ("loss", "late", "hold") else None,
     }
     for cell, (_, message, _, heard, stamp) in taken.items():
         out["states"][cell], out["agent_modes"][cell] = message.state, message.mode - 1
         if kind == "realtime":
             out["made"][cell] = stamp
-        for k, step in enumerate(heard if kind != "plain" else []):
-            out["used" if kind == "realtime" else "lost"][(*cell, k)] = (
-                step == LOST if kind == "loss" else -1 if step == LOST else step
-            )
+        newest = max(0, cell[0] - 1 - (kind == "late"))
+        count = NEIGHBOURS[message.mode][cell[1]]
+        for k, step in enumerate((heard or [newest] * count) if kind != "plain" else []):
+            if out["used"] is not None:
+                out["used"][(*cell, k)] = -1 if step == LOST else step
+            if out["lost"] is not None:
+                out["lost"][(*cell, k)] = step != newest
     for name in ("used", "lost"):
         out[name] = None if out[name] is None else out[name][1:]
     out["late"] = sum(
