@@ -123,7 +123,9 @@ class Collected:
         self._delay, self._holds = experiment.noise.delay, experiment.noise.holds and not self._realtime
         self._lossy = experiment.noise.loss.any or self._realtime
         self._steps_used = self._realtime or self._holds  # whether the log has steps that cannot be known before
-        most = self._links.most if self._lossy else 0
+        # In lockstep, whether values of other steps than the newest are used, which the log mostly leaves out.
+        self._late = not self._realtime and bool(self._delay or self._holds)
+        most = self._links.most if self._lossy or self._late else 0
         cells = self._shape[0] * self._shape[1]
         # The result has the size that the record states, however little of it the bag holds.
         needed, available = 8 * cells * (width + _OTHER_COLUMNS + most), available_memory()
@@ -139,9 +141,9 @@ class Collected:
             self._states: FloatArray = zeros((cells, width), np.float64)
             self._position = zeros((cells,), np.int64)
             self._modes = zeros((cells,), np.int64)
-            self._used = zeros((cells, most if self._steps_used else 0), np.int64)
+            self._used = zeros((cells, most if self._realtime or self._late else 0), np.int64)
             self._made = zeros((cells if self._realtime else 0,), np.int64)
-            self._lost = zeros((cells, 0 if self._steps_used else most), np.bool_)
+            self._lost = zeros((cells, most if self._lossy and not self._realtime else 0), np.bool_)
             self._listed = np.zeros(cells if self._lossy else 0, dtype=np.bool_)  # whether ``heard`` was not empty
         except (MemoryError, ValueError) as error:
             raise BagError(
@@ -271,39 +273,33 @@ class Collected:
             self._states[piece][missing] = np.nan
             self._modes[piece] -= 1
             self._used[piece] -= 1
+            if self._late:
+                self._complete(piece)
             self._made[piece] -= 1
             self.received += len(missing) - int(missing.sum())
             self._release()
         self.out_of_order = _out_of_order(self._position.reshape(self._shape))
         self.states = self._states.reshape(*self._shape, self._width)
         self.modes = self._modes.reshape(self._shape)
+        most = self._links.most if self._lossy or self._late else 0
+        if self._realtime or self._late:
+            self.used = self._used.reshape(*self._shape, most)[1:]
         if self._realtime:
-            self.used = self._used.reshape(*self._shape, self._used.shape[1])[1:]
             self.made = self._made.reshape(self._shape)
-            return
-        if self._lossy and not self._holds:
-            self.lost = self._lost.reshape(*self._shape, self._lost.shape[1])[1:]
-        if self._delay or self._holds:
-            self._complete_used()
+        elif self._lossy:
+            self.lost = self._lost.reshape(*self._shape, most)[1:]
 
-    def _complete_used(self) -> None:
-        """In lockstep: the steps of values that the log leaves out, because no message was lost; and which were."""
-        steps, agents = self._shape
-        used = np.full((steps - 1, agents, self._links.most), -1, dtype=np.int64)
-        newest = _newest(np.arange(1, steps), self._delay)
-        listed = self._listed.reshape(self._shape)[1:] if self._holds else None
-        logged = self._used.reshape(*self._shape, -1)[1:] if self._holds else None
-        for i in range(agents):
-            count = self._links.neighbours(self.modes[1:, i] + 1, np.full(steps - 1, i))
-            there = np.arange(self._links.most) < count[:, None]
-            used[:, i] = np.where(there, newest[:, None], -1)
-            if listed is not None and logged is not None:
-                used[:, i] = np.where(listed[:, i, None], logged[:, i], used[:, i])
-            elif self.lost is not None:
-                used[:, i][self.lost[:, i]] = -1
-        self.used = used
+    def _complete(self, piece: slice) -> None:
+        """Put in the steps of values that the log leaves out, because no message was lost; and which were lost."""
+        step, agent = np.divmod(np.arange(piece.start, min(piece.stop, len(self._position))), self._shape[1])
+        newest = _newest(step, self._delay)[:, None]
+        there = np.arange(self._links.most) < self._links.neighbours(self._modes[piece] + 1, agent)[:, None]
         if self._holds:
-            self.lost = (used >= 0) & (used < newest[:, None, None])
+            used = np.where(self._listed[piece, None], self._used[piece], newest)
+            self._lost[piece] = there & (used < newest)
+        else:
+            used = np.where(self._lost[piece], -1, newest) if self._lossy else newest
+        self._used[piece] = np.where(there, used, -1)
 
 
 def _newest(step: IntArray, delay: int) -> IntArray:
