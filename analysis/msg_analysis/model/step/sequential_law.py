@@ -47,9 +47,8 @@ def step_law(experiment: ValidExperiment) -> StepLaw:
 def build_run_model(experiment: ValidExperiment, step: StepModel | None = None) -> StepModel:
     """What a step of all agents of a run with a linear law does to x(k), as one jump linear system.
 
-    In real time the law is sequential: noise of an agent reaches those that are due later in the same period. ``step``
-    is the model of the experiment, if it is known. With messages that are noisy, late or lost, the micro-steps stay
-    apart (``turns``): what two agents hear of a third one need not be the same.
+    In real time the law is sequential: noise of an agent reaches those that are due later. With messages that are
+    noisy, late or lost, the micro-steps stay apart (``turns``). ``step``: the model of the experiment, if it is known.
     """
     step = step or build_step_model(experiment)
     if step_law(experiment) == "synchronous":

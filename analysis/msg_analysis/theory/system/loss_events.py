@@ -21,7 +21,8 @@ difference that a later one of the same step sees. With q_e = E[(v_e^T z)^2] at 
 
     q_e = v_e^T C v_e + sum_(f before e) R_ef q_f,    L[C] = sum_e q_e u_e u_e^T
 
-is what is added to A C A^T; all v are written for the z at the beginning of the step, all u for that at its end.
+is what is added to A C A^T; all v are written for the z at the beginning of the step, all u for that at its end
+(docs/theory.md, "Messages one by one").
 """
 
 from __future__ import annotations
