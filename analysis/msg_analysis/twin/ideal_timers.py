@@ -23,7 +23,7 @@ import numpy as np
 
 from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.air_reception import sources
+from msg_analysis.model.step.air_reception import used_steps
 from msg_analysis.model.step.phases import phases
 from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.types import IntArray
@@ -36,4 +36,4 @@ def ideal_log(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> tu
     made = np.zeros((steps + 1, model.agents), dtype=np.int64)
     for i in range(model.agents):
         made[1:, i] = StepClock(experiment.step_length, float(phase[i])).times(np.arange(steps))
-    return agent_modes, sources(experiment, model, modes)[0], made
+    return agent_modes, used_steps(experiment, model, modes), made

@@ -28,7 +28,7 @@ from msg_analysis.model.run.agent_law import ProtocolLaw
 from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.model.step.air_reception import add_broadcast_noise, ahead, sources
+from msg_analysis.model.step.air_reception import add_broadcast_noise, ahead, lost_values, used_steps
 from msg_analysis.model.step.step_model import StepMatrices, StepModel, build_model
 from msg_analysis.twin.ideal_timers import ideal_log
 from msg_analysis.twin.network_steps import states as states_of_all
@@ -69,8 +69,10 @@ def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) ->
     agent_modes = lost = used = made = None
     if experiment.run.pace == "realtime":
         agent_modes, used, made = ideal_log(experiment, model, modes)
-    elif noise.loss.any or noise.delay:
-        used, lost = sources(experiment, model, modes)
+    elif noise.delay or noise.holds:
+        used = used_steps(experiment, model, modes)
+    if experiment.run.pace == "lockstep" and noise.loss.any:
+        lost = lost_values(experiment, model, modes)
     expected = states.shape[0] * states.shape[1] * (2 if experiment.truth else 1)
     return Trajectory(
         record,
@@ -79,8 +81,8 @@ def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) ->
         Completeness(expected, expected, 0),
         agent_modes,
         published=published,
-        lost=lost if noise.loss.any else None,
-        used=used if made is not None or noise.delay or noise.holds else None,
+        lost=lost,
+        used=used,
         made=made,
     )
 

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TypeVar
 
@@ -117,20 +117,36 @@ def add_broadcast_noise(experiment: ValidExperiment, states: FloatArray) -> Floa
     return published
 
 
-def sources(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> tuple[IntArray, BoolArray]:
-    """``used`` and ``lost`` of ``Trajectory``, of a run with these graphs (N,) in which all steps are made in time."""
+def used_steps(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> IntArray:
+    """``used`` of ``Trajectory``, of a run with these graphs (N,) in which all steps are made in time."""
+    used = np.full((len(modes), model.agents, model.most_neighbours), NOTHING, dtype=np.int64)
+    for at, i, place, _, found in _sources(experiment, model, modes):
+        used[at, i, place] = found
+    return used
+
+
+def lost_values(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> BoolArray:
+    """``lost`` of ``Trajectory``, of a run in lockstep with these graphs (N,)."""
+    lost = np.zeros((len(modes), model.agents, model.most_neighbours), dtype=np.bool_)
+    for at, i, place, newest, found in _sources(experiment, model, modes):
+        lost[at, i, place] = found != newest
+    return lost
+
+
+def _sources(
+    experiment: ValidExperiment, model: Wiring, modes: IntArray
+) -> Iterator[tuple[IntArray, int, int, IntArray, IntArray]]:
+    """For each neighbour of each agent in each graph: the steps (k,) with that graph, agent and place of the neighbour,
+    and of the message that these steps should use, and of the one that they use, the steps (k,).
+    """
     air, lead, tables = Air(experiment), ahead(experiment), neighbour_tables(model)
-    used = np.full((len(modes), *tables.senders.shape[1:]), NOTHING, dtype=np.int64)
-    lost = np.zeros(used.shape, dtype=np.bool_)
     steps_of = [np.flatnonzero(modes == mode) for mode in range(model.modes)]
     for i, j in np.argwhere(model.listens()).tolist():
         steps = np.maximum(0, np.arange(len(modes)) + lead[i, j] - air.delay)
         found = _of_steps(partial(air.sources, i, j), steps) if air.loss else steps
         for mode, at in enumerate(steps_of):
             for place in np.flatnonzero(tables.senders[mode, i, : tables.count[mode, i]] == j).tolist():
-                used[at, i, place] = found[at]
-                lost[at, i, place] = found[at] != steps[at]
-    return used, lost
+                yield at, i, place, steps[at], found[at]
 
 
 def lost_messages(experiment: ValidExperiment, receiver: int, sender: int, count: int) -> BoolArray:
