@@ -100,7 +100,7 @@ class CycloneAgent:
         for j in self._peers:
             for state in self._valid(readers[state_topic(j + 1)]):
                 self._newest[j] = max(self._newest[j], state.step)
-                if state.step >= self._law.step:
+                if state.step >= self._needed(j):
                     self._states[j][state.step] = np.array(state.state).tobytes()
         for request in self._valid(readers["resend"]):
             if request.agent in (0, self._number) and self._is_genuine(request, topics.RESEND):
@@ -120,13 +120,19 @@ class CycloneAgent:
         step = self._law.step
         if step == self._steps or not self._graphs or any(newest + WINDOW < step for newest in self._newest.values()):
             return False
-        return all(step in self._states[j] for j in self._law.neighbours(self._graphs[0][0]))
+        return all(self._needed(j) in self._states[j] for j in self._law.neighbours(self._graphs[0][0]))
+
+    def _needed(self, j: int) -> int:
+        """Step of the value of agent j that the next step uses: an older one with a delay, or if one was lost."""
+        law = self._law
+        return law.air.needed(j, law.step) if law.air else law.step
 
     def _step(self) -> None:
         step, (mode, last) = self._law.step, self._graphs[0]
-        self._law.advance(mode, [self._states[j][step] for j in self._law.neighbours(mode)])
-        for states in self._states.values():
-            states.pop(step, None)
+        self._law.advance(mode, [self._states[j][self._needed(j)] for j in self._law.neighbours(mode)])
+        for j, states in self._states.items():
+            for old in [k for k in states if k < self._needed(j)]:
+                del states[old]
         if last == step:
             self._graphs.popleft()
         self._publish(mode + 1)

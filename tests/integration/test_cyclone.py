@@ -147,9 +147,10 @@ def test_a_stranger_is_refused(network: Any) -> None:
     assert {topic for topic, _ in refused} >= {"graph", "end", "progress", "agent_1/state"}
 
 
-def test_an_agent(network: Any) -> None:
+@pytest.mark.parametrize("noise", [{}, {"link": 0.2, "delay": 1, "loss": 0.4, "on_loss": "hold"}], ids=["plain", "air"])
+def test_an_agent(network: Any, noise: dict[str, Any]) -> None:
     """The example of the documentation takes part in a run in lockstep, whose bag is equal to the twin."""
-    record = new_record(network.experiment())
+    record = new_record(network.experiment(noise={"process": 1.0} | noise))
     directory: Path = network.directory
     file, bag = directory / "run.json", directory / "bag"
     file.write_text(record.to_json(with_key=True))
