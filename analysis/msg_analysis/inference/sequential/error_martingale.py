@@ -1,0 +1,120 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Evidence on the system error: the martingale of its Poisson equation, exponentially tilted.
+
+For f(y, g) = y^T Y_g y + kappa_g of ``errors.time_means`` and any rate l, exp(l f(y_k+1, g_k+1)) over its conditional
+mean is a martingale factor. The mean is in closed form: given the next graph j, the next y is normal, so that of a
+quadratic form is exp of another one; the graphs are then summed over. Replicas are averaged inside f.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.special import logsumexp
+
+from msg_analysis.inference.errors.time_means import Value, forms_of, values_of
+from msg_analysis.theory.moments import mode_potential
+from msg_analysis.theory.prediction import Prediction
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.types import FloatArray, IntArray
+
+HORIZONS = (300.0, 1e3, 3e3, 1e4, 3e4, 1e5, 1e6)
+"""Steps after which the rates find an error that shows then: one rate of either sign for each."""
+
+DETECTED = 4.0  # size of such an error, in standard errors at that time: its evidence is then exp(8)
+MOST_SHARE = 0.5  # of the rate beyond which the mean is infinite
+
+
+class ErrorMartingale:
+    """Sums over steps of the logarithm of the martingale, for every rate (L,).
+
+    ValueError for a system with lost messages, whose next state is not normal given this one.
+    """
+
+    def __init__(self, prediction: Prediction, replicas: int) -> None:
+        system = prediction.system
+        if system.loss_variance is not None:
+            raise ValueError("lost messages: the next state is not normal given this one")
+        forms, _, trace = forms_of(system, "system")
+        dual = prediction.solver.dual(packed_symmetric.unpack(forms, system.dimension))
+        _, kappa = mode_potential(system, dual)
+        self._forms, self._kappa = dual[0], kappa[0]  # (n, d, d), (n,)
+        self._system, self._replicas = system, replicas
+        self.variance = _typical_variance(prediction, replicas, forms, trace)
+        self.rates = self._choose_rates()
+        self.total = np.zeros(len(self.rates))
+        self.numbers = packed_symmetric.size(system.dimension) + 1
+        self._value = np.concatenate([packed_symmetric.pack(self._forms), self._kappa[:, None]], axis=1)  # (n, p + 1)
+        # (n, n, L, p + 1): log E[exp(l f(next)) | next graph j] = means[g, j, l] @ (s, 1)
+        self._means = np.array([[self._tilted(g, j) for j in range(system.modes)] for g in range(system.modes)])
+        with np.errstate(divide="ignore"):
+            self._log_law = np.log(system.chain)
+
+    def add(self, modes: IntArray, following: IntArray, a: FloatArray, b: FloatArray) -> None:
+        """Add steps: their graphs and the next ones (k,), and (s, 1) before and after them, (k, p + 1) each."""
+        for mode in np.unique(modes).tolist():
+            at = np.flatnonzero(modes == mode)
+            reached = (self._value[following[at]] * b[at]).sum(axis=1)
+            means = np.einsum("jlp,kp->klj", self._means[mode], a[at], optimize=True)
+            expected = logsumexp(means + self._log_law[mode], axis=2)
+            self.total += self.rates * reached.sum() - expected.sum(axis=0)
+
+    def merge(self, other: ErrorMartingale) -> None:
+        """Add the sums of another run of the same experiment, with another seed."""
+        self.total += other.total
+
+    def _choose_rates(self) -> FloatArray:
+        """(L,); none where nothing is random."""
+        if self.variance <= 0.0:
+            return np.empty(0)
+        largest = 0.0
+        for noise in self._system.noise:
+            root = _root(noise)
+            largest = max(largest, float(np.abs(np.linalg.eigvalsh(root @ self._forms @ root)).max()))
+        most = MOST_SHARE * self._replicas / (2.0 * largest) if largest else math.inf
+        rates = np.unique(np.minimum(DETECTED / np.sqrt(np.array(HORIZONS) * self.variance), most))
+        return np.concatenate([-rates[::-1], rates])
+
+    def _tilted(self, mode: int, following: int) -> FloatArray:
+        """(L, p + 1): see ``_means``."""
+        system, d, r = self._system, self._system.dimension, self._replicas
+        root, step = _root(system.noise[mode]), system.matrices[mode]
+        rows = np.empty((len(self.rates), packed_symmetric.size(d) + 1))
+        for row, rate in zip(rows, self.rates, strict=True):
+            form = rate / r * self._forms[following]
+            left = np.eye(d) - 2.0 * root @ form @ root
+            seen = form @ root
+            tilted = form + 2.0 * seen @ np.linalg.solve(left, seen.T)
+            row[:-1] = r * packed_symmetric.pack(step.T @ ((tilted + tilted.T) / 2.0) @ step)
+            row[-1] = rate * self._kappa[following] - 0.5 * r * np.linalg.slogdet(left)[1]
+        return rows
+
+
+def _typical_variance(prediction: Prediction, replicas: int, forms: FloatArray, trace: FloatArray) -> float:
+    """Var(D_k) at the steady second moments: what rates are chosen by; nothing depends on its being exact."""
+    total = 0.0
+    law = prediction.system.stationary
+    for value, moments, share in zip(values_of(prediction, forms), prediction.steady, law, strict=True):
+        assert isinstance(value, Value)
+        a = np.append(packed_symmetric.pack(moments / share), 1.0)[None]
+        total += share * float(value.variances(trace, a, replicas)[0])
+    return total
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.sqrt(values.clip(0.0))) @ vectors.T)

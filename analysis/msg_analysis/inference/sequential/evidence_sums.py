@@ -1,0 +1,204 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Running sums over the steps of runs, which give the evidence on every question at any time (docs/statistics.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.inference.errors.time_means import moments
+from msg_analysis.inference.hypothesis_tests.innovations import QUIET_ROUNDING, innovations
+from msg_analysis.inference.observed.heard_values import NO_NOISE, HeardValues, process_noise
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
+from msg_analysis.inference.statistics.mixture_evidence import (
+    average,
+    coefficient_evidence,
+    proportion_evidence,
+    row_evidence,
+    variance_evidence,
+)
+from msg_analysis.model.step.neighbours import neighbour_tables
+from msg_analysis.theory.prediction import Prediction
+from msg_analysis.types import FloatArray, IntArray
+
+MOST_PAIRS = 5_000  # of agents whose noises are compared; beyond, none are
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What a part of the law says; agents and graphs from 0."""
+
+    kind: str  # see ``EvidenceSums``
+    agent: int | None = None
+    other: int | None = None  # sender of a link, second agent of a pair
+    graph: int | None = None
+
+
+class EvidenceSums:
+    """Sums for the families of questions, each of which counts the same in the evidence on the whole law:
+
+    "noise" of an agent, "gain" of a link or of a leader's pull, "gains" of all at once, "pair" of noises, "switching"
+    away from a graph, "loss" of a link, "broadcast" noise of an agent, "system error". Given its past and, on the air
+    and in real time, what was heard, each is exact; the system error only in lockstep without noise or loss on the air.
+    """
+
+    def __init__(self, prediction: Prediction, replicas: int) -> None:
+        experiment, step = prediction.experiment, prediction.step
+        noise, m = experiment.noise, step.agents
+        self._step, self._noise = step, noise
+        real_time = experiment.run.pace == "realtime"
+        self.plain = not (noise.on_air or noise.delay or real_time)  # all agents hear the states themselves
+        self._process = np.array([process_noise(step, np.full(m, g)) for g in range(step.modes)])  # (n, m, m)
+        variances = np.diagonal(self._process, axis1=1, axis2=2)
+        self._floor = NO_NOISE * float(variances.max(initial=0.0))
+        self.noisy = (variances > self._floor).all(axis=0)  # (m,) agents whose questions can be asked
+        correlated = bool((self._process * ~np.eye(m, dtype=bool)).any())
+        # In real time a value that is used may contain a part of the noise of the same step.
+        usable = self.noisy if not (real_time and correlated) else np.zeros(m, dtype=bool)
+        pull = np.abs(step.nominal.sum(axis=2) - 1.0).max(axis=0) > 1e-12
+        self.links: IntArray = np.argwhere((step.listens() | np.diag(pull)) & usable[:, None])  # (L, 2)
+        first, second = np.triu_indices(m, 1)
+        paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
+        self.pairs: IntArray = np.column_stack([first[paired], second[paired]])
+        self.samples, self.squares = np.zeros(m, np.int64), np.zeros(m)
+        self.link_score, self.link_information = np.zeros((m, m)), np.zeros((m, m))
+        self.pair_score, self.pair_information = np.zeros((m, m)), np.zeros((m, m))
+        self.common_score = self.common_information = 0.0
+        self._common = bool(usable.any()) and not correlated
+        self.counts = np.zeros((step.modes, step.modes), np.int64)
+        self.messages, self.lost = np.zeros((m, m), np.int64), np.zeros((m, m), np.int64)
+        self.broadcast_samples, self.broadcast_squares = 0, np.zeros(m)
+        self.impossible = False  # whether anything moved that has no noise
+        self.error = ErrorMartingale(prediction, replicas) if self.plain else None
+
+    def add(self, observation: Observation, first: int, last: int) -> None:
+        """Add the steps first..last-1 of a run, which follow those that were added before."""
+        reception = HeardValues.of(observation, first, last)
+        e = innovations(observation, first, last, reception)
+        agents = np.arange(self._step.agents)
+        variances = np.diagonal(self._process, axis1=1, axis2=2)[reception.graphs, agents] + reception.link_variance
+        still = variances <= self._floor
+        if still.any() and np.abs(e[still]).max() > QUIET_ROUNDING * observation.largest:
+            self.impossible = True
+        scale = np.sqrt(np.where(still, np.inf, variances))[:, :, None]
+        white = e / scale
+        self.samples += np.where(still, 0, observation.replicas).sum(axis=0)
+        self.squares += (white**2).sum(axis=(0, 2))
+        self._add_links(observation, reception, white, scale)
+        if len(self.pairs):
+            flat = white.transpose(1, 0, 2).reshape(len(white[0]), -1)
+            products = flat @ flat.T
+            self.pair_score += products
+            self.pair_information += np.diag(products)[None, :]
+        graphs = observation.modes[first : last + 1]
+        np.add.at(self.counts, (graphs[:-1], graphs[1:]), 1)
+        if observation.published is not None and self._noise.broadcast:
+            added = observation.published[first:last] - observation.states[first:last]
+            self.broadcast_samples += added.shape[0] * added.shape[2]
+            self.broadcast_squares += (added**2).sum(axis=(0, 2)) / self._noise.broadcast**2
+        if self.error is not None and len(graphs) > 1:
+            steps = len(graphs) - 1
+            a = np.ones((steps + 1, self.error.numbers))
+            a[:, :-1] = moments(observation, first, first + steps + 1, observation.states)
+            self.error.add(graphs[:-1], graphs[1:], a[:-1], a[1:])
+
+    def _add_links(
+        self, observation: Observation, reception: HeardValues, white: FloatArray, scale: FloatArray
+    ) -> None:
+        """Scores of the gains; regressors and innovations over the standard deviation of the noise."""
+        step = self._step
+        agents, every = np.arange(step.agents), np.arange(len(white))
+        count = neighbour_tables(step).count[reception.graphs, agents]  # (b, m)
+        pull = (step.nominal.sum(axis=2) - 1.0)[reception.graphs, agents]
+        common = pull[:, :, None] * (reception.states - step.reference) / scale
+        self.link_score[agents, agents] += (common * white).sum(axis=(0, 2))
+        self.link_information[agents, agents] += (common**2).sum(axis=(0, 2))
+        receivers = np.broadcast_to(agents, count.shape)
+        for d in range(step.most_neighbours):
+            there = count > d
+            weights = reception.weights[:, :, d]
+            difference = reception.heard(every, agents, np.full(step.agents, d)) - reception.states
+            part = np.where(weights != 0.0, weights, 0.0)[:, :, None] * difference / scale
+            common += part
+            place = receivers[there], reception.senders[:, :, d][there]
+            np.add.at(self.link_score, place, (part * white).sum(axis=2)[there])
+            np.add.at(self.link_information, place, (part**2).sum(axis=2)[there])
+            if observation.lost is not None:
+                np.add.at(self.messages, place, 1)
+                np.add.at(self.lost, place, reception.lost[:, :, d][there])
+        if self._common:
+            self.common_score += float((common * white).sum())
+            self.common_information += float((common**2).sum())
+
+    def merge(self, other: EvidenceSums) -> None:
+        """Add the sums of another run of the same experiment, with another seed."""
+        for name in (
+            *("samples", "squares", "link_score", "link_information", "pair_score", "pair_information"),
+            *("common_score", "common_information", "counts", "messages", "lost"),
+            *("broadcast_samples", "broadcast_squares"),
+        ):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.impossible |= other.impossible
+        if self.error is not None and other.error is not None:
+            self.error.merge(other.error)
+
+    def families(self) -> dict[str, tuple[list[Question], FloatArray]]:
+        """For each kind its questions and their evidence, logarithms (questions, alternatives)."""
+        found: dict[str, tuple[list[Question], FloatArray]] = {}
+        noisy = np.flatnonzero(self.noisy)
+        if len(noisy):
+            questions = [Question("noise", int(i)) for i in noisy]
+            found["noise"] = questions, variance_evidence(self.samples[noisy], self.squares[noisy])
+        if len(self.links):
+            i, j = self.links.T
+            questions = [Question("gain", a, b) for a, b in self.links.tolist()]
+            found["gain"] = questions, coefficient_evidence(self.link_score[i, j], self.link_information[i, j])
+        if self._common:
+            score, information = np.array([self.common_score]), np.array([self.common_information])
+            found["gains"] = [Question("gains")], coefficient_evidence(score, information)
+        if len(self.pairs):
+            i, j = self.pairs.T
+            questions = [Question("pair", a, b) for a, b in self.pairs.tolist()]
+            found["pair"] = questions, coefficient_evidence(self.pair_score[i, j], self.pair_information[i, j])
+        law = self._step.transition
+        rows = np.flatnonzero(np.diag(law) < 1.0)
+        if len(rows):
+            each = row_evidence(self.counts, law)[rows]
+            questions = [*(Question("switching", graph=int(g)) for g in rows), Question("switching")]
+            found["switching"] = questions, np.vstack([each, each.sum(axis=0)])  # rows are independent of each other
+        if self.messages.any():
+            i, j = np.nonzero(self.messages)
+            questions = [Question("loss", int(a), int(b)) for a, b in zip(i, j, strict=True)]
+            found["loss"] = questions, proportion_evidence(self.lost[i, j], self.messages[i, j], self._noise.loss)
+        if self.broadcast_samples:
+            questions = [Question("broadcast", i) for i in range(self._step.agents)]
+            found["broadcast"] = questions, variance_evidence(
+                np.full(self._step.agents, self.broadcast_samples), self.broadcast_squares
+            )
+        if self.error is not None and len(self.error.rates):
+            found["system error"] = [Question("system error")], self.error.total[None]
+        return found
+
+    def evidence(self) -> float:
+        """Log of the evidence against the whole law: the mean over the kinds of the mean over their questions."""
+        if self.impossible:
+            return float("inf")
+        families = self.families()
+        if not families:
+            return 0.0
+        return average(np.array([average(logs) for _, logs in families.values()]))

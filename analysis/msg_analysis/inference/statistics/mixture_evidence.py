@@ -1,0 +1,142 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Evidence that may be looked at any time: likelihood ratios mixed over alternatives, in closed form, as logarithms.
+
+Each is a martingale of mean 1 while the null hypothesis holds, so it ever passes 1/level with probability at most
+``level`` (Ville's inequality). Sums over independent runs may be added up before.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import betaln, gammaln, logsumexp
+
+from msg_analysis.types import FloatArray, IntArray
+
+STRENGTHS = (2.0, 20.0, 200.0, 2000.0)
+"""Of the alternatives to a variance: the smaller, the more they differ from it (by 0.7, 0.2, 0.07, 0.02 of it)."""
+
+SHARES = (0.03, 0.1, 0.3, 1.0)  # standard deviations of the alternatives to a coefficient, as shares of it
+ROW_STRENGTHS = (1.0, 10.0, 100.0)  # changes of a row that the alternatives are worth
+PROPORTION_STRENGTHS = (2.0, 20.0, 200.0)  # successes that the alternatives are worth
+
+
+def variance_evidence(samples: FloatArray | IntArray, squares: FloatArray) -> FloatArray:
+    """Against variance 1 of independent normal samples: factors theta of the variance ~ inverse gamma(a, a).
+
+    log of a^a G(a + n/2) exp(S/2) / (G(a) (a + S/2)^(a + n/2)), the mixture of the likelihood ratios of theta.
+
+    Parameters
+    ----------
+    samples
+        (...) numbers n
+    squares
+        (...) sums of squares S
+
+    Returns
+    -------
+    FloatArray
+        (..., K) of each a in ``STRENGTHS``
+    """
+    a = np.array(STRENGTHS)
+    half, s = np.asarray(samples, dtype=float)[..., None] / 2.0, np.asarray(squares)[..., None] / 2.0
+    # (a + n/2) log(a / (a + s)) instead of two large terms that cancel.
+    return np.asarray(gammaln(a + half) - gammaln(a) - half * np.log(a) - (a + half) * np.log1p(s / a) + s)
+
+
+def coefficient_evidence(score: FloatArray, information: FloatArray, size: FloatArray | float = 1.0) -> FloatArray:
+    """Against the coefficient 0 of a regressor of normal samples of known variance: coefficients ~ N(0, tau^2).
+
+    log of (1 + tau^2 J)^(-1/2) exp(tau^2 U^2 / (2 (1 + tau^2 J))).
+
+    Parameters
+    ----------
+    score
+        (...) U, sum of regressor times sample over variance
+    information
+        (...) J, sum of squared regressor over variance
+    size
+        (...) the coefficient in the law; tau are ``SHARES`` of it
+
+    Returns
+    -------
+    FloatArray
+        (..., K) of each share
+    """
+    tau2 = (np.asarray(size)[..., None] * np.array(SHARES)) ** 2
+    spread = 1.0 + tau2 * np.asarray(information)[..., None]
+    return np.asarray(0.5 * (tau2 * np.asarray(score)[..., None] ** 2 / spread - np.log(spread)))
+
+
+def row_evidence(counts: FloatArray | IntArray, law: FloatArray) -> FloatArray:
+    """Against a row of a transition matrix: rows ~ Dirichlet(alpha P), for several alpha.
+
+    log of B(alpha P + c) / (B(alpha P) prod_h P_h^c_h); infinite after a transition that P excludes.
+
+    Parameters
+    ----------
+    counts
+        (n, n) transitions
+    law
+        (n, n) P
+
+    Returns
+    -------
+    FloatArray
+        (n, K) of each row; alpha is ``ROW_STRENGTHS`` over the probability of a change
+    """
+    n = len(law)
+    leaving = 1.0 - np.diag(law)
+    found = np.zeros((n, len(ROW_STRENGTHS)))
+    for g in range(n):
+        possible = law[g] > 0.0
+        if counts[g][~possible].any():
+            found[g] = np.inf
+        elif leaving[g] > 0.0:
+            p, c = law[g][possible], np.asarray(counts[g])[possible]
+            alpha = np.array(ROW_STRENGTHS)[:, None] / leaving[g]
+            prior = alpha * p
+            found[g] = (gammaln(prior + c) - gammaln(prior) - c * np.log(p)).sum(axis=1)
+            found[g] -= (gammaln(alpha + c.sum()) - gammaln(alpha))[:, 0]
+    return found
+
+
+def proportion_evidence(successes: IntArray, trials: IntArray, probability: FloatArray | float) -> FloatArray:
+    """Against a known probability of independent successes: probabilities ~ beta of that mean.
+
+    Parameters
+    ----------
+    successes, trials
+        (...) counts
+    probability
+        (...) between 0 and 1, both excluded
+
+    Returns
+    -------
+    FloatArray
+        (..., K) log of the mixture for each of ``PROPORTION_STRENGTHS``
+    """
+    p = np.asarray(probability, dtype=float)[..., None]
+    hit, miss = np.asarray(successes)[..., None], (np.asarray(trials) - np.asarray(successes))[..., None]
+    strength = np.array(PROPORTION_STRENGTHS)
+    a, b = strength, strength * (1.0 - p) / p
+    return np.asarray(betaln(a + hit, b + miss) - betaln(a, b) - hit * np.log(p) - miss * np.log1p(-p))
+
+
+def average(logarithms: FloatArray) -> float:
+    """Log of the mean of evidence given as logarithms, any shape: evidence again, without a correction for their
+    number.
+    """
+    return float(logsumexp(logarithms) - np.log(np.size(logarithms)))
