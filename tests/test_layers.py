@@ -51,6 +51,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "inference/observed",
         "inference/hypothesis_tests",
         "inference/errors",
+        "inference/sequential",
         "inference/realtime",
         "inference/blame",
         "inference/verdict",

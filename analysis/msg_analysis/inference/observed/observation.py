@@ -34,6 +34,7 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 # States are clipped to this: fourth powers of much larger numbers overflow, and no test could be computed
 LARGEST = 1e60
+SPACED = 400  # steps at which curves over a run are given
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,6 +139,13 @@ class Observation:
         for array in (self.states, self.published, self.lost):
             if array is not None:
                 release(array)
+
+
+def spaced_steps(steps: int) -> IntArray:
+    """(T,): at most 400 numbers of steps up to all of them, denser at the beginning."""
+    half = SPACED // 2
+    spaced = np.concatenate([np.geomspace(1, steps, half), np.linspace(1, steps, half)])
+    return np.unique(np.rint(spaced).astype(np.int64))
 
 
 def bounded(states: FloatArray) -> FloatArray:

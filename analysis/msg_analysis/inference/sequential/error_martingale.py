@@ -24,9 +24,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import logsumexp
 
 from msg_analysis.inference.errors.time_means import Value, forms_of, values_of
+from msg_analysis.inference.statistics.mixture_evidence import log_sum
 from msg_analysis.theory.moments import mode_potential
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.system import packed_symmetric
@@ -70,7 +70,7 @@ class ErrorMartingale:
             at = np.flatnonzero(modes == mode)
             reached = (self._value[following[at]] * b[at]).sum(axis=1)
             means = np.einsum("jlp,kp->klj", self._means[mode], a[at], optimize=True)
-            expected = logsumexp(means + self._log_law[mode], axis=2)
+            expected = log_sum(means + self._log_law[mode], axis=2)
             self.total += self.rates * reached.sum() - expected.sum(axis=0)
 
     def merge(self, other: ErrorMartingale) -> None:

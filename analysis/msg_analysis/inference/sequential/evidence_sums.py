@@ -26,15 +26,15 @@ from msg_analysis.inference.observed.heard_values import NO_NOISE, HeardValues, 
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
 from msg_analysis.inference.statistics.mixture_evidence import (
-    average,
     coefficient_evidence,
+    log_mean,
     proportion_evidence,
     row_evidence,
     variance_evidence,
 )
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.theory.prediction import Prediction
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 MOST_PAIRS = 5_000  # of agents whose noises are compared; beyond, none are
 
@@ -63,10 +63,12 @@ class EvidenceSums:
         self._step, self._noise = step, noise
         real_time = experiment.run.pace == "realtime"
         self.plain = not (noise.on_air or noise.delay or real_time)  # all agents hear the states themselves
+        # A message that is used twice has the same noise both times.
+        self._independent = independent = not (noise.link and (step.holds or real_time))
         self._process = np.array([process_noise(step, np.full(m, g)) for g in range(step.modes)])  # (n, m, m)
         variances = np.diagonal(self._process, axis1=1, axis2=2)
         self._floor = NO_NOISE * float(variances.max(initial=0.0))
-        self.noisy = (variances > self._floor).all(axis=0)  # (m,) agents whose questions can be asked
+        self.noisy = (variances > self._floor).all(axis=0) & independent  # (m,) agents whose questions can be asked
         correlated = bool((self._process * ~np.eye(m, dtype=bool)).any())
         # In real time a value that is used may contain a part of the noise of the same step.
         usable = self.noisy if not (real_time and correlated) else np.zeros(m, dtype=bool)
@@ -83,7 +85,10 @@ class EvidenceSums:
         self.counts = np.zeros((step.modes, step.modes), np.int64)
         self.messages, self.lost = np.zeros((m, m), np.int64), np.zeros((m, m), np.int64)
         self.broadcast_samples, self.broadcast_squares = 0, np.zeros(m)
-        self.impossible = False  # whether anything moved that has no noise
+        self._rows = np.flatnonzero(np.diag(step.transition) < 1.0)  # graphs that are left some time
+        independent_losses = step.burst is None and not real_time
+        self.lossy: IntArray = np.argwhere(step.listens() & (step.losses > 0.0) & independent_losses)  # (links, 2)
+        self.impossible = False  # whether anything happened that cannot: movement without noise, a loss of what never is
         self.error = ErrorMartingale(prediction, replicas) if self.plain else None
 
     def add(self, observation: Observation, first: int, last: int) -> None:
@@ -93,13 +98,14 @@ class EvidenceSums:
         agents = np.arange(self._step.agents)
         variances = np.diagonal(self._process, axis1=1, axis2=2)[reception.graphs, agents] + reception.link_variance
         still = variances <= self._floor
-        if still.any() and np.abs(e[still]).max() > QUIET_ROUNDING * observation.largest:
+        if self._independent and still.any() and np.abs(e[still]).max() > QUIET_ROUNDING * observation.largest:
             self.impossible = True
         scale = np.sqrt(np.where(still, np.inf, variances))[:, :, None]
         white = e / scale
         self.samples += np.where(still, 0, observation.replicas).sum(axis=0)
         self.squares += (white**2).sum(axis=(0, 2))
-        self._add_links(observation, reception, white, scale)
+        lost = observation.lost[first:last] if len(self.lossy) and observation.lost is not None else None
+        self._add_links(reception, white, scale, lost)
         if len(self.pairs):
             flat = white.transpose(1, 0, 2).reshape(len(white[0]), -1)
             products = flat @ flat.T
@@ -118,7 +124,7 @@ class EvidenceSums:
             self.error.add(graphs[:-1], graphs[1:], a[:-1], a[1:])
 
     def _add_links(
-        self, observation: Observation, reception: HeardValues, white: FloatArray, scale: FloatArray
+        self, reception: HeardValues, white: FloatArray, scale: FloatArray, lost: BoolArray | None
     ) -> None:
         """Scores of the gains; regressors and innovations over the standard deviation of the noise."""
         step = self._step
@@ -138,9 +144,9 @@ class EvidenceSums:
             place = receivers[there], reception.senders[:, :, d][there]
             np.add.at(self.link_score, place, (part * white).sum(axis=2)[there])
             np.add.at(self.link_information, place, (part**2).sum(axis=2)[there])
-            if observation.lost is not None:
+            if lost is not None:
                 np.add.at(self.messages, place, 1)
-                np.add.at(self.lost, place, reception.lost[:, :, d][there])
+                np.add.at(self.lost, place, lost[:, :, d][there])
         if self._common:
             self.common_score += float((common * white).sum())
             self.common_information += float((common**2).sum())
@@ -157,48 +163,52 @@ class EvidenceSums:
         if self.error is not None and other.error is not None:
             self.error.merge(other.error)
 
-    def families(self) -> dict[str, tuple[list[Question], FloatArray]]:
-        """For each kind its questions and their evidence, logarithms (questions, alternatives)."""
-        found: dict[str, tuple[list[Question], FloatArray]] = {}
-        noisy = np.flatnonzero(self.noisy)
+    def families(self) -> dict[str, FloatArray]:
+        """For each kind the evidence on its questions, logarithms (questions, alternatives)."""
+        found: dict[str, FloatArray] = {}
+        noisy, rows = np.flatnonzero(self.noisy), self._rows
         if len(noisy):
-            questions = [Question("noise", int(i)) for i in noisy]
-            found["noise"] = questions, variance_evidence(self.samples[noisy], self.squares[noisy])
+            found["noise"] = variance_evidence(self.samples[noisy], self.squares[noisy])
         if len(self.links):
             i, j = self.links.T
-            questions = [Question("gain", a, b) for a, b in self.links.tolist()]
-            found["gain"] = questions, coefficient_evidence(self.link_score[i, j], self.link_information[i, j])
+            found["gain"] = coefficient_evidence(self.link_score[i, j], self.link_information[i, j])
         if self._common:
             score, information = np.array([self.common_score]), np.array([self.common_information])
-            found["gains"] = [Question("gains")], coefficient_evidence(score, information)
+            found["gains"] = coefficient_evidence(score, information)
         if len(self.pairs):
             i, j = self.pairs.T
-            questions = [Question("pair", a, b) for a, b in self.pairs.tolist()]
-            found["pair"] = questions, coefficient_evidence(self.pair_score[i, j], self.pair_information[i, j])
-        law = self._step.transition
-        rows = np.flatnonzero(np.diag(law) < 1.0)
+            found["pair"] = coefficient_evidence(self.pair_score[i, j], self.pair_information[i, j])
         if len(rows):
-            each = row_evidence(self.counts, law)[rows]
-            questions = [*(Question("switching", graph=int(g)) for g in rows), Question("switching")]
-            found["switching"] = questions, np.vstack([each, each.sum(axis=0)])  # rows are independent of each other
-        if self.messages.any():
-            i, j = np.nonzero(self.messages)
-            questions = [Question("loss", int(a), int(b)) for a, b in zip(i, j, strict=True)]
-            found["loss"] = questions, proportion_evidence(self.lost[i, j], self.messages[i, j], self._noise.loss)
+            each = row_evidence(self.counts, self._step.transition)[rows]
+            found["switching"] = np.vstack([each, each.sum(axis=0)])  # rows are independent of each other
+        if len(self.lossy):
+            i, j = self.lossy.T
+            found["loss"] = proportion_evidence(self.lost[i, j], self.messages[i, j], self._step.losses[i, j])
         if self.broadcast_samples:
-            questions = [Question("broadcast", i) for i in range(self._step.agents)]
-            found["broadcast"] = questions, variance_evidence(
-                np.full(self._step.agents, self.broadcast_samples), self.broadcast_squares
-            )
+            samples = np.full(self._step.agents, self.broadcast_samples)
+            found["broadcast"] = variance_evidence(samples, self.broadcast_squares)
         if self.error is not None and len(self.error.rates):
-            found["system error"] = [Question("system error")], self.error.total[None]
+            found["system error"] = self.error.total[None]
         return found
+
+    def question(self, kind: str, row: int) -> Question:
+        """What a row of ``families`` is about."""
+        if kind == "noise":
+            return Question(kind, int(np.flatnonzero(self.noisy)[row]))
+        if kind == "broadcast":
+            return Question(kind, row)
+        if kind == "switching":
+            return Question(kind, graph=int(self._rows[row]) if row < len(self._rows) else None)
+        if kind in ("gain", "pair", "loss"):
+            places = {"gain": self.links, "pair": self.pairs, "loss": self.lossy}[kind]
+            return Question(kind, int(places[row, 0]), int(places[row, 1]))
+        return Question(kind)
 
     def evidence(self) -> float:
         """Log of the evidence against the whole law: the mean over the kinds of the mean over their questions."""
-        if self.impossible:
+        if self.impossible or self.lost[self._step.losses == 0.0].any():
             return float("inf")
         families = self.families()
         if not families:
             return 0.0
-        return average(np.array([average(logs) for _, logs in families.values()]))
+        return float(log_mean(np.array([float(log_mean(logs.ravel())) for logs in families.values()])))

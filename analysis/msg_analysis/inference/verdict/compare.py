@@ -31,7 +31,8 @@ from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
 from msg_analysis.inference.hypothesis_tests.losses import loss_test
 from msg_analysis.inference.hypothesis_tests.switching import switching_test
 from msg_analysis.inference.observed.measurement import Measurement
-from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.observed.observation import Observation, spaced_steps
+from msg_analysis.inference.sequential.watched_evidence import AnyTimeEvidence, any_time_evidence
 from msg_analysis.inference.statistics.batch_means import batch_interval
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.inference.verdict.comparison import Comparison, Test
@@ -42,7 +43,6 @@ from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray, IntArray
 
 MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
-RUNNING_POINTS = 400
 
 
 def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
@@ -132,7 +132,15 @@ def judge(
         given=GivenPath(means, evidence.given) if evidence.given else None,
         order=rank_agents(means, level) if means.long_enough else None,
         blame=blame,
+        any_time=_any_time(prediction, evidence, level),
     )
+
+
+def _any_time(prediction: Prediction, evidence: Evidence, level: float) -> AnyTimeEvidence:
+    means, experiment = evidence.means, prediction.experiment
+    variance = float(means.system_variances.sum()) if means.long_enough else None
+    names = [graph.name for graph in experiment.graph_list]
+    return any_time_evidence(evidence.watched, level, names, variance, evidence.steps, experiment.steps)
 
 
 def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:
@@ -184,7 +192,7 @@ def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Compari
     loss = loss_test(measurement) if enough else None
     family = [("switching", switching.p if switching else None), ("loss", loss.p if loss else None)]
     nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]
-    counts = _spaced(len(series)) if enough else np.empty(0, np.int64)
+    counts = spaced_steps(len(series)) if enough else np.empty(0, np.int64)
     return Comparison(
         trajectory=trajectory,
         level=level,
@@ -236,16 +244,10 @@ def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
 
 def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:
     """Mean of the system error up to some steps, denser at the beginning, and its standard error."""
-    counts = _spaced(len(means.system_series))
+    counts = spaced_steps(len(means.system_series))
     errors = np.sqrt(np.cumsum(means.system_variances)[counts - 1]) / counts
     return {
         "time": np.asarray(counts * dt, dtype=float),
         "system_error": np.cumsum(means.system_series)[counts - 1] / counts,
         "standard_error": errors if means.long_enough else np.zeros(len(counts)),
     }
-
-
-def _spaced(steps: int) -> IntArray:
-    """Numbers of steps up to all of them, denser at the beginning."""
-    spaced = np.concatenate([np.geomspace(1, steps, RUNNING_POINTS // 2), np.linspace(1, steps, RUNNING_POINTS // 2)])
-    return np.unique(np.rint(spaced).astype(np.int64))

@@ -36,6 +36,7 @@ from msg_analysis.inference.hypothesis_tests.losses import LossTest
 from msg_analysis.inference.hypothesis_tests.switching import SwitchingTest
 from msg_analysis.inference.realtime.laws import Laws
 from msg_analysis.inference.realtime.timing import Timing
+from msg_analysis.inference.sequential.watched_evidence import AnyTimeEvidence
 from msg_analysis.inference.verdict.law_identity import law_identity
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
@@ -149,6 +150,8 @@ class Comparison:
         what is wrong, where the verdict is "disagrees"
     pool
         the runs, where there are several
+    any_time
+        evidence that may be looked at any time; None where too few steps arrived, or without a prediction
     """
 
     trajectory: Trajectory
@@ -173,6 +176,7 @@ class Comparison:
     order: Ranking | None = None
     blame: Sequence[Cause] = ()
     pool: Pool | None = None
+    any_time: AnyTimeEvidence | None = None
 
     def __repr__(self) -> str:
         total, runs = self.system_error, f"{len(self.pool.members)} runs" if self.pool else "run"
@@ -273,6 +277,7 @@ class Comparison:
             "continuous": {"system_error": self.continuous_error},
             "batch_means": {"interval": self.batch or (None, None)},
             "tests": [asdict(test) for test in self.tests],
+            "any_time": self.any_time.to_json() if self.any_time else None,
         }
         return {key: _plain(value) for key, value in document.items()}
 

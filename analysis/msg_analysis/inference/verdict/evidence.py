@@ -27,11 +27,12 @@ from msg_analysis.inference.hypothesis_tests.broadcast import BroadcastSums
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
 from msg_analysis.inference.hypothesis_tests.losses import LossTally
 from msg_analysis.inference.hypothesis_tests.switching import Transitions
-from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.observed.observation import Observation, spaced_steps
 from msg_analysis.inference.realtime.event_order import order_events
 from msg_analysis.inference.realtime.laws import Laws, measure_laws
 from msg_analysis.inference.realtime.logged_pattern import means_in_lockstep
 from msg_analysis.inference.realtime.timing import Timing, measure_timing
+from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +47,7 @@ class Evidence:
     transitions: Transitions
     loss: LossTally | None  # None without loss
     broadcast: BroadcastSums | None  # None without broadcast noise
+    watched: WatchedEvidence  # what may be looked at any time
     timing: Timing | None = None  # of one run in real time
     laws: Laws | None = None  # of one run in real time
 
@@ -84,6 +86,7 @@ class Evidence:
             transitions=Transitions.of(observation.modes, observation.step.modes),
             loss=LossTally.of(observation),
             broadcast=BroadcastSums.of(observation),
+            watched=WatchedEvidence.of(observation, spaced_steps(observation.steps)),
             timing=timing,
             laws=laws,
         )
@@ -109,6 +112,7 @@ class Evidence:
             decisive=self.decisive and other.decisive,
             given=given,
             transitions=self.transitions.merged(other.transitions),
+            watched=self.watched.merged(other.watched),
             timing=None,
             laws=None,
         )

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from msg_analysis.common.text.agent_names import agent_text
+from msg_analysis.common.text.agent_names import agent_text, with_names
 from msg_analysis.common.text.number_words import number_text, percent
 from msg_analysis.theory.prediction import LAW_NAMES
 
@@ -97,6 +97,21 @@ def agent_errors(document: dict[str, Any]) -> tuple[list[dict[str, Any]], bool]:
     if document["system_error"].get("standard_error") is None and given:
         return given, True
     return document["node_errors"] or [], False
+
+
+def any_time_words(document: dict[str, Any]) -> list[str]:
+    """The evidence that may be looked at any time, in sentences; empty where there is none."""
+    seen = document.get("any_time")
+    if not seen:
+        return []
+    evidence = seen["evidence"]
+    shown = number_text(evidence) if evidence is not None else "more than 1e300"
+    line = f"Evidence against the prediction, valid however often one looks: {shown} (disagrees at {seen['threshold']:g})"
+    if not seen["disagrees"]:
+        return [f"{line}."]
+    when = f", passed at time {number_text(seen['crossed_at'])}" if seen["crossed_at"] is not None else ""
+    strongest = f"; the strongest is on {seen['questions'][0]['about']}" if seen["questions"] else ""
+    return [with_names(f"{line}{when}{strongest}.", document.get("names"))]
 
 
 def agent_order(document: dict[str, Any]) -> list[str]:

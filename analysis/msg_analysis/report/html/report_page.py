@@ -43,6 +43,7 @@ from msg_analysis.report.documents.comparison_words import (
     TIMES,
     agent_errors,
     agent_order,
+    any_time_words,
     furthest,
     sentence,
     timing_facts,
@@ -74,10 +75,19 @@ def write_report(
     strangers: Sequence[Mapping[str, Any]] = (),
     events: Sequence[Mapping[str, Any]] = (),
     wall_time: float | None = None,
+    channel: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the report of a comparison, whole or not at all; InputError if that fails. Arguments as in ``render``."""
     path = Path(path)
-    html = render(comparison, trajectory, restarts=restarts, strangers=strangers, events=events, wall_time=wall_time)
+    html = render(
+        comparison,
+        trajectory,
+        restarts=restarts,
+        strangers=strangers,
+        events=events,
+        wall_time=wall_time,
+        channel=channel,
+    )
     try:
         write_whole(path, html.encode())
     except OSError as error:
@@ -92,6 +102,7 @@ def render(
     strangers: Sequence[Mapping[str, Any]] = (),  # refused messages: node, topic, reason, count
     events: Sequence[Mapping[str, Any]] = (),  # of processes and refused messages: kind, step, node, words
     wall_time: float | None = None,  # [s] that the run took, if known
+    channel: Mapping[str, Any] | None = None,  # hosts, and packets of each pair of them, as in result.json
     host: str | None = None,  # where the report is written and by which command; None: here, and by this one
     command: str | None = None,
 ) -> str:
@@ -112,6 +123,7 @@ def render(
         symbol=run_heading.SYMBOLS[document["verdict"]],
         restarts=restarts,
         strangers=strangers,
+        channel=channel,
         headline=verdict_line(document),
         timing_facts=timing_facts(timing) if timing else [],
         times=TIMES,
@@ -127,6 +139,7 @@ def render(
         interval_bars=interval_bars,
         heat_maps=[name for name in models if name.startswith("covariance_")],
         order=agent_order(document),
+        any_time=" ".join(any_time_words(document)),
         agents=agent_errors(document),
         experiment=experiment,
         versions=trajectory.record.versions,
@@ -188,6 +201,9 @@ def _models(
     }
     if len(comparison.running["time"]) > 1:
         models["running"] = error_plots.convergence(comparison.running, predicted)
+    seen = comparison.any_time
+    if seen and seen.time is not None and seen.log_curve is not None and np.isfinite(seen.log_curve).all():
+        models["evidence"] = error_plots.evidence(seen.time, seen.log_curve, seen.threshold, seen.crossed)
     figures, drawn = trajectory_plots.trajectory_plots(trajectory, predicted, events)
     models |= figures
     known = trajectory.modes[:steps]

@@ -33,6 +33,7 @@ from msg_analysis.report.documents.comparison_words import (
     TIMES,
     agent_errors,
     agent_order,
+    any_time_words,
     gaps,
     sentence,
     timing_facts,
@@ -63,7 +64,7 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
     _print_bags(document.get("bags") or [], console)
     _print_errors(document, console)
     _print_tests(document, console)
-    for line in agent_order(document):
+    for line in [*any_time_words(document), *agent_order(document)]:
         console.print(Text(line))
     loss = document.get("loss") or {}
     if loss.get("lost") is not None:

@@ -48,6 +48,7 @@ from msg_analysis.report.html.plots.plot_style import (
 )
 from msg_analysis.types import FloatArray
 
+MOST_DECADES = 12  # of evidence, shown either way
 MOST_LINES = 8  # agents whose convergence is drawn at once
 _POINTS = 200  # at most, on the line of an agent
 
@@ -76,6 +77,28 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
     margin = 0.08 * (top - bottom) or 1.0
     plot.y_range = Range1d(max(bottom - margin, 0.0), top + margin)  # an error is never negative
     place_legend(plot)
+    return plot
+
+
+def evidence(time: FloatArray, logarithms: FloatArray, threshold: float, crossed: float | None) -> UIElement:
+    """The evidence against the law after some steps, (points,) each, its threshold, and when it was passed first."""
+    shown = np.clip(logarithms, -MOST_DECADES * np.log(10.0), MOST_DECADES * np.log(10.0))
+    plot = new_figure(
+        230,
+        x_axis_label="simulated time",
+        y_axis_label="evidence against the law",
+        x_range=(0.0, float(time[-1])),
+        y_axis_type="log",
+    )
+    source = ColumnDataSource({"time": time, "evidence": np.exp(shown)})
+    line = plot.line("time", "evidence", source=source, color=BLUE, line_width=2)
+    plot.add_layout(Span(location=threshold, dimension="width", line_color=VERMILLION, line_dash="dashed"))
+    if crossed is not None:
+        plot.add_layout(Span(location=crossed, dimension="height", line_color=VERMILLION, line_dash="dotted"))
+    tooltips = [("time", "@time{0.[00]}"), ("evidence", "@evidence{0.000 a}")]
+    plot.add_tools(HoverTool(renderers=[line], mode="vline", tooltips=tooltips, line_policy="nearest"))
+    low, high = float(shown.min()), max(float(shown.max()), float(np.log(threshold)))
+    plot.y_range = Range1d(float(np.exp(low - 0.7)), float(np.exp(high + 0.7)))
     return plot
 
 

@@ -1,0 +1,168 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The evidence against the law of a run over time, looked at after some of its steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, Question
+from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
+from msg_analysis.inference.statistics.mixture_evidence import log_mean
+from msg_analysis.types import FloatArray, IntArray
+
+LARGEST_LOGARITHM = 700.0  # evidence beyond is not shown as a number: floating point ends there
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WatchedEvidence:
+    """Sums over a run, and the evidence after some of its steps; of several runs, only the sums."""
+
+    sums: EvidenceSums
+    dt: float
+    steps: IntArray | None  # (T,) ascending, the last is all steps
+    logarithms: FloatArray | None  # (T,) of the evidence after them
+
+    @classmethod
+    def of(cls, observation: Observation, looks: IntArray) -> WatchedEvidence:
+        """Of a run, at the numbers of steps ``looks`` (T,), ascending, the last of which is all steps."""
+        prediction, step = observation.prediction, observation.step
+        sums = EvidenceSums(prediction, observation.replicas)
+        numbers = (4 + step.most_neighbours) * observation.states[0].size + step.agents**2
+        if sums.error is not None:
+            numbers = max(numbers, sums.error.numbers * (1 + len(sums.error.rates)))
+        logarithms = np.empty(len(looks))
+        ends = iter(enumerate(looks.tolist()))
+        number, end = next(ends)
+        for first, last in observation.blocks(numbers, "evidence"):
+            while first < last:
+                until = min(end, last)
+                sums.add(observation, first, until)
+                first = until
+                if until == end:
+                    logarithms[number] = sums.evidence()
+                    number, end = next(ends, (number, observation.steps + 1))
+        return cls(sums, step.dt, looks, logarithms)
+
+    def merged(self, other: WatchedEvidence) -> WatchedEvidence:
+        """Of these and other runs of the same experiment; the sums of ``self`` are changed in place."""
+        self.sums.merge(other.sums)
+        return WatchedEvidence(self.sums, self.dt, None, None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnyTimeEvidence:
+    """What may be said at any time, however often one looks.
+
+    While the run follows the law, the evidence ever passes ``threshold`` with probability at most 1 / threshold.
+    """
+
+    threshold: float
+    log_evidence: float
+    crossed: float | None  # [units of simulated time] when it passed the threshold first; None: never, or several runs
+    time: FloatArray | None  # (T,) [units of simulated time]; None of several runs
+    log_curve: FloatArray | None  # (T,)
+    questions: Sequence[tuple[str, float]]  # the strongest question of each kind, and its log evidence; largest first
+    half_width: float | None  # of the 95 % interval of the system error that holds at all times at once
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the threshold is passed, or was."""
+        return self.crossed is not None or self.log_evidence >= math.log(self.threshold)
+
+    def to_json(self) -> dict[str, Any]:
+        """The document; evidence that is too large for a number is None."""
+        small = self.log_evidence < LARGEST_LOGARITHM
+        return {
+            "evidence": math.exp(self.log_evidence) if small else None,
+            "log_evidence": self.log_evidence,
+            "threshold": self.threshold,
+            "disagrees": self.disagrees,
+            "crossed_at": self.crossed,
+            "questions": [{"about": words, "log_evidence": log} for words, log in self.questions],
+            "half_width": self.half_width,
+        }
+
+
+def any_time_evidence(
+    watched: WatchedEvidence,
+    level: float,
+    graphs: Sequence[str],
+    variance: float | None = None,
+    steps: int | None = None,
+    planned: int | None = None,
+) -> AnyTimeEvidence:
+    """The evidence in words and numbers.
+
+    Parameters
+    ----------
+    watched
+        of one run or several
+    level
+        probability that the threshold 1 / level is ever passed by a run that follows its law, at most
+    graphs
+        their names
+    variance, steps, planned
+        sum of Var(D_k) of the system error over so many steps, and the number of steps that were planned; None where
+        it is not known
+    """
+    threshold, sums = 1.0 / level, watched.sums
+    time, crossed = None, None
+    if watched.steps is not None and watched.logarithms is not None:
+        time = watched.steps * watched.dt
+        over = np.flatnonzero(watched.logarithms >= math.log(threshold))
+        crossed = float(time[over[0]]) if len(over) else None
+    questions = []
+    for kind, logarithms in sums.families().items():
+        each = log_mean(logarithms, axis=1)
+        best = int(np.argmax(each))
+        questions.append((question_words(sums.question(kind, best), graphs), float(each[best])))
+    half_width = None
+    if variance and steps and planned and sums.error is not None:
+        half_width = float(simultaneous_half_width(variance, sums.error.variance * planned)) / steps
+    return AnyTimeEvidence(
+        threshold=threshold,
+        log_evidence=sums.evidence(),
+        crossed=crossed,
+        time=time,
+        log_curve=watched.logarithms,
+        questions=sorted(questions, key=lambda entry: -entry[1]),
+        half_width=half_width,
+    )
+
+
+def question_words(question: Question, graphs: Sequence[str]) -> str:
+    """What is asked, with agents by number and graphs by name."""
+    agent = None if question.agent is None else question.agent + 1
+    other = None if question.other is None else question.other + 1
+    if question.kind == "gain":
+        return f"gain of leader {agent}" if agent == other else f"gain of the link from agent {other} to agent {agent}"
+    if question.kind == "loss":
+        return f"losses from agent {other} to agent {agent}"
+    if question.kind == "switching":
+        return "switching" if question.graph is None else f"switching away from {graphs[question.graph]}"
+    return {
+        "noise": f"noise of agent {agent}",
+        "gains": "all gains",
+        "pair": f"common noise of agents {agent} and {other}",
+        "broadcast": f"broadcast noise of agent {agent}",
+        "system error": "system error",
+    }[question.kind]

@@ -1,0 +1,203 @@
+"""Evidence on the law of runs: each part against a computation by hand, false alarms, faults that are found."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence, any_time_evidence
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.inference.verdict.pool import compare_pooled
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.theory.prediction import predict
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.twin.simulate import simulate
+
+
+def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:
+    run = {"dt": 0.05, "duration": duration, "replicas": 1, "seed": seed} | changes.pop("run", {})
+    return ValidExperiment.parse(
+        {
+            "name": "net",
+            "problem": "consensus",
+            "time": "continuous",
+            "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
+            "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
+            "run": run,
+            **changes,
+        }
+    )
+
+
+def observed(truth: ValidExperiment, law: ValidExperiment | None = None) -> Observation:
+    """A run of ``truth`` next to the prediction of ``law``."""
+    trajectory = simulate(truth)
+    return Observation.of(trajectory, predict(law or truth))
+
+
+def test_the_error_martingale_is_fair() -> None:
+    """Over the next graph and the next state, by Gauss-Hermite quadrature, the factor of every rate has mean 1."""
+    law = ValidExperiment.parse(
+        {
+            "name": "two",
+            "problem": "consensus",
+            "time": "continuous",
+            "graphs": {"near": {"arcs": [[1, 2, 2.0], [2, 1, 1.0]]}, "far": {"arcs": [[1, 2, 0.3]]}},
+            "switching": {"generator": [[-1, 1], [2, -2]]},
+            "run": {"dt": 0.1, "duration": 10, "replicas": 1, "seed": 1},
+        }
+    )
+    prediction = predict(law)
+    system = prediction.system
+    nodes, weights = np.polynomial.hermite_e.hermegauss(120)
+    weights = weights / weights.sum()
+    for g in range(2):
+        for y in (-3.0, 0.0, 0.4, 5.0):
+            martingale = ErrorMartingale(prediction, 1)
+            mean = np.zeros(len(martingale.rates))
+            after = system.matrices[g, 0, 0] * y + np.sqrt(system.noise[g, 0, 0]) * nodes
+            for j in range(2):
+                for end, weight in zip(after, weights, strict=True):
+                    martingale.total[:] = 0.0
+                    a, b = (np.array([[packed_symmetric.pack(np.array([[v * v]]))[0], 1.0]]) for v in (y, end))
+                    martingale.add(np.array([g]), np.array([j]), a, b)
+                    mean += system.chain[g, j] * weight * np.exp(martingale.total)
+            assert mean == pytest.approx(np.ones(len(mean)), abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"noise": {"loss": 0.3, "link": 0.2, "broadcast": 0.1}},
+        {"noise": {"delay": 2}},
+        {"problem": "tracking", "leaders": {"agents": [2], "gain": 1.5, "reference": 3.0}},
+    ],
+    ids=["plain", "on the air", "delay", "leader"],
+)
+def test_sums_are_those_of_a_loop_over_the_steps(changes: dict[str, Any]) -> None:
+    observation = observed(experiment(duration=12.0, **changes))
+    sums = EvidenceSums(observation.prediction, 1)
+    for first in range(0, observation.steps, 50):
+        sums.add(observation, first, min(first + 50, observation.steps))
+    step, noise = observation.step, observation.prediction.experiment.noise
+    states = observation.states[:, :, 0]
+    heard = states if observation.published is None else observation.published[:, :, 0]
+    squares, score, information = np.zeros(5), np.zeros((5, 5)), np.zeros((5, 5))
+    for k, g in enumerate(observation.modes.tolist()):
+        for i in range(5):
+            neighbours = step.neighbours(g, i).tolist()
+            came = [observation.lost is None or not observation.lost[k, i, d] for d in range(len(neighbours))]
+            parts = {
+                j: step.nominal[g, i, j] * (heard[max(k - noise.delay, 0), j] - states[k, i])
+                for j, there in zip(neighbours, came, strict=True)
+                if there
+            }
+            parts[i] = (step.nominal[g, i].sum() - 1.0) * (states[k, i] - step.reference)
+            variance = 0.05 + noise.link**2 * sum(step.nominal[g, i, j] ** 2 for j in parts if j != i)
+            e = states[k + 1, i] - states[k, i] - sum(parts.values())
+            squares[i] += e**2 / variance
+            for j, part in parts.items():
+                score[i, j] += part * e / variance
+                information[i, j] += part**2 / variance
+    assert sums.squares == pytest.approx(squares)
+    assert sums.link_score == pytest.approx(score, abs=1e-9)
+    assert sums.link_information == pytest.approx(information, abs=1e-9)
+    counts = np.zeros((2, 2))
+    np.add.at(counts, (observation.modes[:-1], observation.modes[1:]), 1)
+    assert (sums.counts == counts).all()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"noise": {"loss": 0.3, "link": 0.2, "broadcast": 0.1}}, {"run": {"pace": "realtime"}}],
+    ids=["lockstep", "on the air", "real time"],
+)
+def test_correct_runs_seldom_pass_at_any_time(changes: dict[str, Any]) -> None:
+    """Of 40 runs, watched 100 times each, at level 10 %: false-alarm rate P(binomial(40, 0.1) > 10) = 0.2 %."""
+    passed = 0
+    for seed in range(40):
+        observation = observed(experiment(seed=100 + seed, duration=25.0, **changes))
+        watched = WatchedEvidence.of(observation, np.arange(5, observation.steps + 1, 5))
+        assert watched.logarithms is not None
+        passed += bool((watched.logarithms >= np.log(10.0)).any())
+    assert passed <= 10
+
+
+ARCS = [[1, 2, 0.5], *([i, j, 1.0] for i, j in ((2, 1), (2, 3), (3, 2), (3, 4), (4, 3), (4, 5), (5, 4)))]
+WEAK = {"line": {"arcs": ARCS}, "ring": {"arcs": [*ARCS, [5, 1, 1.0], [1, 5, 1.0]]}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"noise": {"process": [1, 1, 1.3, 1, 1]}}, "noise of agent 3"),
+        ({"switching": {"generator": [[-1.0, 1.0], [0.5, -0.5]]}}, "switching away from line"),
+        ({"graphs": WEAK}, "gain of the link from agent 1 to agent 2"),
+    ],
+)
+def test_faults_are_found_and_named(changes: dict[str, Any], words: str) -> None:
+    observation = observed(experiment(duration=600.0, **changes), experiment(duration=600.0))
+    looks = np.arange(100, observation.steps + 1, 100)
+    found = any_time_evidence(WatchedEvidence.of(observation, looks), 0.01, ["line", "ring"])
+    assert found.disagrees
+    assert found.crossed is not None
+    assert found.questions[0][0] == words
+
+
+def test_a_fault_of_the_system_error() -> None:
+    """Its own martingale sees agents that have twice the noise variance, without asking for any agent."""
+    noisy = experiment(duration=600.0, noise={"process": 2.0**0.5})
+    observation = observed(noisy, experiment(duration=600.0))
+    sums = EvidenceSums(observation.prediction, 1)
+    sums.add(observation, 0, observation.steps)
+    assert sums.families()["system error"].max() > np.log(1000.0)
+
+
+def test_what_never_moves_is_infinite_evidence() -> None:
+    still = experiment(noise={"process": [1.0, 0.0, 1.0, 1.0, 1.0]})
+    observation = observed(experiment(noise={"process": [1.0, 0.01, 1.0, 1.0, 1.0]}), still)
+    sums = EvidenceSums(observation.prediction, 1)
+    sums.add(observation, 0, observation.steps)
+    assert sums.evidence() == np.inf
+    same = observed(still)
+    sums = EvidenceSums(same.prediction, 1)
+    sums.add(same, 0, same.steps)
+    assert sums.evidence() < 20.0
+    assert "noise" in sums.families()
+
+
+def test_in_a_comparison() -> None:
+    comparison = compare(simulate(experiment(duration=200.0)))
+    document = comparison.to_json()["any_time"]
+    assert not document["disagrees"]
+    assert document["crossed_at"] is None
+    assert document["threshold"] == 100.0
+    assert document["evidence"] == pytest.approx(np.exp(document["log_evidence"]))
+    logs = [entry["log_evidence"] for entry in document["questions"]]
+    assert logs == sorted(logs, reverse=True)
+    half = 0.5 * (comparison.system_error.interval[1] - comparison.system_error.interval[0])
+    assert half < document["half_width"] < 2.5 * half  # wider, since it holds at all times
+
+
+def test_runs_together_are_one_game() -> None:
+    """Sums are added up, and looked at once."""
+    truth = [simulate(experiment(seed=seed, duration=300.0)) for seed in (1, 2)]
+    apart = [compare(run).any_time for run in truth]
+    both = compare_pooled([("one", truth[0]), ("two", truth[1])]).any_time
+    assert both is not None
+    assert both.time is None
+    sums = []
+    for run in truth:
+        observation = Observation.of(run, predict(run.record.experiment))
+        one = EvidenceSums(observation.prediction, 1)
+        one.add(observation, 0, observation.steps)
+        sums.append(one)
+    sums[0].merge(sums[1])
+    assert both.log_evidence == pytest.approx(sums[0].evidence())
+    assert all(alone is not None and np.isfinite(alone.log_evidence) for alone in apart)
