@@ -68,7 +68,8 @@ class EvidenceSums:
         self._process = np.array([process_noise(step, np.full(m, g)) for g in range(step.modes)])  # (n, m, m)
         variances = np.diagonal(self._process, axis1=1, axis2=2)
         self._floor = NO_NOISE * float(variances.max(initial=0.0))
-        self.noisy = (variances > self._floor).all(axis=0) & independent  # (m,) agents whose questions can be asked
+        # (m,) agents whose questions can be asked
+        self.noisy: BoolArray = np.asarray((variances > self._floor).all(axis=0) & independent)
         correlated = bool((self._process * ~np.eye(m, dtype=bool)).any())
         # In real time a value that is used may contain a part of the noise of the same step.
         usable = self.noisy if not (real_time and correlated) else np.zeros(m, dtype=bool)
@@ -88,7 +89,9 @@ class EvidenceSums:
         self._rows = np.flatnonzero(np.diag(step.transition) < 1.0)  # graphs that are left some time
         independent_losses = step.burst is None and not real_time
         self.lossy: IntArray = np.argwhere(step.listens() & (step.losses > 0.0) & independent_losses)  # (links, 2)
-        self.impossible = False  # whether anything happened that cannot: movement without noise, a loss of what never is
+        self.impossible = (
+            False  # whether anything happened that cannot: movement without noise, a loss of what never is
+        )
         self.error = ErrorMartingale(prediction, replicas) if self.plain else None
 
     def add(self, observation: Observation, first: int, last: int) -> None:
@@ -123,9 +126,7 @@ class EvidenceSums:
             a[:, :-1] = moments(observation, first, first + steps + 1, observation.states)
             self.error.add(graphs[:-1], graphs[1:], a[:-1], a[1:])
 
-    def _add_links(
-        self, reception: HeardValues, white: FloatArray, scale: FloatArray, lost: BoolArray | None
-    ) -> None:
+    def _add_links(self, reception: HeardValues, white: FloatArray, scale: FloatArray, lost: BoolArray | None) -> None:
         """Scores of the gains; regressors and innovations over the standard deviation of the noise."""
         step = self._step
         agents, every = np.arange(step.agents), np.arange(len(white))

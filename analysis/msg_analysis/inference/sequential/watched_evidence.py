@@ -127,7 +127,7 @@ def any_time_evidence(
     threshold, sums = 1.0 / level, watched.sums
     time, crossed = None, None
     if watched.steps is not None and watched.logarithms is not None:
-        time = watched.steps * watched.dt
+        time = np.asarray(watched.steps * watched.dt, dtype=float)
         over = np.flatnonzero(watched.logarithms >= math.log(threshold))
         crossed = float(time[over[0]]) if len(over) else None
     questions = []

@@ -106,7 +106,9 @@ def any_time_words(document: dict[str, Any]) -> list[str]:
         return []
     evidence = seen["evidence"]
     shown = number_text(evidence) if evidence is not None else "more than 1e300"
-    line = f"Evidence against the prediction, valid however often one looks: {shown} (disagrees at {seen['threshold']:g})"
+    line = (
+        f"Evidence against the prediction, valid however often one looks: {shown} (disagrees at {seen['threshold']:g})"
+    )
     if not seen["disagrees"]:
         return [f"{line}."]
     when = f", passed at time {number_text(seen['crossed_at'])}" if seen["crossed_at"] is not None else ""
