@@ -33,11 +33,16 @@ def simultaneous_half_width(variance: FloatArray | float, target: float, level: 
     Parameters
     ----------
     variance
-        (...) sum V of the conditional variances so far
+        (..., ) sum V of the conditional variances so far
     target
         V at which the bound is nearly as low as it can be: chosen before the run
     level
         probability that it is ever passed
+
+    Returns
+    -------
+    FloatArray
+        (..., ) bound on the absolute value of the sum
     """
     wide = 2.0 * math.log(1.0 / level)
     r = max(target, np.finfo(float).tiny) / (wide + math.log(1.0 + wide))

@@ -41,9 +41,9 @@ def variance_evidence(samples: FloatArray | IntArray, squares: FloatArray) -> Fl
     Parameters
     ----------
     samples
-        (...) numbers n
+        (..., ) numbers n
     squares
-        (...) sums of squares S
+        (..., ) sums of squares S
 
     Returns
     -------
@@ -64,11 +64,11 @@ def coefficient_evidence(score: FloatArray, information: FloatArray, size: Float
     Parameters
     ----------
     score
-        (...) U, sum of regressor times sample over variance
+        (..., ) U, sum of regressor times sample over variance
     information
-        (...) J, sum of squared regressor over variance
+        (..., ) J, sum of squared regressor over variance
     size
-        (...) the coefficient in the law; tau are ``SHARES`` of it
+        (..., ) the coefficient in the law; tau are ``SHARES`` of it
 
     Returns
     -------
@@ -119,9 +119,9 @@ def proportion_evidence(successes: IntArray, trials: IntArray, probability: Floa
     Parameters
     ----------
     successes, trials
-        (...) counts
+        (..., ) counts
     probability
-        (...) between 0 and 1, both excluded
+        (..., ) between 0 and 1, both excluded
 
     Returns
     -------
