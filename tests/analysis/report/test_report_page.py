@@ -247,7 +247,7 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         "predicted, logged pattern",
     ):
         assert text in page.text
-    assert _plots(page) == 15
+    assert _plots(page) == 16
     without_figures(monkeypatch)
     on_time = in_real_time(0)
     write_report(on_time, on_time.trajectory, tmp_path / "report.html")

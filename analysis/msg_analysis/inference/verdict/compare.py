@@ -40,7 +40,7 @@ from msg_analysis.inference.verdict.evidence import Evidence
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.types import FloatArray
 
 MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
