@@ -77,6 +77,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "terminal",
         "discovery",
         "processes",
+        "channel",
         "recovery",
         "replay",
         "watching",

@@ -146,6 +146,13 @@ def _interruption() -> Interruption:
 )
 @nodes.use_sim_time
 @click.option(
+    "--channel",
+    "channel_file",
+    type=YAML,
+    metavar="FILE",
+    help="Put each process on a host of its own, or as FILE says, with loss, delay and rate between them (root).",
+)
+@click.option(
     "--pin/--no-pin",
     default=True,
     help="Pin each process to one core if there are more processes than cores: faster (lockstep).",
@@ -171,6 +178,7 @@ def run(
     domain: int | None,
     readers: tuple[str, ...],
     use_sim_time: bool,
+    channel_file: Path | None,
     pin: bool,
     no_fork: bool,
     compression: Compression,
@@ -193,6 +201,14 @@ def run(
     interruption = _interruption()
     changes = {"seed": seed, "duration": duration, "pace": pace, "speed": speed, "processes": processes}
     what = load_with_overrides(experiment, changes)
+    channel = None
+    if channel_file is not None:
+        if use_sim_time or readers:
+            option = "--use-sim-time" if use_sim_time else "--await"
+            raise click.UsageError(f"{option}: not with --channel: other programs do not reach its hosts")
+        from msg_agents.channel.channel_file import Channel
+
+        channel = Channel.load(channel_file, what)
     with page(web, web_host) as served:
         with RunView(what, served, tells_domain=not as_json) as view:
             if served is not None:
@@ -209,6 +225,7 @@ def run(
                 fork=not no_fork,
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
+                channel=channel,
                 interruption=interruption,
             )
         say, analyse = view.display.end, not no_analyse
@@ -367,6 +384,14 @@ def host(
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
 
 
+@main.command(epilog=examples("msg-agents schema > channel.schema.json"))
+def schema() -> None:
+    """Print the JSON Schema of channel files, for editors."""
+    from msg_agents.channel.channel_file import json_schema
+
+    print_json(json_schema(), indent=2)
+
+
 for _command in (
     begin.demo_of(run),
     begin.examples,
@@ -376,6 +401,7 @@ for _command in (
     nodes.agent,
     nodes.switcher,
     nodes.recorder,
+    nodes.channel,
     replay.play,
     watching.live,
     watching.markers,

@@ -65,6 +65,7 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
         ),
         click.option("--lifeline", type=int, hidden=True),
         click.option("--introduction", type=int, hidden=True),
+        click.option("--namespace", type=int, hidden=True),
         click.option(
             "--account",
             type=PATH,
@@ -164,12 +165,14 @@ def agent(
 @_checkpoint
 @_patience
 @click.option("--steps", type=PATH, hidden=True)
+@click.option("--active-graph", type=PATH, hidden=True)
 def switcher(
     run_record: Path,
     *,
     readers: tuple[str, ...],
     checkpoint: Path | None,
     steps: Path | None,
+    active_graph: Path | None,
     patience: float | None,
     **options: Any,
 ) -> None:
@@ -181,6 +184,13 @@ def switcher(
 
         if steps is not None:
             write_steps(steps, reached)
+
+    def tell_channel(file: Path | None) -> Callable[[int], None]:
+        if file is None:
+            return lambda _: None
+        from msg_agents.channel.active_graph import ActiveGraphFile
+
+        return ActiveGraphFile(file).tell
 
     def nodes() -> list[NetworkNode]:
         from msg_agents.nodes.network_node import ACK_TIMEOUT
@@ -196,6 +206,7 @@ def switcher(
             model=model,
             readers=list(readers),
             on_progress=report,
+            on_graph=tell_channel(active_graph),
             checkpoints=directory,
             ack_timeout=max(ACK_TIMEOUT, patience or 0.0),
         )
@@ -224,18 +235,32 @@ def recorder(
     _run_nodes(nodes, record, **options)
 
 
+@click.command(hidden=True)
+@click.option("--control", type=int, required=True)
+def channel(control: int) -> None:
+    """Be the channel of a run, which tells it over the socket CONTROL what to do."""
+    from msg_agents.channel.process import serve
+
+    serve(control)
+
+
 def _run_nodes(
     nodes: Callable[[], list[NetworkNode]],
     record: RunRecord,
     *,
     lifeline: int | None,
     introduction: int | None,
+    namespace: int | None,
     discovery_timeout: float,
     use_sim_time: bool,
     account: Path | None,
     parameter_services: bool,  # noqa: ARG001  see LeanNode
     patience: float | None = None,
 ) -> None:
+    if namespace is not None:
+        from msg_agents.channel.namespaces import enter
+
+        enter(namespace)
     if lifeline is not None:
         hold_pipe(lifeline)
     from msg_agents.nodes.node_process import run_nodes

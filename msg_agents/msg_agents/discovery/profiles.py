@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from pathlib import Path
 
 from msg_analysis.common.version import ros_distribution
@@ -36,7 +38,50 @@ MOST_INTRODUCED = 206  # participants that are introduced to each other: they fi
 NUMBERS_OF_DOMAIN = 119  # of participants whose ports are those of their domain; from there on, of the next one
 UDP_PROFILE = Path(__file__).with_name("udp.xml")
 
+LEASE = 60.0
+"""s of silence after which a participant on another host counts as gone, and messages on their way to it are lost: the
+longest time for which a host may be cut off."""
+
+ANNOUNCEMENT = 3.0  # s between two announcements of a participant to other hosts
+_NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
+
 
 def domains_for(participants: int) -> int:
     """How many domains in a row have the ports of so many participants that are introduced to each other."""
     return -(-(FIRST_INTRODUCED + participants) // NUMBERS_OF_DOMAIN)
+
+
+def profile_for_hosts(
+    addresses: Sequence[str] = (),  # of all hosts, at which participants are looked for; empty: by multicast
+    participants: int = MOST_PARTICIPANTS,  # to look for at each address
+    *,
+    lease: float = LEASE,  # s
+) -> str:
+    """A profile, as XML, for participants on several hosts: UDP at all their interfaces."""
+    ET.register_namespace("", _NAMESPACE)
+    tree = ET.parse(LOOPBACK_PROFILE)  # drops its comments, which are about another profile
+
+    def find(path: str) -> ET.Element:
+        found = tree.find(f".//{{*}}{path.replace('/', '/{*}')}")
+        assert found is not None, path
+        return found
+
+    find("maxInitialPeersRange").text = str(participants)
+    find("transport_descriptor").remove(find("interfaceWhiteList"))  # messages go to other hosts
+    discovery = ET.Element(_tag("discovery_config"))
+    find("builtin").insert(0, discovery)
+    for key, seconds in (("leaseDuration", lease), ("leaseAnnouncement", ANNOUNCEMENT)):
+        ET.SubElement(ET.SubElement(discovery, _tag(key)), _tag("sec")).text = f"{seconds:.0f}"
+    peers = find("initialPeersList")
+    peers.clear()
+    for address in addresses:
+        locator = ET.SubElement(ET.SubElement(peers, _tag("locator")), _tag("udpv4"))
+        ET.SubElement(locator, _tag("address")).text = address
+    if not addresses:
+        find("builtin").remove(peers)
+    ET.indent(tree, "  ")
+    return ET.tostring(tree.getroot(), encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _tag(name: str) -> str:
+    return f"{{{_NAMESPACE}}}{name}"

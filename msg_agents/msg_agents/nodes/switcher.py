@@ -67,6 +67,7 @@ class Switcher(NetworkNode):
         model: Wiring,
         readers: list[str],  # nodes other than the agents that must be discovered before the run starts
         on_progress: Callable[[Sequence[int]], None] = lambda _: None,  # newest step of every agent, -1: none yet
+        on_graph: Callable[[int], None] = lambda _: None,  # mode, from 0, of the graph that is active from now on
         checkpoints: Path | None = None,  # directory for a mark; finding one there means a takeover
         ack_timeout: float = ACK_TIMEOUT,  # s to wait for acknowledgements of the end
     ) -> None:
@@ -78,7 +79,7 @@ class Switcher(NetworkNode):
         self._slowest = -1
         self._heard = False  # from an agent since the last call of on_progress
         self._recorded = RECORDER not in readers
-        self._on_progress = on_progress
+        self._on_progress, self._on_graph = on_progress, on_graph
         self._duplicates: set[str] = set()  # names seen at the last check
         self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
         if self._mark and self._mark.exists():  # in the middle of a run, none of the user's nodes is awaited
@@ -173,7 +174,7 @@ class LockstepSwitcher(Switcher):
         super().__init__(**options)
         # A mark means that part of the path has been published; how much is not known.
         self._behind = bool(self._mark and self._mark.exists())
-        self._ahead: deque[int] = deque()  # first steps of published sojourns that the slowest agent has not reached
+        self._ahead: deque[Sojourn] = deque()  # published sojourns that the slowest agent has not reached
         self._most_ahead = MOST_AHEAD
 
     def _health(self, values: dict[str, str]) -> Health:
@@ -193,8 +194,8 @@ class LockstepSwitcher(Switcher):
             if slowest < 0:  # not all agents have reported yet
                 return
             self._catch_up(slowest)
-        while self._ahead and self._ahead[0] <= slowest:
-            self._ahead.popleft()
+        while self._ahead and self._ahead[0].first_step <= slowest:
+            self._on_graph(self._ahead.popleft().mode)
         while len(self._ahead) < self._most_ahead:
             sojourn = next(self._path, None)
             if sojourn is None:
@@ -215,7 +216,7 @@ class LockstepSwitcher(Switcher):
     def _go_ahead(self, sojourn: Sojourn) -> None:
         size = self._publish_sojourn(sojourn)
         self._most_ahead = min(self._most_ahead, max(LEAST_AHEAD, BYTES_AHEAD // size))
-        self._ahead.append(sojourn.first_step)
+        self._ahead.append(sojourn)
 
 
 class RealtimeSwitcher(Switcher):
@@ -270,6 +271,7 @@ class RealtimeSwitcher(Switcher):
             self._next = next(self._path, None)
         for sojourn in begun:
             self._publish_sojourn(sojourn)
+            self._on_graph(sojourn.mode)
         if self._next:
             self._timer.set(self._schedule.clock_time(self._next.first_step))
 

@@ -128,6 +128,20 @@ def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str,
     return environment
 
 
+def channel_environment(profile: Path) -> dict[str, str]:
+    """Changes to our environment that make the middleware follow a profile, whatever the user has set.
+
+    Shared memory, a discovery server or a discovery range of the user's would lead messages past the channel.
+    """
+    return {
+        **profile_variables(profile),
+        RANGE_VARIABLE: "SYSTEM_DEFAULT",
+        TRANSPORTS_VARIABLE: "",
+        LOCALHOST_VARIABLE: "",
+        SERVER_VARIABLE: "",
+    }
+
+
 def without_shared_memory() -> dict[str, str]:
     """Changes to our environment that make the middleware use UDP only; the user's profile or transports are kept.
 

@@ -22,15 +22,14 @@ from __future__ import annotations
 
 import re
 import socket
-import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from msg_agents.discovery.profiles import LOOPBACK_PROFILE, MOST_PARTICIPANTS
+from msg_agents.discovery.profiles import MOST_PARTICIPANTS, profile_for_hosts
 from msg_agents.discovery.rtps import PEERS_VARIABLE
 from msg_agents.processes.environment import LAST_DOMAIN, node_environment
 from msg_agents.processes.process_plan import Share, wanted_processes
@@ -40,17 +39,11 @@ from msg_analysis.model.experiment.problems import ExperimentError, problem, sho
 from msg_analysis.model.experiment.spec import expected
 from msg_analysis.model.experiment.yaml_document import read_yaml
 
-LEASE = 60.0
-"""s of silence after which a participant counts as gone, and messages on their way to it are lost: the longest time for
-which a host may be cut off."""
-
-ANNOUNCEMENT = 3.0  # s between two announcements of a participant to all possible peers
 VISITORS = 8  # participants on a host besides those of the run, such as tools that watch it
-_NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
 _RANGE = re.compile(r"([0-9]+)-([0-9]+)")
 
 
-def _numbers(value: object) -> list[int]:
+def agent_numbers(value: object) -> list[int]:
     """Agent numbers from a list of numbers and of ranges."""
     wanted = expected("a list of numbers of agents, from 1, and of ranges such as 3-5")
     if not isinstance(value, list):
@@ -76,7 +69,7 @@ class HostSpec(BaseModel):
         description="the address at which the other hosts reach this one",
         examples=["192.0.2.1"],
     )
-    agents: Annotated[list[int], BeforeValidator(_numbers)] = Field(
+    agents: Annotated[list[int], BeforeValidator(agent_numbers)] = Field(
         default=[], description="the agents that run there", examples=[[1, "3-5"]]
     )
 
@@ -159,28 +152,8 @@ class Hosts:
 
     def profile(self, experiment: ValidExperiment) -> str:
         """The Fast DDS profile with which the processes of all hosts find each other."""
-        ET.register_namespace("", _NAMESPACE)
-        tree = ET.parse(LOOPBACK_PROFILE)  # drops its comments, which are about another profile
         addresses = list(dict.fromkeys(("127.0.0.1", *self.addresses.values())))
-
-        def find(path: str) -> ET.Element:
-            found = tree.find(f".//{{*}}{path.replace('/', '/{*}')}")
-            assert found is not None, path
-            return found
-
-        find("maxInitialPeersRange").text = str(self.participants(experiment))
-        find("transport_descriptor").remove(find("interfaceWhiteList"))  # messages go to other hosts
-        discovery = ET.Element(_tag("discovery_config"))
-        find("builtin").insert(0, discovery)
-        for key, seconds in (("leaseDuration", LEASE), ("leaseAnnouncement", ANNOUNCEMENT)):
-            ET.SubElement(ET.SubElement(discovery, _tag(key)), _tag("sec")).text = f"{seconds:.0f}"
-        peers = find("initialPeersList")
-        peers.clear()
-        for address in addresses:
-            locator = ET.SubElement(ET.SubElement(peers, _tag("locator")), _tag("udpv4"))
-            ET.SubElement(locator, _tag("address")).text = address
-        ET.indent(tree, "  ")
-        return ET.tostring(tree.getroot(), encoding="unicode", xml_declaration=True) + "\n"
+        return profile_for_hosts(addresses, self.participants(experiment))
 
     def environment(self, experiment: ValidExperiment, folder: Path) -> dict[str, str]:
         """Environment of the processes, with the profile written to ``folder``; the user's own profile is kept."""
@@ -190,19 +163,21 @@ class Hosts:
         return node_environment(self.domain, profile) | {PEERS_VARIABLE: " ".join(others)}
 
 
-def _tag(name: str) -> str:
-    return f"{{{_NAMESPACE}}}{name}"
-
-
 def _mistakes(spec: HostsSpec, agents: int) -> list[str]:
     """Mistakes in the assignment of agents and recorder to hosts."""
     problems = []
     if spec.recorder not in spec.hosts:
         names = ", ".join(spec.hosts)
         problems.append(problem("recorder", spec.recorder, f"expected one of the hosts, {names}", "name one of them"))
+    return problems + assignment_problems({name: host.agents for name, host in spec.hosts.items()}, agents)
+
+
+def assignment_problems(hosts: Mapping[str, Sequence[int]], agents: int) -> list[str]:
+    """Mistakes in the numbers of the agents on each host, of an experiment with so many agents."""
+    problems = []
     where: dict[int, list[str]] = {}
-    for name, host in spec.hosts.items():
-        for number in host.agents:
+    for name, numbers in hosts.items():
+        for number in numbers:
             where.setdefault(number, []).append(name)
     unknown = sorted(number for number in where if number > agents)
     if unknown:

@@ -29,7 +29,7 @@ from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.types import BoolArray
 from msg_analysis.wire.topics import agent_name
 
-RECORDER, SWITCHER = "recorder", "switcher"
+RECORDER, SWITCHER, CHANNEL = "recorder", "switcher", "channel"
 SMALL = 8
 """Of ``processes: auto``: up to so many agents, each has a process of its own; beyond, there is one process per so many
 agents, but not more than the machine has cores."""
@@ -91,6 +91,23 @@ def count_processes(experiment: ValidExperiment, agents: int | None = None, *, m
     return count
 
 
+def split_agents(
+    experiment: ValidExperiment, agents: Sequence[int] | None = None, *, most: int = MOST_UNAIDED
+) -> list[tuple[int, ...]]:
+    """The agents (indices, ascending; None: all) of each process; InputError: more than ``most`` processes."""
+    agents = range(experiment.agents) if agents is None else agents
+    count = count_processes(experiment, len(agents), most=most)
+    # Consecutive agents share a process: in most graphs they are neighbours, and their messages stay inside.
+    return [tuple(agents[i * len(agents) // count : (i + 1) * len(agents) // count]) for i in range(count)]
+
+
+def process_name(agents: Sequence[int]) -> str:
+    """The name of a process with these agents (indices, ascending)."""
+    first, last = agents[0] + 1, agents[-1] + 1
+    rest = f"to_{last}" if last - first == len(agents) - 1 else f"and_{len(agents) - 1}_more"
+    return f"agent_{first}" if first == last else f"agents_{first}_{rest}"
+
+
 def discovery_timeout(agents: int, processes: int) -> float:
     """Seconds after which a node of a network of so many agents and processes gives up on the missing ones.
 
@@ -111,18 +128,22 @@ def plan_network(
     share: Share | None = None,
     readers: Sequence[str] = (),  # nodes that the user starts, and that must read the topics before the run starts
     most: int = MOST_UNAIDED,
+    hosts: Sequence[Sequence[int]] = (),  # agents of each host of a channel: a process is on one; empty: no channel
 ) -> list[ProcessPlan]:
     """The processes of a run, in the order in which to start them; with ``share``, those of this host only.
 
     InputError: more than ``most`` processes with agents.
     """
     here = tuple(range(experiment.agents)) if share is None else share.agents
-    count = count_processes(experiment, len(here), most=most)
+    groups = [group for part in hosts or [here] for group in split_agents(experiment, part, most=most)]
+    count = len(groups)
+    if count > most:
+        raise InputError(f"run.processes: {count} processes on all hosts: expected at most {most}: give fewer")
     common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
     if parameter_services:
         common += ("--parameter-services",)
     timeout = discovery_timeout(experiment.agents, count) if share is None else share.discovery_timeout
-    if readers:
+    if readers or hosts:  # what a channel loses is sent again
         timeout = max(timeout, USER_TIMEOUT)
     if timeout != DISCOVERY_TIMEOUT:
         common += ("--discovery-timeout", f"{timeout:g}")
@@ -140,14 +161,10 @@ def plan_network(
         if storage.split_size is not None:
             files += ("--split-size", repr(storage.split_size / MEGABYTE))
         plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
-    for index in range(count):
-        # Consecutive agents share a process: in most graphs they are neighbours, and their messages stay inside.
-        agents = here[index * len(here) // count : (index + 1) * len(here) // count]
+    for agents in groups:
         numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
-        first, last = agents[0] + 1, agents[-1] + 1
-        rest = f"to_{last}" if last - first == len(agents) - 1 else f"and_{len(agents) - 1}_more"
-        name = f"agent_{first}" if first == last else f"agents_{first}_{rest}"
-        plans.append(ProcessPlan(name, ("agent", str(run_file), *numbers, *options), agents, resumes))
+        arguments = ("agent", str(run_file), *numbers, *options)
+        plans.append(ProcessPlan(process_name(agents), arguments, agents, resumes))
     if home:
         plans.append(ProcessPlan(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
     return plans

@@ -57,6 +57,8 @@ class RunResult:
         when processes were killed and back, and messages first refused: see ``running.event_log``
     reached
         newest step of the slowest agent, as last reported; -1: none
+    channel
+        what the channel did: see ``channel.counts``; None: there was none
     trajectory
         states of the bag; None if there is none, or it could not be read, or the run was interrupted
     comparison
@@ -75,6 +77,7 @@ class RunResult:
     strangers: list[dict[str, Any]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
     reached: int = -1
+    channel: dict[str, Any] | None = None
     trajectory: Trajectory | None = None
     comparison: Comparison | None = None
     report: Path | None = None
@@ -140,6 +143,7 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
             strangers=result.strangers,
             events=result.events,
             wall_time=result.wall_time,
+            channel=result.channel,
         )
         result.report = file
     result.comparison = comparison

@@ -23,6 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 
+from msg_agents.channel.channel_file import Channel
 from msg_agents.processes.core_pinning import place
 from msg_agents.processes.environment import RESTARTS
 from msg_agents.processes.fork_server import NodeServer
@@ -37,6 +38,7 @@ from msg_agents.processes.process_plan import (
 )
 from msg_agents.recovery.checkpoint import room_for
 from msg_agents.running.event_log import EventLog
+from msg_agents.running.run_channel import run_channel
 from msg_agents.running.run_folder import make_bag_directory, workshop
 from msg_agents.running.run_result import RunResult
 from msg_agents.running.supervisor import ACCOUNTS, CRASHED, STEPS, Supervisor
@@ -76,6 +78,7 @@ def run_network(
     environment: Mapping[str, str] | None = None,
     record: RunRecord | None = None,
     share: Share | None = None,
+    channel: Channel | None = None,
     interruption: Interruption | None = None,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
@@ -118,6 +121,8 @@ def run_network(
     share
         what this host runs, of several hosts; None: all. Without the recorder only the logs are kept, in the
         directory that would hold the bag
+    channel
+        the hosts on which the processes are, and what is between them; None: all are on this one
     interruption
         keeps signals from the start of the processes on, beyond the end of this call; None: one for this call only
 
@@ -129,11 +134,12 @@ def run_network(
     Raises
     ------
     NotAvailableError, InputError
-        the experiment cannot be run, or no domain is free; nothing was started, and no bag or log is left
+        the experiment cannot be run, no domain is free, or rights for a channel are missing; nothing was started, and
+        no bag or log is left
     """
     view = view or View(on_progress, on_note)
     experiment.require_available()
-    most = MOST_PROCESSES if will_introduce(environment or {}) else MOST_UNAIDED
+    most = MOST_PROCESSES if channel is None and will_introduce(environment or {}) else MOST_UNAIDED
     processes = count_processes(experiment, None if share is None else len(share.agents), most=most)
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
     bag = directory if share is None or share.home else None
@@ -141,8 +147,14 @@ def run_network(
     kept = interruption or Interruption()
     try:
         with (
+            run_channel(channel) as linked,
             workshop() as folder,
-            surroundings(folder, domain, environment or {}, processes + 2) as around,
+            surroundings(
+                folder,
+                domain,
+                {**(environment or {}), **(linked.environment(folder) if linked else {})},
+                processes + 2,
+            ) as around,
         ):
             variables = around.environment
             if share is None:
@@ -173,7 +185,10 @@ def run_network(
                         share=share,
                         readers=readers,
                         most=MOST_PROCESSES if around.introducer else MOST_UNAIDED,
+                        hosts=linked.agents if linked else (),
                     )
+                    if linked:
+                        linked.start(supervisor, plans, record.model)
                     if around.introducer:
                         around.introducer.introduce(partners(plans, record.model.listens()))
                     if pin and experiment.run.pace == "lockstep":
@@ -186,6 +201,8 @@ def run_network(
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
                     _collect_failures(supervisor, result, kept, restarts)
             result.strangers = supervisor.account().strangers()
+            if linked:
+                result.channel = linked.to_json(supervisor)
             if bag is not None:
                 try:
                     with kept.let_through():

@@ -20,6 +20,7 @@ import contextlib
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -32,7 +33,7 @@ from typing import Self
 from msg_agents.discovery.introducer import Introducer
 from msg_agents.processes.core_pinning import keep_to
 from msg_agents.processes.fork_server import NodeServer, NodeStart
-from msg_agents.processes.process_plan import RECORDER, SWITCHER, ProcessPlan
+from msg_agents.processes.process_plan import CHANNEL, RECORDER, SWITCHER, ProcessPlan
 from msg_agents.processes.status_file import Account, read_accounts, read_steps
 from msg_analysis.common.forked_processes import Process
 
@@ -42,6 +43,7 @@ ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0)
 AT_ONCE = 50  # processes that are started together: so many log files are then open
 POLL = 0.02  # s
 SILENCE = 3.0  # s; accounts are written once a second
+CHANNEL_SILENCE = 10.0  # s after which a channel that reports nothing is given up
 EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
 CRASHED = 1  # exit code of Python after an uncaught exception
 ACCOUNTS, STEPS = "accounts", "steps.json"
@@ -65,6 +67,7 @@ class Child:
     number: int = 1  # of this start; 2: restarted once
     ended: float | None = None  # when it was first seen to have ended with exit code 0 [s]
     early: bool = False  # whether it did so before its last step
+    given_up: str | None = None  # why it was ended
 
     @property
     def running(self) -> bool:
@@ -89,6 +92,8 @@ class Child:
     def failure(self) -> str | None:
         """How it failed, in words; None if it is running or has ended well."""
         code = self.process.poll()
+        if self.given_up:
+            return self.given_up
         if self.early:
             return f"exit code {code} before its last step"
         return None if code is None else failure_of(code)
@@ -128,14 +133,31 @@ class Supervisor:
     last_step: int = 0  # of the run
     fork_server: NodeServer | None = None  # without one, or when it has ended, every child starts on its own
     introducer: Introducer | None = None  # without one, the children look for each other
+    namespaces: Mapping[str, int] = field(default_factory=dict)  # descriptors by name of the process; else that of ours
+    options: Mapping[str, Sequence[str]] = field(default_factory=dict)  # more of them, by name of the process
+    channel: Child | None = None  # carries the packets of the others; not one of ``children``: it has no part to do
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
+    _control: socket.socket | None = field(default=None, init=False)  # of the channel, which ends when it is closed
 
     def start(self, plans: Sequence[ProcessPlan]) -> None:
         """Start all processes."""
         self._lifeline = os.pipe()
         for first in range(0, len(plans), AT_ONCE):
             self.children += self._start([(plan, 1) for plan in plans[first : first + AT_ONCE]])
+
+    def start_channel(self) -> socket.socket:
+        """Start the process of a channel, before all others; the socket at which it waits for ``hand_over``."""
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            plan = ProcessPlan(CHANNEL, (CHANNEL, "--control", str(theirs.fileno())))
+            (self.channel,) = self._start([(plan, 1)])
+        return self._control
+
+    @property
+    def channel_account(self) -> Path:
+        """The file in which the channel says what it did."""
+        return self.logs / ACCOUNTS / f"{CHANNEL}.1.json"
 
     def restart(self, child: Child) -> None:
         """Start a process that has ended again; the new child takes its place in ``children``."""
@@ -161,14 +183,19 @@ class Supervisor:
         return self.logs / f"{plan.name}.log"
 
     def _node_start(self, plan: ProcessPlan, number: int, output: int) -> NodeStart:
+        if plan.name == CHANNEL:
+            *command, option, control = plan.arguments
+            return NodeStart(command, {option: int(control)}, output, None)
         account = self.logs / ACCOUNTS / f"{plan.name}.{number}.json"
         self._accounts.append(account)
-        arguments = [*plan.arguments, "--account", str(account)]
+        arguments = [*plan.arguments, "--account", str(account), *self.options.get(plan.name, ())]
         if plan.name == SWITCHER:
             arguments += ["--steps", str(self.logs / STEPS)]
         descriptors = {"--lifeline": self._lifeline[0]}
         if self.introducer is not None:
             descriptors["--introduction"] = self.introducer.descriptor
+        if plan.name in self.namespaces:
+            descriptors["--namespace"] = self.namespaces[plan.name]
         return NodeStart(arguments, descriptors, output, self.cores.get(plan.name))
 
     def _spawn(self, node: NodeStart) -> Process:
@@ -190,6 +217,9 @@ class Supervisor:
     def read_status(self) -> None:
         """Read what the switcher has reported, and note agents that have ended too early: their code may end Python."""
         self.steps = read_steps(self.logs / STEPS) or self.steps
+        if self.channel and CHANNEL_SILENCE < self.channel.age_of_account < math.inf and self.channel.running:
+            self.channel.given_up = f"no report for {CHANNEL_SILENCE:g} s, as if it was stopped"
+            self.channel.process.send_signal(signal.SIGKILL)
         switching = any(child.running for child in self.children if child.plan.name == SWITCHER)
         for child in self.children:
             if not self.steps or not switching or not child.plan.agents or child.process.poll() != 0:
@@ -215,7 +245,8 @@ class Supervisor:
     @property
     def silent(self) -> list[Child]:
         """Running children that have not written their account lately."""
-        return [child for child in self.running if child.age_of_account > SILENCE]
+        running = self.running + ([self.channel] if self.channel and self.channel.running else [])
+        return [child for child in running if child.age_of_account > SILENCE]
 
     @property
     def over(self) -> bool:
@@ -234,7 +265,7 @@ class Supervisor:
     @property
     def failures(self) -> list[Child]:
         """Children that failed; after the end of the run, only the recorder can still fail."""
-        failed = [child for child in self.children if child.failure]
+        failed = [child for child in (self.channel, *self.children) if child and child.failure]
         if failed and self.over:
             return [child for child in failed if child.plan.name == RECORDER]
         return failed
@@ -243,6 +274,9 @@ class Supervisor:
         """End all: first the agents and the switcher, so that the recorder gets all that they sent."""
         self._end([child for child in self.children if child.plan.name != RECORDER])
         self._end([child for child in self.children if child.plan.name == RECORDER])
+        if self.channel and self._control:
+            self._control.close()
+            self._end([self.channel])
 
     @staticmethod
     def _end(children: Sequence[Child]) -> None:

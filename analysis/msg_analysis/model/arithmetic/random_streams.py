@@ -45,6 +45,7 @@ class Stream(IntEnum):
     LOSS = 6
     PHASE = 7
     PAST = 8
+    CHANNEL = 100  # packets between two hosts; all others are part of the run
 
 
 def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.random.Generator:

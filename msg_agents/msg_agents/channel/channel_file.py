@@ -1,0 +1,314 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The channel file: which agents are on which host, and what happens to the packets between two hosts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from msg_agents.channel.link import LinkSettings, LossModel
+from msg_agents.channel.namespaces import MOST_HOSTS
+from msg_agents.processes.hosts import agent_numbers, assignment_problems
+from msg_agents.processes.process_plan import process_name, split_agents
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.experiment.problems import ExperimentError, problem, translate
+from msg_analysis.model.experiment.spec import expected, is_number
+from msg_analysis.model.experiment.yaml_document import read_yaml
+from msg_analysis.types import BoolArray, FloatArray
+
+BASE = "base"
+"""The host of recorder and switcher."""
+
+MTU = 65535  # bytes; every message of a run is then one packet
+SECOND = 1e3  # ms
+
+
+def _number(wanted: str, fits: Callable[[float], bool]) -> BeforeValidator:
+    def check(value: object) -> object:
+        if not is_number(value) or not fits(float(value)):  # type: ignore[arg-type]
+            raise expected(wanted)
+        return float(value)  # type: ignore[arg-type]
+
+    return BeforeValidator(check)
+
+
+Probability = Annotated[float, _number("a number >= 0 and < 1", lambda p: 0 <= p < 1)]
+AnyProbability = Annotated[float, _number("a number from 0 to 1", lambda p: 0 <= p <= 1)]
+Milliseconds = Annotated[float, _number("a number of milliseconds from 0 to 60000", lambda t: 0 <= t <= 60_000)]
+Rate = Annotated[float, _number("a number of Mbit/s > 0", lambda r: r > 0)]
+BurstLength = Annotated[float, _number("a number >= 1", lambda n: n >= 1)]
+
+
+class TwoStates(BaseModel):
+    """Gilbert-Elliott: losses come in bursts, since the link is in a good or in a bad state."""
+
+    model_config = ConfigDict(extra="forbid")
+    good: AnyProbability = Field(0.0, description="probability of a loss in the good state", examples=[0.0])
+    bad: AnyProbability = Field(1.0, description="probability of a loss in the bad state", examples=[1.0])
+    to_bad: AnyProbability = Field(description="probability per packet of good to bad", examples=[0.02])
+    to_good: AnyProbability = Field(description="probability per packet of bad to good", examples=[0.2])
+
+
+def _loss(value: object) -> object:
+    if isinstance(value, dict | TwoStates):
+        return value
+    if not is_number(value) or not 0 <= value < 1:  # type: ignore[operator]
+        raise expected("a number >= 0 and < 1, or {good, bad, to_bad, to_good}")
+    return TwoStates(good=value, bad=value, to_bad=0.0, to_good=1.0)
+
+
+class LinkSpec(BaseModel):
+    """What happens to the packets from one host to another; what is not given is that of ``default``."""
+
+    model_config = ConfigDict(extra="forbid")
+    loss: Annotated[TwoStates | None, BeforeValidator(_loss, json_schema_input_type=Probability | TwoStates)] = Field(
+        None, description="probability that a packet is lost; or two states, for bursts", examples=[0.2]
+    )
+    burst: BurstLength | None = Field(
+        None, description="packets that are lost in a row, on average; only beside a number as loss", examples=[5]
+    )
+    delay_ms: Milliseconds | None = Field(None, description="how long a packet takes [ms]", examples=[2])
+    jitter_ms: Milliseconds | None = Field(
+        None, description="the delay is uniform between delay_ms - jitter_ms and delay_ms + jitter_ms", examples=[1]
+    )
+    rate_mbit: Rate | None = Field(None, description="Mbit/s; no limit if left out", examples=[6])
+    queue: Annotated[int, Field(strict=True, ge=0, le=1_000_000)] | None = Field(
+        None, description="packets that wait while one is sent, at a limited rate; 100 if left out", examples=[100]
+    )
+
+
+class PairSpec(LinkSpec):
+    """The same for one pair of hosts: one direction (sender, receiver), or both (between)."""
+
+    sender: str | None = Field(None, description="the host that sends", examples=["left"])
+    receiver: str | None = Field(None, description="the host that receives", examples=["right"])
+    between: Annotated[list[str], Field(min_length=2, max_length=2)] | None = Field(
+        None,
+        description="both directions between two hosts, instead of sender and receiver",
+        examples=[["left", "right"]],
+    )
+
+    @property
+    def directions(self) -> list[tuple[str, str]]:
+        """Sender and receiver; empty where neither form is given whole."""
+        if self.between and self.sender is None and self.receiver is None:
+            first, second = self.between
+            return [(first, second), (second, first)]
+        if self.sender is not None and self.receiver is not None and not self.between:
+            return [(self.sender, self.receiver)]
+        return []
+
+
+class ChannelHostSpec(BaseModel):
+    """One host."""
+
+    model_config = ConfigDict(extra="forbid")
+    agents: Annotated[list[int], BeforeValidator(agent_numbers, json_schema_input_type=list[int | str])] = Field(
+        description="the agents that run there", examples=[[1, "3-5"]]
+    )
+
+
+class ChannelSpec(BaseModel):
+    """The channel file as data."""
+
+    model_config = ConfigDict(extra="forbid")
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**64)] = Field(
+        0, description="of losses and delays", examples=[7]
+    )
+    hosts: dict[str, ChannelHostSpec] | None = Field(
+        None,
+        description=f"the hosts of the agents, by name; one for each process if left out. Recorder and switcher are on "
+        f"another one, {BASE}",
+        examples=[{"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}],
+    )
+    default: LinkSpec = Field(
+        LinkSpec(), description="what happens to packets from any host to any other", examples=[{"loss": 0.2}]
+    )
+    pairs: list[PairSpec] = Field(
+        [], description="pairs of hosts with settings of their own", examples=[[{"between": ["left", "right"]}]]
+    )
+    recorder: Literal["clean", "default"] = Field(
+        "default",
+        description=f"clean: packets from and to {BASE}, where recorder and switcher are, are neither lost nor delayed",
+        examples=["clean"],
+    )
+    graph: bool = Field(
+        False,
+        strict=True,
+        description="whether only hosts that a link of the active graph joins reach each other, once the run has begun",
+        examples=[True],
+    )
+    mtu: Annotated[int, Field(strict=True, ge=576, le=MTU)] = Field(
+        MTU, description="bytes of the largest packet; a larger message is several packets", examples=[1500]
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel file that fits an experiment."""
+
+    seed: int
+    hosts: dict[str, tuple[int, ...]]  # agents, from 0, by host; the first host is that of recorder and switcher
+    links: dict[tuple[str, str], LinkSettings]  # of all ordered pairs of hosts, by sender and receiver
+    graph: bool  # whether hosts that no active link joins do not reach each other
+    mtu: int
+
+    @classmethod
+    def load(cls, path: Path, experiment: ValidExperiment) -> Channel:
+        """Read a channel file (YAML); InputError if it cannot be read or does not fit the experiment."""
+        return cls.parse(read_yaml(path), experiment, source=str(path))
+
+    @classmethod
+    def parse(cls, document: Any, experiment: ValidExperiment, source: str = "channel") -> Channel:
+        """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
+        if not isinstance(document, dict):
+            keys = ", ".join(ChannelSpec.model_fields)
+            raise ExperimentError(source, [f"expected some of the keys {keys}: see `msg-agents run --help`"])
+        try:
+            spec = ChannelSpec.model_validate(document)
+        except ValidationError as error:
+            raise ExperimentError(source, [translate(each, root=ChannelSpec) for each in error.errors()]) from error
+        hosts, problems = _hosts(spec, experiment)
+        default = _settings(spec.default, LinkSettings(), "default", problems)
+        own = _pairs(spec, default, [BASE, *hosts], problems)
+        if problems:
+            raise ExperimentError(source, problems)
+        links = {
+            (sender, receiver): LinkSettings()
+            if spec.recorder == "clean" and BASE in (sender, receiver)
+            else own.get((sender, receiver), default)
+            for sender in (BASE, *hosts)
+            for receiver in (BASE, *hosts)
+            if sender != receiver
+        }
+        return cls(spec.seed, {BASE: (), **hosts}, links, spec.graph, spec.mtu)
+
+    def host_of(self, agents: Sequence[int]) -> str:
+        """The host of a process with these agents; of recorder and switcher without any."""
+        return next((name for name, there in self.hosts.items() if agents and agents[0] in there), BASE)
+
+    def joined(self, used: BoolArray) -> BoolArray:
+        """(n, H, H) whether a link joins two hosts in each graph, in either direction; the first host is joined to all.
+
+        ``used``: (n, m, m) whether agent i uses what agent j publishes in each graph.
+        """
+        there = np.zeros((len(self.hosts), used.shape[1]), dtype=bool)
+        for place, agents in enumerate(self.hosts.values()):
+            there[place, list(agents)] = True
+        links = np.einsum("hi,gij,kj->ghk", there, used, there) > 0
+        joined: BoolArray = links | links.transpose(0, 2, 1)
+        joined[:, 0, :] = joined[:, :, 0] = True
+        return joined
+
+    def agent_loss(self, agents: int) -> FloatArray:
+        """(m, m) probability that a packet from agent j to agent i is lost; 0 on one host."""
+        loss = np.zeros((agents, agents))
+        for (sender, receiver), settings in self.links.items():
+            loss[np.ix_(self.hosts[receiver], self.hosts[sender])] = settings.loss.mean
+        return loss
+
+
+def _hosts(spec: ChannelSpec, experiment: ValidExperiment) -> tuple[dict[str, tuple[int, ...]], list[str]]:
+    """Agents, from 0, by host, and the mistakes."""
+    if spec.hosts is None:
+        return {process_name(agents): agents for agents in split_agents(experiment)}, []
+    problems = assignment_problems({name: host.agents for name, host in spec.hosts.items()}, experiment.agents)
+    if BASE in spec.hosts:
+        problems.append(problem("hosts", BASE, "is the host of recorder and switcher", "choose another name"))
+    if len(spec.hosts) >= MOST_HOSTS:
+        problems.append(problem("hosts", f"{len(spec.hosts)} hosts", f"expected fewer than {MOST_HOSTS}", "join some"))
+    problems += [
+        problem(f"hosts.{name}.agents", "[]", "expected at least one agent", "remove the host")
+        for name, host in spec.hosts.items()
+        if not host.agents
+    ]
+    return {name: tuple(sorted(number - 1 for number in host.agents)) for name, host in spec.hosts.items()}, problems
+
+
+def _pairs(
+    spec: ChannelSpec, default: LinkSettings, hosts: Sequence[str], problems: list[str]
+) -> Mapping[tuple[str, str], LinkSettings]:
+    """Settings of the pairs that have their own; mistakes are added to ``problems``."""
+    found: dict[tuple[str, str], LinkSettings] = {}
+    for number, pair in enumerate(spec.pairs, start=1):
+        key = f"pairs[{number}]"
+        if not pair.directions:
+            problems.append(
+                problem(key, "which pair", "expected sender and receiver, or between", "between: [left, right]")
+            )
+        settings = _settings(pair, default, key, problems)
+        for direction in pair.directions:
+            words = f"from {direction[0]} to {direction[1]}"
+            unknown = [name for name in direction if name not in hosts]
+            if unknown:
+                problems.append(problem(key, unknown[0], f"expected one of {', '.join(hosts)}", "name one of them"))
+            elif direction[0] == direction[1]:
+                problems.append(problem(key, words, "expected two hosts", "a host reaches itself without the channel"))
+            elif direction in found:
+                problems.append(problem(key, words, "a pair that is there already", "remove one"))
+            elif spec.recorder == "clean" and BASE in direction:
+                problems.append(problem(key, words, "contradicts recorder: clean", "remove one"))
+            found[direction] = settings
+    return found
+
+
+def _settings(spec: LinkSpec, default: LinkSettings, key: str, problems: list[str]) -> LinkSettings:
+    """Of a link; what is not given is that of ``default``. Mistakes are added to ``problems``."""
+    given: dict[str, Any] = {
+        "delay": None if spec.delay_ms is None else spec.delay_ms / SECOND,
+        "jitter": None if spec.jitter_ms is None else spec.jitter_ms / SECOND,
+        "rate": spec.rate_mbit,
+        "queue": spec.queue,
+    }
+    if spec.loss is not None:
+        given["loss"] = LossModel(spec.loss.good, spec.loss.bad, spec.loss.to_bad, spec.loss.to_good)
+        if not spec.loss.to_good:
+            problems.append(problem(f"{key}.loss.to_good", "0", "expected a number > 0", "or give a number as loss"))
+    settings = replace(default, **{name: value for name, value in given.items() if value is not None})
+    if spec.burst is not None:
+        number = spec.loss.good if spec.loss is not None and spec.loss.good == spec.loss.bad else None
+        problems += (found := _burst_problems(number, spec.burst, f"{key}.burst"))
+        if number is not None and not found:
+            settings = replace(settings, loss=LossModel.bursts(number, spec.burst))
+    if settings.jitter > settings.delay:
+        wanted = f"expected at most delay_ms, {settings.delay * SECOND:g}"
+        problems.append(
+            problem(f"{key}.jitter_ms", settings.jitter * SECOND, wanted, "no packet arrives before it is sent")
+        )
+    if spec.queue is not None and settings.rate == inf:
+        problems.append(
+            problem(f"{key}.queue", spec.queue, "has no effect without rate_mbit", "give one, or remove it")
+        )
+    return settings
+
+
+def _burst_problems(loss: float | None, burst: float, key: str) -> list[str]:
+    if loss is None:
+        return [problem(key, burst, "expected a number as loss beside it", "give one, or remove burst")]
+    least = loss / (1 - loss)
+    if burst < least:
+        return [problem(key, burst, f"expected at least {least:.4g}", f"with loss {loss:g} bursts are longer")]
+    return []
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of the channel file, for editors."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | ChannelSpec.model_json_schema()

@@ -1,0 +1,87 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The channel of a run: hosts, environment, process, and what it did."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from msg_agents.channel.active_graph import ActiveGraphFile
+from msg_agents.channel.channel_file import BASE, Channel
+from msg_agents.channel.counts import read_counts
+from msg_agents.channel.namespaces import Host, open_hosts
+from msg_agents.channel.process import hand_over
+from msg_agents.discovery.profiles import profile_for_hosts
+from msg_agents.discovery.rtps import PEERS_VARIABLE
+from msg_agents.processes.environment import channel_environment
+from msg_agents.processes.process_plan import SWITCHER, ProcessPlan
+from msg_agents.running.supervisor import Supervisor
+from msg_analysis.model.step.step_model import Wiring
+
+LEASE = 600.0  # s; a link that loses much, or that the graph cuts, is no reason to give a host up
+
+
+@dataclass(frozen=True, slots=True)
+class RunChannel:
+    """The channel of one run. The hosts are open."""
+
+    channel: Channel
+    hosts: dict[str, Host]
+
+    @property
+    def agents(self) -> list[tuple[int, ...]]:
+        """The agents (from 0) of each host that has any."""
+        return [agents for agents in self.channel.hosts.values() if agents]
+
+    def environment(self, folder: Path) -> dict[str, str]:
+        """Changes of the environment of all processes, with a profile in ``folder``."""
+        profile = folder / "channel.xml"
+        profile.write_text(profile_for_hosts(lease=LEASE), encoding="utf-8")
+        peers = " ".join(host.address for host in self.hosts.values())
+        return channel_environment(profile) | {PEERS_VARIABLE: peers}
+
+    def start(self, supervisor: Supervisor, plans: Sequence[ProcessPlan], wiring: Wiring) -> None:
+        """Start its process, and say on which host each of the others is to be."""
+        control = supervisor.start_channel()
+        counts = supervisor.channel_account
+        active_graph = counts.with_name("active_graph") if self.channel.graph else None
+        if active_graph is not None:
+            ActiveGraphFile.create(active_graph)
+            supervisor.options = {SWITCHER: ("--active-graph", str(active_graph))}
+        supervisor.namespaces = {plan.name: self.hosts[self.channel.host_of(plan.agents)].namespace for plan in plans}
+        joined = self.channel.joined(wiring.links) if self.channel.graph else None
+        hand_over(control, self.channel, self.hosts, counts, active_graph, joined)
+
+    def to_json(self, supervisor: Supervisor) -> dict[str, Any]:
+        """Its hosts, and what it did, as in the result of the run."""
+        hosts = {
+            name: {"address": host.address, "agents": [agent + 1 for agent in self.channel.hosts[name]]}
+            for name, host in self.hosts.items()
+        }
+        counts = read_counts(supervisor.channel_account) or {"pairs": [], "overflowed": 0, "late_ms": None}
+        return {"seed": self.channel.seed, "recorder": BASE, "graph": self.channel.graph, "hosts": hosts} | counts
+
+
+@contextmanager
+def run_channel(channel: Channel | None) -> Iterator[RunChannel | None]:
+    """Open the hosts of a channel; None: without one. NotAvailableError: this machine or user cannot have them."""
+    if channel is None:
+        yield None
+        return
+    with open_hosts(list(channel.hosts), channel.mtu) as hosts:
+        yield RunChannel(channel, hosts)

@@ -1,0 +1,223 @@
+"""Networks over a channel: hosts as network namespaces, with loss and delay between them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from scipy import stats
+
+from msg_agents.channel.namespaces import open_hosts
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.errors import NotAvailableError
+
+LEVEL = 1e-6  # false-alarm rate of the test of a loss; the losses have a fixed seed, the numbers of packets do not
+PROGRAM = Path(sys.executable).with_name("msg-agents")
+
+
+@pytest.fixture(autouse=True)
+def _rights() -> None:
+    try:
+        with open_hosts(["trial"], 1500):
+            pass
+    except NotAvailableError as error:
+        pytest.skip(f"no rights for a channel: {error}")
+
+
+def channel_file(network: Any, **document: Any) -> Path:
+    path = Path(network.directory / "channel.yaml")
+    path.write_text(yaml.safe_dump(document))
+    return path
+
+
+def start(network: Any, run: dict[str, Any], *options: str, **channel: Any) -> subprocess.Popen[str]:
+    file = network.file(run=run)
+    arguments = ("--out", network.directory / "runs", "--json", *options, "--channel", channel_file(network, **channel))
+    return network.start("run", file, *arguments)
+
+
+def namespaces(network: Any) -> set[int]:
+    """Inodes of the network namespaces of the test's processes, without ours."""
+    own = Path("/proc/self/ns/net").stat().st_ino
+    found = set()
+    for process in network.nodes():
+        try:
+            found.add(Path(f"/proc/{process.pid}/ns/net").stat().st_ino)
+        except OSError:
+            continue
+    return found - {own}
+
+
+def holders(inodes: set[int]) -> list[str]:
+    """What still holds one of these namespaces: a process in it, or a descriptor of it."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        for link in (entry / "ns/net", *(entry / "fd").glob("*")):
+            try:
+                target = os.readlink(link)
+            except OSError:
+                continue
+            if target in {f"net:[{inode}]" for inode in inodes}:
+                found.append(str(link))
+    return found
+
+
+@pytest.fixture
+def hosts(network: Any) -> Iterator[set[int]]:
+    """Namespaces that a test notes; at its end, nothing holds them, so the kernel has removed them."""
+    noted: set[int] = set()
+    yield noted
+    network.wait_for(lambda: not network.processes(), 30, "the end of all processes")
+    assert len(noted) == 6
+    assert holders(noted) == []
+
+
+def wait_until_moving(network: Any, hosts: set[int]) -> None:
+    network.wait_until_moving()
+    hosts |= namespaces(network)
+
+
+def totals(result: dict[str, Any], what: str) -> int:
+    return sum(pair[what] for pair in result["channel"]["pairs"])
+
+
+def test_lockstep_over_a_bad_channel_equals_the_twin(network: Any) -> None:
+    """Losses are repaired, so that only the time differs; they are as frequent as the file says."""
+    run = start(network, {"duration": 5}, seed=3, default={"loss": 0.1, "delay_ms": 1, "jitter_ms": 0.5})
+    result = network.completed(run)
+    assert result["verdict"] is not None
+    channel = result["channel"]
+    assert list(channel["hosts"]) == ["base", *(f"agent_{i}" for i in range(1, 6))]
+    assert channel["hosts"]["agent_2"] == {"address": "10.77.0.3", "agents": [2]}
+    assert len(channel["pairs"]) == 30
+    assert all(pair["sent"] and pair["bytes"] >= 28 * pair["sent"] for pair in channel["pairs"])
+    assert stats.binomtest(totals(result, "lost"), totals(result, "sent"), 0.1).pvalue > LEVEL
+    assert (totals(result, "dropped"), totals(result, "cut"), channel["overflowed"]) == (0, 0, 0)
+    page = Path(result["report"]).read_text()
+    assert "Packets of each pair of hosts" in page
+    assert f"<td>agent_1</td><td>agent_2</td><td>{channel['pairs'][6]['sent']}</td>" in page
+
+
+def test_real_time_over_a_bad_channel(network: Any) -> None:
+    """Old values are used where new ones are lost; nothing is missing in the log."""
+    run = start(
+        network,
+        {"duration": 3, "pace": "realtime"},
+        hosts={"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}},
+        default={"loss": 0.4, "burst": 3, "delay_ms": 2},
+        recorder="clean",
+    )
+    result = network.completed(run)
+    used = read_bag(result["bag"]).used
+    assert used is not None
+    pairs = {(pair["sender"], pair["receiver"]): pair for pair in result["channel"]["pairs"]}
+    assert pairs["left", "right"]["lost"] > 0
+    assert pairs["base", "right"]["lost"] == pairs["left", "base"]["lost"] == 0
+
+
+@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+def test_only_active_links_carry_packets(network: Any, pace: str) -> None:
+    """Lockstep goes on all the same: the graph is that of the slowest agent, whose values then reach it."""
+    run = start(network, {"duration": 3, "pace": pace}, "--no-analyse", graph=True)
+    result = network.completed(run)
+    pairs = {(pair["sender"], pair["receiver"]): pair for pair in result["channel"]["pairs"]}
+    assert pairs["agent_1", "agent_3"]["cut"] > 0  # by no link in any graph: multicast only
+    assert pairs["agent_1", "agent_2"]["cut"] == 0  # in both graphs
+    assert all(pairs["base", f"agent_{i}"]["cut"] == pairs[f"agent_{i}", "base"]["cut"] == 0 for i in range(1, 6))
+
+
+def test_a_limited_rate(network: Any) -> None:
+    run = start(network, {"duration": 3}, "--no-analyse", "--no-fork", default={"rate_mbit": 2, "queue": 1000})
+    assert totals(network.completed(run), "queued") > 0
+
+
+def test_a_killed_agent_comes_back_on_its_host(network: Any, hosts: set[int]) -> None:
+    run = start(network, {"duration": 600}, "--no-analyse", default={"loss": 0.01})
+    wait_until_moving(network, hosts)
+    victim = next(process for process in network.processes("agent") if process.agent == 3)
+    victim.kill()
+    result = network.completed(run)
+    assert len(result["restarts"]) == 1
+
+
+def test_a_killed_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
+    run = start(network, {"duration": 100_000}, "--no-analyse")
+    wait_until_moving(network, hosts)
+    (channel,) = network.processes("channel")
+    channel.kill()
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3
+    assert "failed: channel: killed by SIGKILL" in stderr
+    result = json.loads(stdout)
+    assert totals(result, "sent") > 0
+    assert read_bag(result["bag"]).completeness.missing > 0
+
+
+def test_a_stopped_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
+    run = start(network, {"duration": 100_000}, "--no-analyse")
+    wait_until_moving(network, hosts)
+    (channel,) = network.processes("channel")
+    channel.kill(signal.SIGSTOP)
+    _, stderr = run.communicate(timeout=90)
+    assert run.returncode == 3
+    assert "no report from channel" in stderr
+    assert "failed: channel: no report for 10 s, as if it was stopped" in stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_a_killed_run_leaves_nothing_behind(network: Any, hosts: set[int], number: signal.Signals) -> None:
+    run = start(network, {"duration": 100_000}, "--no-analyse")
+    wait_until_moving(network, hosts)
+    run.send_signal(number)
+    run.communicate(timeout=60)
+    assert run.returncode == (3 if number == signal.SIGINT else -signal.SIGKILL)
+
+
+def test_without_rights_nothing_is_started(network: Any) -> None:
+    """In a user namespace that gives none: one line that says what to do."""
+    if shutil.which("unshare") is None:
+        pytest.skip("no command unshare: install it (Debian: apt-get install util-linux)")
+    arguments = ["run", network.file(), "--out", network.directory / "runs", "--channel", channel_file(network)]
+    done = subprocess.run(["unshare", "--user", PROGRAM, *arguments], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("error:"))
+    assert line.startswith("error: --channel: no right to make network namespaces and TUN devices")
+    assert "run it as root, or in namespaces of your own: `unshare --user --map-root-user --net msg-agents run" in line
+    assert not list((network.directory / "runs").glob("*"))
+
+
+def test_a_user_without_rights_can_use_namespaces_of_his_own(network: Any) -> None:
+    """The command that the error names, with one namespace more, in which the user is not root."""
+    command = ["unshare", "--user", "--map-root-user", "--net"]
+    if subprocess.run([*command, "true"], capture_output=True).returncode:
+        pytest.skip("this machine does not let users make namespaces")
+    arguments = ["run", network.file(run={"duration": 2}), "--out", network.directory / "runs", "--json"]
+    done = subprocess.run(
+        [*command, PROGRAM, *arguments, "--no-analyse", "--channel", channel_file(network)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert totals(json.loads(done.stdout), "sent") > 0
+
+
+def test_bad_channel_files_and_options_that_need_other_programs(network: Any) -> None:
+    run = start(network, {}, default={"loss": 2, "delay": 3})
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 2
+    assert "channel.yaml: 2 problems" in stderr
+    run = start(network, {"pace": "realtime"}, "--use-sim-time")
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 2
+    assert "--use-sim-time: not with --channel" in stderr
