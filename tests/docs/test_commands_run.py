@@ -37,6 +37,7 @@ TESTED = {  # and where
     r"msg-agents run line_ring --domain 42 --await my_node": "tests/integration/test_cyclone.py",
     r"msg-agents run line_ring_realtime": "tests/integration/test_realtime.py",
     r"msg-agents run median\.yaml": "tests/integration/test_protocols.py",
+    r"msg-agents run \w+ --channel channel\.yaml": "tests/integration/test_channel.py",
     r"msg-agents (live|play)\b": "tests/integration/test_live.py",
     r"msg-agents markers": "tests/integration/test_markers.py",
     r"msg-agents (recorder|agent|switcher)\b": "tests/integration/test_single_nodes.py",

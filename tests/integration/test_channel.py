@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -63,7 +62,7 @@ def holders(inodes: set[int]) -> list[str]:
     for entry in Path("/proc").glob("[0-9]*"):
         for link in (entry / "ns/net", *(entry / "fd").glob("*")):
             try:
-                target = os.readlink(link)
+                target = str(link.readlink())
             except OSError:
                 continue
             if target in {f"net:[{inode}]" for inode in inodes}:

@@ -38,6 +38,7 @@ _KEYS = {
     "run.dt": "step length dt",
     "run.duration": "simulated time",
     "run.pace": "pace",
+    "run.delivery": "delivery",
     "run.processes": "number of processes",
     "run.replicas": "number of replicas",
     "run.seed": "seed",

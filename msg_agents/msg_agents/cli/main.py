@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -118,6 +118,12 @@ def _interruption() -> Interruption:
     help="Overrides run.speed: units of simulated time per second (realtime).",
 )
 @click.option(
+    "--delivery",
+    metavar="HOW",
+    shell_complete=suggest("best_effort", "reliable"),
+    help="Overrides run.delivery: best_effort or reliable (realtime).",
+)
+@click.option(
     "--processes",
     metavar="P",
     shell_complete=suggest("auto", "one_per_agent"),
@@ -173,6 +179,7 @@ def run(
     duration: float | None,
     pace: str | None,
     speed: float | None,
+    delivery: str | None,
     processes: str | None,
     restarts: int,
     domain: int | None,
@@ -199,7 +206,8 @@ def run(
     from msg_agents.watching.run_view import RunView
 
     interruption = _interruption()
-    changes = {"seed": seed, "duration": duration, "pace": pace, "speed": speed, "processes": processes}
+    changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
+    changes |= {"delivery": delivery, "processes": processes}
     what = load_with_overrides(experiment, changes)
     channel = None
     if channel_file is not None:

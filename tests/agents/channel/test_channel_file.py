@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
-from msg_agents.channel.channel_file import BASE, Channel, json_schema
+from msg_agents.channel.channel_file import BASE, Channel, ChannelSpec, PairSpec, TwoStates, json_schema
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
 
@@ -158,3 +160,13 @@ def test_schema_is_up_to_date() -> None:
     committed = json.loads((ROOT / "docs/channel.schema.json").read_text())
     assert committed == json_schema(), "run: msg-agents schema > docs/channel.schema.json"
     assert all("description" in field for field in committed["properties"].values())
+
+
+def test_the_example_of_the_documentation() -> None:
+    page = (ROOT / "docs/channel.md").read_text()
+    document = yaml.safe_load(page.partition("```yaml\n")[2].partition("```")[0])
+    channel = Channel.parse(document, experiment())
+    assert list(channel.hosts) == [BASE, "left", "right"]
+    assert (channel.links["right", "left"].loss.to_good, channel.links[BASE, "left"].rate) == (0.25, 6)
+    for key in (*ChannelSpec.model_fields, *PairSpec.model_fields, *TwoStates.model_fields):
+        assert re.search(rf"\b{key}\b", page), key

@@ -394,6 +394,12 @@ class RunSpec(_Section):
         examples=["lockstep"],
     )
     speed: Positive = Field(1.0, description="realtime: simulated time units per second of the clock", examples=[1.0])
+    delivery: Literal["reliable", "best_effort"] | None = Field(
+        None,
+        description="realtime: how agents hear each other. best_effort, the default: what is lost is not sent again; "
+        "reliable: it is, and later values wait for it. In lockstep always reliable",
+        examples=["best_effort"],
+    )
     processes: Annotated[
         str | int,
         PlainValidator(_processes, json_schema_input_type=Literal["auto", "one_per_agent"] | Count),

@@ -318,6 +318,9 @@ def stability_problems(graphs: Iterable[Graph], gains: FloatArray, dt: float) ->
 def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
     """Steps, durations and starting values that do not fit; ``agents`` is None where unknown."""
     found = []
+    if run.pace == "lockstep" and run.delivery == "best_effort":
+        wanted = "in lockstep expected reliable, since every value is needed"
+        found.append(problem("run.delivery", "best_effort", wanted, "remove it, or use run.pace: realtime"))
     if time == "discrete" and run.dt != 1.0:
         found.append(problem("run.dt", run.dt, "expected 1 in discrete time", "remove run.dt"))
     else:

@@ -43,11 +43,13 @@ Value = tuple[bytes, int]  # a state, and the simulated time [ns] at which it wa
 class RealtimeAgent(Agent):
     """An agent that steps by a timer on the clock of its node; parameters as in ``Agent``."""
 
-    hears = topics.PASSIVE_NEWEST  # only the newest value is of use; an overloaded network keeps none of the others
-
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         experiment = self.record.experiment
+        if experiment.run.delivery != "reliable":
+            self.hears = (
+                topics.PASSIVE_NEWEST
+            )  # only the newest value is of use; none of the others is kept or repeated
         self._phase = float(phases(experiment)[self._law.agent])
         self._speed = experiment.run.speed
         self._dt = experiment.step_length
@@ -63,7 +65,7 @@ class RealtimeAgent(Agent):
         self._made = stamp_ns(self._resumed) if self._resumed else 0  # simulated time [ns] of the newest state
         # The stamps of others may be so much ahead of our clock.
         self._margin = round(CLOCK_MARGIN * SECOND * self._speed)
-        self._late = 0  # largest lateness since the last report [ns of simulated time]
+        self._late = self._graph_late = 0  # largest lateness since the last report [ns of simulated time]
         self._looked = 0  # time of the clock at the last call of ``_waiting_for`` [ns]
         self._missed = self._missed_before = 0  # steps made later than the next one was due
 
@@ -154,6 +156,10 @@ class RealtimeAgent(Agent):
 
     def learn(self, graph: ActiveGraph) -> str | None:
         """See Agent."""
+        if self._schedule:  # those before the epoch is known are early, or of a run that this agent comes back to
+            # After the first step of this agent that should have used it.
+            late = self._schedule.simulated(self._timer.now()) - self._schedule.due(graph.first_step)
+            self._graph_late = max(self._graph_late, late)
         return self._newest.learn(graph.mode - 1, graph.first_step)
 
     def health(self) -> Health:
@@ -161,11 +167,13 @@ class RealtimeAgent(Agent):
         step, stall = self._law.step, self._stall
         overdue = stall.update(step)
         missed, late = self._missed - self._missed_before, self._late / self._speed / 1e6
-        self._missed_before, self._late = self._missed, 0
+        graph_late = self._graph_late / self._speed / 1e6
+        self._missed_before, self._late, self._graph_late = self._missed, 0, 0
         values = {
             "step": str(step),
             "steps per second": f"{stall.rate:.1f}",
             "largest lateness [ms]": f"{late:.3f}",
+            "largest lateness of a graph [ms]": f"{graph_late:.3f}",
             "deadlines missed": str(self._missed),
             "oldest value of a neighbour [steps]": str(max(self._newest.behind.values(), default=0)),
         }
