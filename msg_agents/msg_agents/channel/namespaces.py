@@ -29,7 +29,7 @@ import struct
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 
 from msg_analysis.errors import NotAvailableError
@@ -133,8 +133,9 @@ def _enter_new_host(address: str, mtu: int) -> Host:
             for request, value in ((_SIOCSIFADDR, address), (_SIOCSIFNETMASK, MASK)):
                 place = struct.pack("16sHH4s8x", DEVICE, socket.AF_INET, 0, socket.inet_aton(value))
                 fcntl.ioctl(control, request, place)
-            for request, number in ((_SIOCSIFMTU, mtu), (_SIOCSIFTXQLEN, WAITING_ROOM)):
-                fcntl.ioctl(control, request, struct.pack("16si20x", DEVICE, number))
+            fcntl.ioctl(control, _SIOCSIFMTU, struct.pack("16si20x", DEVICE, mtu))
+            with suppress(PermissionError):  # in a user's own namespaces it stays at 500
+                fcntl.ioctl(control, _SIOCSIFTXQLEN, struct.pack("16si20x", DEVICE, WAITING_ROOM))
             _set_up(control, DEVICE)
         for file in ("ns/net", "net/dev"):
             opened.append(os.open(f"/proc/thread-self/{file}", os.O_RDONLY | os.O_CLOEXEC))

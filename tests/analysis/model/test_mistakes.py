@@ -71,6 +71,11 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ({"run.replicas": 0}, ["run.replicas: 0: expected a number >= 1"]),
     ({"run.seed": -1}, ["run.seed: -1: expected a number >= 0"]),
     ({"run.pace": "realtme"}, ["run.pace:", "did you mean 'realtime'?"]),
+    ({"run.delivery": "besteffort"}, ["run.delivery:", "did you mean 'best_effort'?"]),
+    (
+        {"run.delivery": "best_effort"},
+        ["run.delivery: best_effort: in lockstep expected reliable", "run.pace: realtime"],
+    ),
     ({"run.speed": 0}, ["run.speed: 0: expected a number > 0"]),
     ({"run.processes": 0}, ["run.processes: 0: expected 'auto', 'one_per_agent' or a whole number >= 1"]),
     ({"graphs": {1: {"path": [1, 2]}}, "switching": ...}, ["graphs: key 1: expected a text"]),
