@@ -20,6 +20,7 @@ import pytest
 import yaml
 from processors import another_processor
 
+from msg_agents.processes.environment import PROFILE_VARIABLES
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 
@@ -188,15 +189,35 @@ def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: rand
 def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
     """Ctrl-C on one of them: they say who has gone. Exit code 3 everywhere.
 
-    RTPS says once, best effort, that a participant has gone. Who misses that finds out when its lease ends, after a
-    minute; mostly another one of the same host was not missed.
+    They say so themselves, so nobody waits for a lease of a minute, or for the patience of the others.
     """
     prepare(lan, 20000)
-    hosts = lan.start_all("--patience", "2")
+    hosts = lan.start_all("--patience", "1000")
     lan.network.wait_until_moving("base")
     hosts["left"].send_signal(signal.SIGINT)
-    texts = ended(hosts, 3, timeout=200)
+    texts = ended(hosts, 3, timeout=50)
     assert "failed: stopped by Ctrl-C\n" in texts["left"][1]
     assert re.search(r"switcher: exit code 2: error: agent_[14](, agent_4)? left the network", texts["base"][1])
     assert re.search(r"agent_[235]: exit code 2: error: switcher left the network", texts["right"][1])
     assert read_bag(json.loads(texts["base"][0])["bag"]).completeness.missing > 0
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> None:
+    """A lease of 5 s instead of a minute; it is cut off for 12 s, so that both sides have given each other up."""
+    prepare(lan, 1000 if pace == "lockstep" else 40, run={"pace": pace})
+    command = [str(PROGRAM), "host", str(lan.run_file), str(lan.hosts_file), "--profile"]
+    profile = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    short, count = re.subn(r"(<leaseDuration>\s*<sec>)60", r"\g<1>5", profile)
+    assert count == 1
+    file = lan.network.directory / "short.xml"
+    file.write_text(short)
+    setting = dict.fromkeys(PROFILE_VARIABLES, str(file)) | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
+    hosts = lan.start_all("--patience", "60", **dict.fromkeys(NAMES, setting))
+    lan.network.wait_until_moving("base")
+    assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
+    lan.plug("left", "down", cable=True)
+    time.sleep(12)
+    lan.plug("left", "up", cable=True)
+    whole(lan, ended(hosts, 0, timeout=120))

@@ -14,8 +14,8 @@
 
 """Signatures of the messages that steer a run: only processes that have the run's record with its key can make them.
 
-Progress, end, epoch and requests to resend cannot be compared with the record as the graph can. Who forges one could
-end the run for all.
+Progress, end, epoch, leave and requests to resend cannot be compared with the record as the graph can. Who forges one
+could end the run for all.
 """
 
 from __future__ import annotations

@@ -112,6 +112,7 @@ PROGRESS = Topic("progress", schemas.PROGRESS, LATCHED, "agents, recorder", "swi
 RESEND = Topic("resend", schemas.PROGRESS, LATCHED, "agents", "agents")
 EPOCH = Topic("epoch", schemas.PROGRESS, LATCHED, "switcher", "agents")
 END = Topic("end", schemas.PROGRESS, LATCHED, "switcher", "agents, recorder, live, markers")
+LEAVE = Topic("leave", schemas.PROGRESS, LATCHED, "agents, switcher, recorder", "agents, switcher, recorder")
 ESTIMATE = Topic("estimate", schemas.ESTIMATE, NEWEST, "live", "")
 MARKERS = Topic("markers", MessageType("visualization_msgs", "MarkerArray"), NEWEST, "markers", "")
 DIAGNOSTICS = Topic("/diagnostics", MessageType("diagnostic_msgs", "DiagnosticArray"), RECENT, "every process", "")
@@ -127,6 +128,7 @@ TOPICS = (
     RESEND,
     EPOCH,
     END,
+    LEAVE,
     ESTIMATE,
     MARKERS,
     DIAGNOSTICS,

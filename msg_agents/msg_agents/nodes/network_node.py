@@ -80,6 +80,15 @@ class NetworkNode(LeanNode):
         if self.refused[topic, reason] == 1:
             self.get_logger().warning(f"refused a message on {topic}: {reason} (further ones are only counted)")
 
+    @property
+    def number(self) -> int:
+        """In messages: that of its agent, from 1."""
+        return NOT_AN_AGENT
+
+    def rejoin(self) -> bool:
+        """Make good what others may have missed while the network was cut; False: not possible yet, ask again."""
+        return True
+
     def health(self) -> Health:
         """State of this node; called about once a second."""
         raise NotImplementedError

@@ -32,6 +32,7 @@ import rclpy
 from rclpy.exceptions import NotInitializedException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from msg_agents.discovery.introducer import write_introduction
 from msg_agents.discovery.rtps import PREFIX_SIZE, remove_participant
@@ -106,11 +107,19 @@ def run_nodes(
     signal.signal(signal.SIGINT, lambda number, _: told.append(number))
     if throughput:
         prefer_throughput()
+    arguments = [*sys.argv, *(USE_SIM_TIME if use_sim_time else [])]
+    handlers = SignalHandlerOptions.ALL
+    if (
+        patience is not None
+    ):  # with ROS's handler, nothing could be published after a signal: see ``PeerPresence.leave``
+        signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
+        handlers = SignalHandlerOptions.NO
     with ros_arguments():
-        rclpy.init(args=[*sys.argv, *(USE_SIM_TIME if use_sim_time else [])])
+        rclpy.init(args=arguments, signal_handler_options=handlers)
     nodes: Sequence[NetworkNode] = []
     prefix = b""  # of a process that was introduced
     reporter: HealthReporter | None = None
+    presence: PeerPresence | None = None
     spinner: Executor | None = None
     complete = False
     try:
@@ -121,20 +130,23 @@ def run_nodes(
             prefix = own_prefix(nodes[0])
             write_introduction(introduction, nodes[0].get_name(), prefix)
         reporter = HealthReporter(nodes, account)
+        presence = None if patience is None else PeerPresence(nodes, patience)
         spinner = make_executor(executor)
         for node in nodes:
             spinner.add_node(node)
-        _gate(nodes, discovery_timeout)
+        _gate(nodes, discovery_timeout, told)
         # All objects made so far live until the end: the garbage collector need not scan them again and again.
         gc.collect()
         gc.freeze()
         gc.set_threshold(GC_THRESHOLD)
         for node in nodes:
             node.begin()
-        if patience is not None:
-            PeerPresence(nodes[0], patience)
+        if presence is not None:
+            presence.begin()
         for node in nodes:
             while not node.done.done():
+                if told:
+                    raise ExternalShutdownException
                 spinner.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
             node.done.result()
         complete = True
@@ -144,6 +156,8 @@ def run_nodes(
         if rclpy.ok():
             raise
     finally:
+        if presence is not None and not complete and rclpy.ok():
+            presence.leave()
         deadline = time.monotonic() + ACK_TIMEOUT
         for node in nodes:
             node.finish(complete=complete, deadline=deadline)
@@ -215,8 +229,10 @@ def leave_at_once(nodes: Sequence[Node], executor: Executor | None, prefix: byte
     rclpy.try_shutdown()
 
 
-def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
+def _gate(nodes: Sequence[NetworkNode], timeout: float, told: Sequence[int]) -> None:
     """Wait until the publishers of all nodes have found their readers, and every name belongs to one node only.
+
+    ``told``: signals that end the wait.
 
     Readers are identified by name: with duplicates, a run might start without the node that belongs to it.
     """
@@ -242,6 +258,6 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float) -> None:
                 f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} did not discover: "
                 f"{', '.join(missing)}. Are they running {discovery_scope()}?"
             )
-        if not rclpy.ok():
+        if told or not rclpy.ok():
             raise ExternalShutdownException
         time.sleep(min(max(FIRST_POLL, PAUSE_PER_LOOK * (time.monotonic() - begun)), GATE_POLL))

@@ -26,14 +26,14 @@ from msg_agents.channel.channel_file import BASE, Channel
 from msg_agents.channel.counts import read_counts
 from msg_agents.channel.namespaces import Host, open_hosts
 from msg_agents.channel.process import hand_over
-from msg_agents.discovery.profiles import profile_for_hosts
+from msg_agents.discovery.profiles import LEASE, profile_for_hosts
 from msg_agents.discovery.rtps import PEERS_VARIABLE
 from msg_agents.processes.environment import channel_environment
 from msg_agents.processes.process_plan import SWITCHER, ProcessPlan
 from msg_agents.running.supervisor import Supervisor
 from msg_analysis.model.step.step_model import Wiring
 
-LEASE = 600.0  # s; a link that loses much, or that the graph cuts, is no reason to give a host up
+CUT_LEASE = 600.0  # s; that the graph cuts a link is no reason to give a host up
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class RunChannel:
     def environment(self, folder: Path) -> dict[str, str]:
         """Changes of the environment of all processes, with a profile in ``folder``."""
         profile = folder / "channel.xml"
-        profile.write_text(profile_for_hosts(lease=LEASE), encoding="utf-8")
+        profile.write_text(profile_for_hosts(lease=CUT_LEASE if self.channel.graph else LEASE), encoding="utf-8")
         peers = " ".join(host.address for host in self.hosts.values())
         return channel_environment(profile) | {PEERS_VARIABLE: peers}
 

@@ -49,7 +49,7 @@ def test_a_switcher_of_another_namespace_is_not_ours(start: Callable[..., Node],
     start("switcher", namespace)
     wait_for(lambda: "switcher" in agent.get_node_names())
     assert ("switcher" in agent.names_in_namespace()) == there
-    PeerPresence(agent, patience=0.0)
+    PeerPresence([agent], patience=0.0).begin()
     executor = rclpy.executors.SingleThreadedExecutor()
     executor.add_node(agent)
     executor.spin_until_future_complete(agent.done, timeout_sec=3.0)
@@ -58,6 +58,27 @@ def test_a_switcher_of_another_namespace_is_not_ours(start: Callable[..., Node],
     if not there:
         with pytest.raises(PeersLostError, match="switcher left the network"):
             agent.done.result()
+
+
+def test_a_peer_that_says_that_it_leaves_is_not_waited_for(
+    start: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although its node is there, and with a patience that outlasts the test. An agent needs only the switcher."""
+    nodes = {name: start(name) for name in ("agent_1", "agent_2", "switcher")}
+    monkeypatch.setattr(type(nodes["agent_2"]), "number", property(lambda node: 2 * (node.get_name() == "agent_2")))
+    presences = {name: PeerPresence([node], patience=1000.0) for name, node in nodes.items()}
+    agent = nodes["agent_1"]
+    assert isinstance(agent, NetworkNode)
+    executor = rclpy.executors.SingleThreadedExecutor()
+    executor.add_node(agent)
+    for name in ("agent_2", "switcher"):
+        wait_for(lambda: agent.count_publishers("/leave") == 3 and nodes["switcher"].count_subscribers("/leave") == 3)
+        presences[name].leave()
+        executor.spin_until_future_complete(agent.done, timeout_sec=3.0)
+        assert agent.done.done() == (name == "switcher")
+    executor.shutdown()
+    with pytest.raises(PeersLostError, match=r"^switcher left the network before the end of the run: see"):
+        agent.done.result()
 
 
 def test_a_reader_of_the_user_may_be_in_any_namespace(start: Callable[..., Node]) -> None:

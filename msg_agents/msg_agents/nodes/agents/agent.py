@@ -211,6 +211,14 @@ class Agent(NetworkNode):
             self._publish_state(0)
         self._report()
 
+    def rejoin(self) -> bool:
+        """See NetworkNode. All that is kept goes to the recorder again, and what peers may lack to them."""
+        if self._group.missing_recorder():
+            return False
+        self._repeat(0, heard_since=self._missed_since())
+        self._ask_again(self.far)
+        return True
+
     def _take_over(self) -> bytes | None:
         """Resume from the last state that an earlier process published; its message, or None without one."""
         published = self._published.read()
