@@ -221,3 +221,46 @@ def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> 
     time.sleep(12)
     lan.plug("left", "up", cable=True)
     whole(lan, ended(hosts, 0, timeout=120))
+
+
+def test_clocks_of_one_machine_agree(lan: Lan) -> None:
+    """The clocks of these hosts are one clock: 0 is in every interval, and nobody is warned."""
+    prepare(lan, 10, run={"pace": "realtime"})
+    texts = ended(lan.start_all("--no-analyse"), 0)
+    clocks = json.loads(texts["base"][0])["clocks"]
+    assert [entry["node"] for entry in clocks] == [f"agent_{i}" for i in range(1, 6)]
+    assert all(low <= 0 <= high for low, high in (entry["ahead_ms"] for entry in clocks))
+    assert not any("are not that of the switcher" in stderr for _, stderr in texts.values())
+    assert json.loads(texts["left"][0])["clocks"] is None
+
+
+AHEAD = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <time.h>
+int clock_gettime(clockid_t clock, struct timespec *found) {
+    static int (*next)(clockid_t, struct timespec *);
+    if (!next) next = dlsym(RTLD_NEXT, "clock_gettime");
+    int failed = next(clock, found);
+    if (!failed && clock == CLOCK_REALTIME) {
+        found->tv_nsec += 200000000;
+        if (found->tv_nsec >= 1000000000) { found->tv_nsec -= 1000000000; found->tv_sec += 1; }
+    }
+    return failed;
+}
+"""
+
+
+def test_a_clock_that_is_ahead_is_found(lan: Lan) -> None:
+    """That of the left host is 200 ms ahead of the others, by a library; dt / speed is 50 ms."""
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc, which makes a clock that is ahead")
+    library = lan.network.directory / "ahead.so"
+    command = ["gcc", "-shared", "-fPIC", "-o", library, "-x", "c", "-", "-ldl"]
+    subprocess.run(command, input=AHEAD, text=True, check=True)
+    prepare(lan, 10, run={"pace": "realtime"})
+    texts = ended(lan.start_all("--no-analyse", left={"LD_PRELOAD": str(library)}), 0)
+    for entry in json.loads(texts["base"][0])["clocks"]:
+        low, high = entry["ahead_ms"]
+        assert low <= (200 if entry["node"] in ("agent_1", "agent_4") else 0) <= high
+    assert re.search("note: the clocks of agent_1(, agent_4)? are not that of the switcher", texts["base"][1])

@@ -36,6 +36,7 @@ from msg_analysis.common.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from msg_agents.nodes.network_node import NetworkNode
+    from msg_agents.stepping.clock_offsets import ClockOffsets
     from msg_analysis.bags.format.storage_options import Compression
     from msg_analysis.model.run.record import RunRecord
 
@@ -166,6 +167,7 @@ def agent(
 @_patience
 @click.option("--steps", type=PATH, hidden=True)
 @click.option("--active-graph", type=PATH, hidden=True)
+@click.option("--clocks", type=PATH, hidden=True)
 def switcher(
     run_record: Path,
     *,
@@ -173,6 +175,7 @@ def switcher(
     checkpoint: Path | None,
     steps: Path | None,
     active_graph: Path | None,
+    clocks: Path | None,
     patience: float | None,
     **options: Any,
 ) -> None:
@@ -184,6 +187,12 @@ def switcher(
 
         if steps is not None:
             write_steps(steps, reached)
+
+    def note_clocks(offsets: ClockOffsets, warning: str | None) -> None:
+        from msg_agents.processes.status_file import write_clocks
+
+        if clocks is not None:
+            write_clocks(clocks, offsets.to_json(), warning)
 
     def tell_channel(file: Path | None) -> Callable[[int], None]:
         if file is None:
@@ -208,6 +217,7 @@ def switcher(
             on_progress=report,
             on_graph=tell_channel(active_graph),
             checkpoints=directory,
+            on_clocks=None if patience is None else note_clocks,
             ack_timeout=max(ACK_TIMEOUT, patience or 0.0),
         )
         store_participant(takeovers, node)

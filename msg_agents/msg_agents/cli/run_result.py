@@ -104,6 +104,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         "events": result.events,
         "strangers": result.strangers,
         "failures": result.failures,
+        "clocks": result.clocks,
         "channel": result.channel,
     }
     if result.bag is not None and (result.comparison is not None or (result.interrupted and result.recorded)):

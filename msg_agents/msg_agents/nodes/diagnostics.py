@@ -31,6 +31,7 @@ from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.topics import DIAGNOSTICS
 
 DIAGNOSTICS_PERIOD = 1.0  # s
+CLOCK_BOUND = "clock ahead of the switcher's by at most [ms]"  # a value of agents in real time
 
 
 @dataclass(slots=True)

@@ -24,12 +24,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
+from rclpy.serialization import deserialize_message
 
-from msg_agents.nodes.diagnostics import Health
+from msg_agents.nodes.diagnostics import CLOCK_BOUND, Health
 from msg_agents.nodes.network_node import ACK_TIMEOUT, NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.ros.timers import DueTimer, every
-from msg_agents.processes.process_plan import RECORDER
+from msg_agents.processes.process_plan import RECORDER, SWITCHER
+from msg_agents.stepping.clock_offsets import MILLISECOND, ClockOffsets
 from msg_agents.stepping.realtime_schedule import Schedule
 from msg_analysis.model.arithmetic.step_clock import SECOND
 from msg_analysis.model.run.graph_path import Sojourn, sojourns
@@ -70,6 +73,7 @@ class Switcher(NetworkNode):
         on_graph: Callable[[int], None] = lambda _: None,  # mode, from 0, of the graph that is active from now on
         checkpoints: Path | None = None,  # directory for a mark; finding one there means a takeover
         ack_timeout: float = ACK_TIMEOUT,  # s to wait for acknowledgements of the end
+        on_clocks: Callable[[ClockOffsets, str | None], None] | None = None,  # with several hosts: see RealtimeSwitcher
     ) -> None:
         super().__init__("switcher", record=record)
         self._ack_timeout = ack_timeout
@@ -79,7 +83,7 @@ class Switcher(NetworkNode):
         self._slowest = -1
         self._heard = False  # from an agent since the last call of on_progress
         self._recorded = RECORDER not in readers
-        self._on_progress, self._on_graph = on_progress, on_graph
+        self._on_progress, self._on_graph, self._on_clocks = on_progress, on_graph, on_clocks
         self._duplicates: set[str] = set()  # names seen at the last check
         self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
         if self._mark and self._mark.exists():  # in the middle of a run, none of the user's nodes is awaited
@@ -227,12 +231,37 @@ class RealtimeSwitcher(Switcher):
         self._timer = DueTimer(self, self._keep_up)
         self._schedule: Schedule | None = None
         self._next = next(self._path, None)
+        self._clocks = ClockOffsets()
+        self._apart: str | None = None  # which clocks are too far from ours
+        if self._on_clocks and not self.get_parameter("use_sim_time").value:
+            self.subscribe(topics.DIAGNOSTICS, self._receive_health)
+
+    def _receive_health(self, data: bytes) -> None:
+        """Compare the clocks of agents with ours: their health has the time at which it was sent."""
+        assert self._on_clocks
+        now = self._timer.now()
+        array = deserialize_message(data, DiagnosticArray)
+        sent = array.header.stamp.sec * SECOND + array.header.stamp.nanosec
+        agents = {f"{self.get_namespace()}/{name}".lstrip("/"): name for name in self._own_names()}
+        for status in array.status:
+            name = agents.get(status.name.partition(":")[0])
+            bounds = [float(value.value) for value in status.values if value.key == CLOCK_BOUND]
+            if name not in (None, SWITCHER, RECORDER) and bounds:
+                self._clocks.hear(name, sent, now, bounds[0] * MILLISECOND)
+        run = self.record.experiment.run
+        apart = self._clocks.warning(self.record.experiment.step_length / run.speed * SECOND)
+        if apart and not self._apart:
+            self.get_logger().warning(apart)
+        self._apart = apart
+        self._on_clocks(self._clocks, apart)
 
     def _health(self, values: dict[str, str]) -> Health:
         if self._schedule is None:
             return Health("waiting for the time on /clock", waiting=True, values=values)
         late = self._next is not None and self._timer.now() - self._schedule.clock_time(self._next.first_step)
         values["lateness of the graph [ms]"] = f"{max(0, late) / 1e6:.3f}"
+        if self._apart:
+            return Health(self._apart, waiting=True, values=values)
         return Health(f"step of the slowest agent: {self._slowest}", values=values)
 
     def begin(self) -> None:

@@ -14,7 +14,8 @@
 
 """Files in which the processes of a run report to the runner: neither side ever waits for the other.
 
-Account files have refused messages and what the nodes wait for; the file of steps, how far every agent is.
+Account files have refused messages and what the nodes wait for; the file of steps, how far every agent is; that of
+clocks, how far those of several hosts are apart.
 """
 
 from __future__ import annotations
@@ -61,6 +62,19 @@ def read_steps(path: Path) -> list[int]:
         steps: list[int] = json.loads(path.read_text(encoding="utf-8"))
         return steps
     return []
+
+
+def write_clocks(path: Path, offsets: Sequence[Mapping[str, Any]], warning: str | None) -> None:
+    """Replace what the switcher knows of the clocks of several hosts; an error such as a full disk is ignored."""
+    _replace(path, {"offsets": list(offsets), "warning": warning})
+
+
+def read_clocks(path: Path) -> tuple[list[dict[str, Any]] | None, str | None]:
+    """Offsets of the clocks (None: not compared), and which are too far apart."""
+    with contextlib.suppress(OSError, ValueError):
+        document = json.loads(path.read_text(encoding="utf-8"))
+        return document["offsets"], document["warning"]
+    return None, None
 
 
 def _replace(path: Path, document: Any) -> None:

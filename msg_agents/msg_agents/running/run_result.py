@@ -57,6 +57,9 @@ class RunResult:
         when processes were killed and back, and messages first refused: see ``running.event_log``
     reached
         newest step of the slowest agent, as last reported; -1: none
+    clocks
+        with several hosts in real time, how far the clocks of the agents' hosts are ahead of the switcher's:
+        dictionaries with "node" and "ahead_ms", an interval; None: not compared
     channel
         what the channel did: see ``channel.counts``; None: there was none
     trajectory
@@ -77,6 +80,7 @@ class RunResult:
     strangers: list[dict[str, Any]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
     reached: int = -1
+    clocks: list[dict[str, Any]] | None = None
     channel: dict[str, Any] | None = None
     trajectory: Trajectory | None = None
     comparison: Comparison | None = None

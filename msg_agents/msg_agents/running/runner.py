@@ -41,7 +41,7 @@ from msg_agents.running.event_log import EventLog
 from msg_agents.running.run_channel import run_channel
 from msg_agents.running.run_folder import make_bag_directory, workshop
 from msg_agents.running.run_result import RunResult
-from msg_agents.running.supervisor import ACCOUNTS, CRASHED, STEPS, Supervisor
+from msg_agents.running.supervisor import ACCOUNTS, CLOCKS, CRASHED, STEPS, Supervisor
 from msg_agents.running.surroundings import ROS_LOGS, surroundings, will_introduce
 from msg_agents.stepping.stall_detection import LagDetector, StallDetector
 from msg_agents.terminal.interruption import Interruption
@@ -201,6 +201,7 @@ def run_network(
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
                     _collect_failures(supervisor, result, kept, restarts)
             result.strangers = supervisor.account().strangers()
+            result.clocks, _ = supervisor.clocks()
             if linked:
                 result.channel = linked.to_json(supervisor)
             if bag is not None:
@@ -237,11 +238,13 @@ def _watch(
     stall, steps, run = StallDetector(), experiment.steps, experiment.run
     due = run.speed / experiment.step_length  # steps per second in real time
     lag = LagDetector(due) if run.pace == "realtime" and follow_clock else None
-    events = EventLog(result.events)
+    events, warned = EventLog(result.events), None
     while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
         time.sleep(POLL)
         supervisor.read_status()
         events.look(supervisor.steps, supervisor.account)
+        if not warned and (warned := supervisor.clocks()[1]):
+            view.note(warned)
         view.look(supervisor.steps)
         reached = min(supervisor.steps, default=-1)
         if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
@@ -313,7 +316,7 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
 
 def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
     try:
-        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS, STEPS, ROS_LOGS))
+        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS, STEPS, CLOCKS, ROS_LOGS))
     except OSError as error:
         # The argument of shutil.Error is a list of (from, to, reason).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)

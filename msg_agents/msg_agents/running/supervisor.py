@@ -28,13 +28,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from msg_agents.discovery.introducer import Introducer
 from msg_agents.processes.core_pinning import keep_to
 from msg_agents.processes.fork_server import NodeServer, NodeStart
 from msg_agents.processes.process_plan import CHANNEL, RECORDER, SWITCHER, ProcessPlan
-from msg_agents.processes.status_file import Account, read_accounts, read_steps
+from msg_agents.processes.status_file import Account, read_accounts, read_clocks, read_steps
 from msg_analysis.common.forked_processes import Process
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
@@ -46,7 +46,7 @@ SILENCE = 3.0  # s; accounts are written once a second
 CHANNEL_SILENCE = 10.0  # s after which a channel that reports nothing is given up
 EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
 CRASHED = 1  # exit code of Python after an uncaught exception
-ACCOUNTS, STEPS = "accounts", "steps.json"
+ACCOUNTS, STEPS, CLOCKS = "accounts", "steps.json", "clocks.json"
 
 
 def failure_of(code: int) -> str | None:
@@ -190,7 +190,7 @@ class Supervisor:
         self._accounts.append(account)
         arguments = [*plan.arguments, "--account", str(account), *self.options.get(plan.name, ())]
         if plan.name == SWITCHER:
-            arguments += ["--steps", str(self.logs / STEPS)]
+            arguments += ["--steps", str(self.logs / STEPS), "--clocks", str(self.logs / CLOCKS)]
         descriptors = {"--lifeline": self._lifeline[0]}
         if self.introducer is not None:
             descriptors["--introduction"] = self.introducer.descriptor
@@ -241,6 +241,10 @@ class Supervisor:
     def account(self) -> Account:
         """What the nodes have refused, and what they wait for."""
         return read_accounts(self._accounts)
+
+    def clocks(self) -> tuple[list[dict[str, Any]] | None, str | None]:
+        """How far the clocks of several hosts are apart, and a warning."""
+        return read_clocks(self.logs / CLOCKS)
 
     @property
     def silent(self) -> list[Child]:

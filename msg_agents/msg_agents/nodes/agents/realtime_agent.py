@@ -16,13 +16,15 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from typing import Any
 
 from msg_agents.nodes.agents.agent import Agent
-from msg_agents.nodes.diagnostics import Health
+from msg_agents.nodes.diagnostics import CLOCK_BOUND, Health
 from msg_agents.nodes.ros.timers import DueTimer
+from msg_agents.nodes.switcher import EPOCH_DELAY
 from msg_agents.stepping.agent_inputs import NOTHING
 from msg_agents.stepping.newest_values import NewestOnAir, NewestValues
 from msg_agents.stepping.realtime_schedule import CLOCK_MARGIN, Schedule
@@ -65,6 +67,10 @@ class RealtimeAgent(Agent):
         self._made = stamp_ns(self._resumed) if self._resumed else 0  # simulated time [ns] of the newest state
         # The stamps of others may be so much ahead of our clock.
         self._margin = round(CLOCK_MARGIN * SECOND * self._speed)
+        self._common: Schedule | None = None  # simulated time without a phase
+        self._ahead_at_most = (
+            math.inf
+        )  # how far our clock is ahead of the switcher's at most, by what came from it [ns]
         self._late = self._graph_late = 0  # largest lateness since the last report [ns of simulated time]
         self._looked = 0  # time of the clock at the last call of ``_waiting_for`` [ns]
         self._missed = self._missed_before = 0  # steps made later than the next one was due
@@ -93,9 +99,15 @@ class RealtimeAgent(Agent):
                 self.refuse(Refusal.OTHER_EPOCH, topics.EPOCH.name)
             return
         self._schedule = Schedule(epoch=epoch, speed=self._speed, step_length=self._dt, phase=self._phase)
+        self._common = Schedule(epoch=epoch, speed=self._speed, step_length=self._dt)
+        self._bound_clock(epoch - EPOCH_DELAY)
         self._newest.review()
         # After a takeover steps are overdue; by the time of the next step all others have published their state.
         self._set_timer(self._timer.now())
+
+    def _bound_clock(self, sent: int) -> None:
+        """A message has come that the switcher sent at this time of its clock [ns], or later."""
+        self._ahead_at_most = min(self._ahead_at_most, self._timer.now() - sent)
 
     def _set_timer(self, now: int) -> None:
         assert self._schedule is not None
@@ -160,6 +172,8 @@ class RealtimeAgent(Agent):
             # After the first step of this agent that should have used it.
             late = self._schedule.simulated(self._timer.now()) - self._schedule.due(graph.first_step)
             self._graph_late = max(self._graph_late, late)
+        if self._common and graph.first_step:  # the first one comes before its time
+            self._bound_clock(self._common.clock_time(graph.first_step))
         return self._newest.learn(graph.mode - 1, graph.first_step)
 
     def health(self) -> Health:
@@ -177,6 +191,8 @@ class RealtimeAgent(Agent):
             "deadlines missed": str(self._missed),
             "oldest value of a neighbour [steps]": str(max(self._newest.behind.values(), default=0)),
         }
+        if math.isfinite(self._ahead_at_most):
+            values[CLOCK_BOUND] = f"{self._ahead_at_most / 1e6:.6f}"
         if self._newest.finished:
             return Health("has made all steps", values=values)
         waiting = self._waiting_for()
