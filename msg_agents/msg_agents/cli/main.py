@@ -56,7 +56,15 @@ if TYPE_CHECKING:
     from msg_analysis.bags.format.storage_options import Compression
 
 
-@click.group(cls=CommandGroup)
+class _Commands(CommandGroup):
+    """With that of the process of a channel, which only a run can start: it is in no list."""
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        """The command of this name."""
+        return nodes.channel if name == nodes.channel.name else super().get_command(context, name)
+
+
+@click.group(cls=_Commands)
 @click.version_option(msg_agents.__version__, prog_name="msg-agents")
 def main() -> None:
     """Networks of agents under Markov-switching graphs, as ROS 2 processes."""
@@ -409,7 +417,6 @@ for _command in (
     nodes.agent,
     nodes.switcher,
     nodes.recorder,
-    nodes.channel,
     replay.play,
     watching.live,
     watching.markers,

@@ -245,7 +245,7 @@ def recorder(
     _run_nodes(nodes, record, **options)
 
 
-@click.command(hidden=True)
+@click.command()
 @click.option("--control", type=int, required=True)
 def channel(control: int) -> None:
     """Be the channel of a run, which tells it over the socket CONTROL what to do."""
