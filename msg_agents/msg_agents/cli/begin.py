@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Commands to begin with: ``demo``, ``examples``, ``new``."""
+"""Commands to begin with: ``demo``, ``examples``, ``new``, ``schema``."""
 
 from __future__ import annotations
 
@@ -222,3 +222,11 @@ def _words(kind: Any) -> Callable[[str], tuple[Any, ...]]:
         return () if words == ["none"] else tuple(dict.fromkeys(kind.convert(word, None, None) for word in words))
 
     return read
+
+
+@click.command(epilog=example_lines("msg-agents schema > channel.schema.json"))
+def schema() -> None:
+    """Print the JSON Schema of channel files, for editors."""
+    from msg_agents.channel.channel_file import json_schema
+
+    print_json(json_schema(), indent=2)

@@ -282,18 +282,6 @@ def _newest_bag(directory: Path) -> Path:
     return bags[-1].parent
 
 
-@main.command(epilog=examples("msg-agents prepare line_ring > run.json"))
-@experiment_argument
-def prepare(experiment: Path) -> None:
-    """Print the run record of a new run of EXPERIMENT: the file with which single nodes are started."""
-    from msg_analysis.model.experiment.experiment import ValidExperiment
-    from msg_analysis.twin.simulate import new_record
-
-    what = ValidExperiment.load(experiment)
-    what.require_available()
-    click.echo(new_record(what).to_json(with_key=True))
-
-
 @main.command(
     epilog=examples(
         "msg-agents prepare line_ring > run.json   # once; copy it to all hosts",
@@ -400,20 +388,14 @@ def host(
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
 
 
-@main.command(epilog=examples("msg-agents schema > channel.schema.json"))
-def schema() -> None:
-    """Print the JSON Schema of channel files, for editors."""
-    from msg_agents.channel.channel_file import json_schema
-
-    print_json(json_schema(), indent=2)
-
-
 for _command in (
     begin.demo_of(run),
     begin.examples,
     begin.new,
+    begin.schema,
     runs,
     doctor,
+    nodes.prepare,
     nodes.agent,
     nodes.switcher,
     nodes.recorder,

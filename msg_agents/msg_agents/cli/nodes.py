@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Commands of ``msg-agents`` that run one process of a network: ``agent``, ``switcher`` and ``recorder``."""
+"""Commands of ``msg-agents`` that run one process of a network: ``agent``, ``switcher``, ``recorder``; ``prepare``."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from msg_agents.cli.ros_command import RosCommand
 from msg_agents.processes.environment import DISCOVERY_TIMEOUT
 from msg_agents.processes.lifeline import hold_pipe
 from msg_analysis.cli.console import examples
-from msg_analysis.cli.options import PATH, RUN_RECORD, PositiveFloat, suggest
+from msg_analysis.cli.options import PATH, RUN_RECORD, PositiveFloat, experiment_argument, suggest
 from msg_analysis.cli.storage_options import storage, storage_options
 from msg_analysis.common.exit_codes import ExitCode
 
@@ -112,6 +112,18 @@ def _agents_of_record(context: click.Context, _option: click.Parameter, incomple
     except (OSError, ValueError, KeyError, TypeError):  # better no completion than a wrong one
         return []
     return [CompletionItem(str(i)) for i in range(1, agents + 1) if str(i).startswith(incomplete)]
+
+
+@click.command(epilog=examples("msg-agents prepare line_ring > run.json"))
+@experiment_argument
+def prepare(experiment: Path) -> None:
+    """Print the run record of a new run of EXPERIMENT: the file with which single nodes are started."""
+    from msg_analysis.model.experiment.experiment import ValidExperiment
+    from msg_analysis.twin.simulate import new_record
+
+    what = ValidExperiment.load(experiment)
+    what.require_available()
+    click.echo(new_record(what).to_json(with_key=True))
 
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))

@@ -157,7 +157,7 @@ def run_network(
             ) as around,
         ):
             variables = around.environment
-            if share is None:
+            if share is None and linked is None:  # other hosts and users' tools do not reach those of a channel
                 view.joined(around.domain)
             with NodeServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 record = record or new_record(experiment)
