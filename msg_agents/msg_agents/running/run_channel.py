@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from msg_agents.channel.active_graph import ActiveGraphFile
 from msg_agents.channel.channel_file import BASE, Channel
 from msg_agents.channel.counts import read_counts
@@ -31,7 +33,11 @@ from msg_agents.discovery.rtps import PEERS_VARIABLE
 from msg_agents.processes.environment import channel_environment
 from msg_agents.processes.process_plan import SWITCHER, ProcessPlan
 from msg_agents.running.supervisor import Supervisor
+from msg_analysis.errors import InputError
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.experiment.topology import heard_links
 from msg_analysis.model.step.step_model import Wiring
+from msg_analysis.theory.prediction import predict
 
 CUT_LEASE = 600.0  # s; that the graph cuts a link is no reason to give a host up
 
@@ -67,14 +73,40 @@ class RunChannel:
         joined = self.channel.joined(wiring.links) if self.channel.graph else None
         hand_over(control, self.channel, self.hosts, counts, active_graph, joined)
 
-    def to_json(self, supervisor: Supervisor) -> dict[str, Any]:
+    def to_json(self, supervisor: Supervisor, experiment: ValidExperiment) -> dict[str, Any]:
         """Its hosts, and what it did, as in the result of the run."""
         hosts = {
             name: {"address": host.address, "agents": [agent + 1 for agent in self.channel.hosts[name]]}
             for name, host in self.hosts.items()
         }
         counts = read_counts(supervisor.channel_account) or {"pairs": [], "overflowed": 0, "late_ms": None}
-        return {"seed": self.channel.seed, "recorder": BASE, "graph": self.channel.graph, "hosts": hosts} | counts
+        predicted = predicted_errors(self.channel, experiment)
+        known = {"seed": self.channel.seed, "recorder": BASE, "graph": self.channel.graph, "hosts": hosts}
+        return known | {"predicted": predicted} | counts
+
+
+def predicted_errors(channel: Channel, experiment: ValidExperiment) -> dict[str, Any] | None:
+    """Errors predicted before the run: in place of what the channel loses, the last value heard; nothing is late.
+
+    None where that is not what happens (lockstep, reliable delivery, losses in the experiment itself, packets that the
+    graph cuts, bursts, which are of packets and not of the messages of a link), or where it has no prediction.
+    """
+    run, noise = experiment.run, experiment.noise
+    if run.pace == "lockstep" or run.delivery == "reliable" or noise.loss.any or channel.graph:
+        return None
+    if any(link.loss.good != link.loss.bad for link in channel.links.values()):
+        return None
+    document = experiment.to_document()
+    heard = heard_links(experiment.graph_list, experiment.time)
+    probability = channel.agent_loss(experiment.agents) * heard
+    arcs = [[j + 1, i + 1, float(probability[i, j])] for i, j in np.argwhere(probability).tolist()]
+    if arcs:
+        document["noise"] |= {"loss": {"arcs": arcs}, "on_loss": "hold"}
+    try:
+        predicted = predict(ValidExperiment.parse(document)).emulated
+    except InputError:
+        return None
+    return {"system_error": predicted.system_error, "node_errors": predicted.node_errors.tolist()}
 
 
 @contextmanager

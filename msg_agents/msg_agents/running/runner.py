@@ -203,7 +203,7 @@ def run_network(
             result.strangers = supervisor.account().strangers()
             result.clocks, _ = supervisor.clocks()
             if linked:
-                result.channel = linked.to_json(supervisor)
+                result.channel = linked.to_json(supervisor, experiment)
             if bag is not None:
                 try:
                     with kept.let_through():
