@@ -141,9 +141,9 @@ class Observation:
                 release(array)
 
 
-def spaced_steps(steps: int) -> IntArray:
-    """(T,): at most 400 numbers of steps up to all of them, denser at the beginning."""
-    half = SPACED // 2
+def spaced_steps(steps: int, most: int = SPACED) -> IntArray:
+    """(T,): at most so many numbers of steps up to all of them, denser at the beginning."""
+    half = most // 2
     spaced = np.concatenate([np.geomspace(1, steps, half), np.linspace(1, steps, half)])
     return np.unique(np.rint(spaced).astype(np.int64))
 

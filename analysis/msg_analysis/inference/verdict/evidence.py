@@ -34,6 +34,8 @@ from msg_analysis.inference.realtime.logged_pattern import means_in_lockstep
 from msg_analysis.inference.realtime.timing import Timing, measure_timing
 from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence
 
+LOOKS = 80  # at most, at the evidence over time
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
@@ -86,7 +88,7 @@ class Evidence:
             transitions=Transitions.of(observation.modes, observation.step.modes),
             loss=LossTally.of(observation),
             broadcast=BroadcastSums.of(observation),
-            watched=WatchedEvidence.of(observation, spaced_steps(observation.steps)),
+            watched=WatchedEvidence.of(observation, spaced_steps(observation.steps, LOOKS)),
             timing=timing,
             laws=laws,
         )
