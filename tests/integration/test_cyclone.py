@@ -86,8 +86,10 @@ def test_a_reader_that_was_there_first_gets_everything(network: Any, pause: floa
     assert result.failures == []
     assert result.strangers == []
     equal_to_the_twin(result.trajectory)
+    asked = any("no step for" in log.read_text() for log in (result.bag / "log").iterdir())
     for agent in range(5):
-        assert once(found[f"agent_{agent + 1}/state"]) == states_of(result.trajectory, agent)
+        states = found[f"agent_{agent + 1}/state"]
+        assert (once(states) if asked else states) == states_of(result.trajectory, agent)
     (record,) = found["experiment"]
     assert json.loads(record)["run"] == str(result.trajectory.record.run)
     assert [sequence for sequence, _, _ in found["graph"]] == list(range(len(found["graph"])))

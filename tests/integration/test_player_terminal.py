@@ -58,16 +58,22 @@ def test_keys_pause_and_step(network: Any, twin_bag: Path, plain: Any, terminal:
     assert screen.mode() == screen.before
 
 
+def paused_player(terminal: Any, bag: Path) -> Terminal:
+    """One that waits for the node `plain`, and shows that it stands still."""
+    screen: Terminal = terminal(
+        *(PROGRAM, "play", bag, "--paused", "--rate", "max", "--await", "plain"),
+        *("--topics", "/agent_3/state", "--topics", "/graph"),
+    )
+    screen.wait_for("paused")
+    return screen
+
+
 def test_forward(network: Any, twin_bag: Path, plain: Any, terminal: Any) -> None:
     """The right arrow leaves out 5 % of 15 s, but no graph; the reader then has those of the new place."""
     recorded = contents(mcap(twin_bag))
     file = network.directory / "plain.mcap"
     first = plain(file, {"/agent_3/state": 301 - 45, "/graph": len(recorded["/graph"])})
-    screen = terminal(
-        *(PROGRAM, "play", twin_bag, "--paused", "--rate", "max", "--await", "plain"),
-        *("--topics", "/agent_3/state", "--topics", "/graph"),
-    )
-    screen.wait_for("paused")
+    screen = paused_player(terminal, twin_bag)
     screen.type(3 * b"\x1b[C")
     screen.wait_for("2.2/15.0 s")
     screen.type(b" ")
@@ -82,11 +88,7 @@ def test_to_a_typed_time(network: Any, twin_bag: Path, plain: Any, terminal: Any
     recorded = contents(mcap(twin_bag))
     file = network.directory / "plain.mcap"
     first = plain(file, {"/agent_3/state": 301 - 250, "/graph": len(recorded["/graph"])})
-    screen = terminal(
-        *(PROGRAM, "play", twin_bag, "--paused", "--rate", "max", "--await", "plain"),
-        *("--topics", "/agent_3/state", "--topics", "/graph"),
-    )
-    screen.wait_for("paused")
+    screen = paused_player(terminal, twin_bag)
     for typed, said in (
         (b"1.2.5\n", "1.2.5: expected a time in seconds"),
         (b"150\n", "150 s: expected a time up to 15 s"),

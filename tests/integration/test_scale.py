@@ -6,14 +6,12 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from visitor import assert_endpoints
 
-from msg_agents.processes.environment import node_environment
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 
@@ -86,32 +84,16 @@ def test_who_reads_batches(
     network: Any, domain: int, experiment: Any, of_batches: list[int], of_first: list[int], of_last: list[int]
 ) -> None:
     """Processes that hear most of the network, on the node of their first agent, and no topic of single agents."""
-    wanted = {
+    readers = {
         "/states": sorted(["recorder", *(f"agent_{i}" for i in of_batches)]),
         "/agent_1/state": sorted(f"agent_{i}" for i in of_first),
         "/agent_24/state": sorted(f"agent_{i}" for i in of_last),
     }
     run = network.record(network.file(**experiment, run={"duration": 10_000, "processes": 3}), "--domain", str(domain))
     network.wait_until_moving()
-    command = [sys.executable, "-P", "-c", READERS, json.dumps(wanted)]
-    visitor = subprocess.run(
-        command, env=node_environment(domain), capture_output=True, text=True, timeout=60, check=False
-    )
+    assert_endpoints({topic: [[name, "RELIABLE"] for name in names] for topic, names in readers.items()}, {}, domain)
     run.terminate()
     run.communicate(timeout=60)
-    assert json.loads(visitor.stdout) == wanted, visitor.stderr
-
-
-READERS = """
-import json, sys, time, rclpy
-wanted, found, end = json.loads(sys.argv[1]), {}, time.monotonic() + 20
-rclpy.init()
-node = rclpy.create_node("visitor")
-while found != wanted and time.monotonic() < end:
-    time.sleep(0.1)
-    found = {topic: sorted(r.node_name for r in node.get_subscriptions_info_by_topic(topic)) for topic in wanted}
-print(json.dumps(found))
-"""
 
 
 def cores_of(pid: int) -> set[int]:

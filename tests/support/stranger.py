@@ -64,6 +64,11 @@ for topic, kind in topics.items():
 for topic, data in messages[early:]:
     publishers[topic].publish(bytes.fromhex(data))
     time.sleep(0.0001)
+of_states = [message for message in dict(messages).items() if message[0].endswith("/state")]
+while int(sys.argv[5]):
+    for topic, data in of_states:
+        publishers[topic].publish(bytes.fromhex(data))
+    time.sleep(0.001)
 time.sleep(600)
 """
 Forgery = tuple[str, bytes]  # topic, message
@@ -77,17 +82,20 @@ def run_beside(
     meanwhile: Sequence[Forgery] = (),
     *,
     of_batches: int = 1,
+    endless: bool = False,
 ) -> tuple[Trajectory, dict[str, str], Refused]:
     """Run a network of five agents in two processes while a stranger's messages meet every reader before its own.
 
-    More are sent ``meanwhile``. In another network, only batches can be sent, for so many readers. What comes back:
-    trajectory, logs by process, and what was refused by (node, topic, reason).
+    More are sent ``meanwhile``; with ``endless``, one of each topic of states is then sent again and again, since
+    readers with best effort see only some. In another network, only batches can be sent, for so many readers. What
+    comes back: trajectory, logs by process, and what was refused by (node, topic, reason).
     """
     directory: Path = network.directory
     (directory / "forged").write_text("".join(f"{topic} {data.hex()}\n" for topic, data in [*early, *meanwhile]))
+    arguments = [directory / "forged", len(early), record.experiment.agents, of_batches, int(endless)]
     with (
         free_domain() as domain,
-        _stranger([directory / "forged", len(early), record.experiment.agents, of_batches], node_environment(domain)),
+        _stranger(arguments, node_environment(domain)),
         network_awaiting("referee", record, directory, domain) as nodes,
     ):
         network.wait_for(lambda: not nodes.running or nodes.failures, 90, "the end of the run")

@@ -38,9 +38,8 @@ def test_coefficients_are_mixed_with_the_normal_law() -> None:
     random = np.random.default_rng(2)
     regressor, variance = random.normal(size=60), random.uniform(0.5, 2.0, 60)
     samples = 0.2 * regressor + random.normal(size=60) * np.sqrt(variance)
-    found = coefficient_evidence(
-        np.array((regressor * samples / variance).sum()), np.array((regressor**2 / variance).sum()), 0.4
-    )
+    scaled = 0.4 * regressor  # the coefficient in the law is 0.4
+    found = coefficient_evidence(np.array((scaled * samples / variance).sum()), np.array((scaled**2 / variance).sum()))
     deviation = np.sqrt(variance)
     null = stats.norm.logpdf(samples, scale=deviation).sum()
     for share, log in zip(SHARES, found, strict=True):

@@ -1,0 +1,38 @@
+"""A node outside a network that looks who reads its topics."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+
+from msg_agents.processes.environment import node_environment
+
+Endpoints = Mapping[str, Sequence[Sequence[str]]]
+
+
+def assert_endpoints(readers: Endpoints, writers: Endpoints, domain: int) -> None:
+    """Within 20 s, these topics have exactly these readers and writers: node and reliability of each, sorted."""
+    wanted = json.dumps([readers, writers])
+    command = [sys.executable, "-P", "-c", VISITOR, wanted]
+    visitor = subprocess.run(
+        command, env=node_environment(domain), capture_output=True, text=True, timeout=60, check=False
+    )
+    assert json.loads(visitor.stdout) == json.loads(wanted), visitor.stderr
+
+
+VISITOR = """
+import json, sys, time, rclpy
+wanted, found, end = json.loads(sys.argv[1]), [], time.monotonic() + 20
+rclpy.init()
+node = rclpy.create_node("visitor")
+looks = node.get_subscriptions_info_by_topic, node.get_publishers_info_by_topic
+while found != wanted and time.monotonic() < end:
+    time.sleep(0.1)
+    found = [
+        {topic: sorted([e.node_name, e.qos_profile.reliability.name] for e in look(topic)) for topic in topics}
+        for look, topics in zip(looks, wanted)
+    ]
+print(json.dumps(found))
+"""
