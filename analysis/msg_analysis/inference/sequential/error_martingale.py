@@ -22,6 +22,7 @@ quadratic form is exp of another one; the graphs are then summed over. Replicas 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -50,11 +51,11 @@ class ErrorMartingale:
         if system.loss_variance is not None:
             raise ValueError("lost messages: the next state is not normal given this one")
         forms, _, trace = forms_of(system, "system")
-        dual = prediction.solver.dual(packed_symmetric.unpack(forms, system.dimension))
-        _, kappa = mode_potential(system, dual)
-        self._forms, self._kappa = dual[0], kappa[0]  # (n, d, d), (n,)
+        values = [value for value in values_of(prediction, forms) if isinstance(value, Value)]
+        self._forms = values[0].forms[:, 0]  # (n, d, d), the same for every graph of this step
+        self._kappa = mode_potential(system, self._forms[None])[1][0]  # (n,)
         self._system, self._replicas = system, replicas
-        self.variance = _typical_variance(prediction, replicas, forms, trace)
+        self.variance = _typical_variance(prediction, replicas, values, trace)
         self.rates = self._choose_rates()
         self.total = np.zeros(len(self.rates))
         self.numbers = packed_symmetric.size(system.dimension) + 1
@@ -104,12 +105,11 @@ class ErrorMartingale:
         return rows
 
 
-def _typical_variance(prediction: Prediction, replicas: int, forms: FloatArray, trace: FloatArray) -> float:
+def _typical_variance(prediction: Prediction, replicas: int, values: Sequence[Value], trace: FloatArray) -> float:
     """Var(D_k) at the steady second moments: what rates are chosen by; nothing depends on its being exact."""
     total = 0.0
     law = prediction.system.stationary
-    for value, moments, share in zip(values_of(prediction, forms), prediction.steady, law, strict=True):
-        assert isinstance(value, Value)
+    for value, moments, share in zip(values, prediction.steady, law, strict=True):
         a = np.append(packed_symmetric.pack(moments / share), 1.0)[None]
         total += share * float(value.variances(trace, a, replicas)[0])
     return total

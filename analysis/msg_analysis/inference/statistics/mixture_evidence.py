@@ -28,7 +28,7 @@ from msg_analysis.types import FloatArray, IntArray
 STRENGTHS = (2.0, 20.0, 200.0, 2000.0)
 """Of the alternatives to a variance: the smaller, the more they differ from it (by 0.7, 0.2, 0.07, 0.02 of it)."""
 
-SHARES = (0.03, 0.1, 0.3, 1.0)  # standard deviations of the alternatives to a coefficient, as shares of it
+SHARES = (0.03, 0.1, 0.3, 1.0)  # standard deviations tau of the alternatives to a coefficient, 1 in the law
 ROW_STRENGTHS = (1.0, 10.0, 100.0)  # changes of a row that the alternatives are worth
 PROPORTION_STRENGTHS = (2.0, 20.0, 200.0)  # successes that the alternatives are worth
 
@@ -56,7 +56,7 @@ def variance_evidence(samples: FloatArray | IntArray, squares: FloatArray) -> Fl
     return np.asarray(gammaln(a + half) - gammaln(a) - half * np.log(a) - (a + half) * np.log1p(s / a) + s)
 
 
-def coefficient_evidence(score: FloatArray, information: FloatArray, size: FloatArray | float = 1.0) -> FloatArray:
+def coefficient_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
     """Against the coefficient 0 of a regressor of normal samples of known variance: coefficients ~ N(0, tau^2).
 
     log of (1 + tau^2 J)^(-1/2) exp(tau^2 U^2 / (2 (1 + tau^2 J))).
@@ -67,15 +67,13 @@ def coefficient_evidence(score: FloatArray, information: FloatArray, size: Float
         (..., ) U, sum of regressor times sample over variance
     information
         (..., ) J, sum of squared regressor over variance
-    size
-        (..., ) the coefficient in the law; tau are ``SHARES`` of it
 
     Returns
     -------
     FloatArray
-        (..., K) of each share
+        (..., K) of each tau in ``SHARES``
     """
-    tau2 = (np.asarray(size)[..., None] * np.array(SHARES)) ** 2
+    tau2 = np.array(SHARES) ** 2
     spread = 1.0 + tau2 * np.asarray(information)[..., None]
     return np.asarray(0.5 * (tau2 * np.asarray(score)[..., None] ** 2 / spread - np.log(spread)))
 
