@@ -4,7 +4,7 @@ A ROS 2 topic ``name`` of type ``package/msg/Type`` is the DDS topic ``rt/name``
 The package cyclonedds reads the annotations of the types as they are: they must not be deferred (``from __future__``).
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -167,7 +167,7 @@ class Node:
 
     def without_writer(self) -> list[str]:
         """Topics that it reads and for which it knows no writer yet."""
-        return [topic for topic, reader in self.readers.items() if not reader.get_matched_publications()]
+        return [topic for topic, reader in self.readers.items() if not _matched(reader.get_matched_publications)]
 
     def announce(self) -> None:
         """Say the name and which endpoints belong to it: from then on, nodes that wait for this name take it for ready.
@@ -193,8 +193,18 @@ class Node:
             for gid in node.reader_gid_seq
         }
         writer = self.writers[topic]
-        matched = [writer.get_matched_subscription_data(handle) for handle in writer.get_matched_subscriptions()]
+        handles = _matched(writer.get_matched_subscriptions)
+        matched = [writer.get_matched_subscription_data(handle) for handle in handles]
         return {readers[reader.key.bytes] for reader in matched if reader is not None and reader.key.bytes in readers}
+
+
+def _matched(ask: Callable[[], list[int]]) -> list[int]:
+    """Who is matched. The package counts, then lists: where one more is matched in between, it raises IndexError."""
+    while True:
+        try:
+            return ask()
+        except IndexError:
+            continue
 
 
 def _gid(identity: Iterable[int]) -> Gid:

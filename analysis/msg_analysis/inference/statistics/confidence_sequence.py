@@ -47,4 +47,4 @@ def simultaneous_half_width(variance: FloatArray | float, target: float, level: 
     wide = 2.0 * math.log(1.0 / level)
     r = max(target, np.finfo(float).tiny) / (wide + math.log(1.0 + wide))
     total = np.asarray(variance, dtype=float) + r
-    return np.asarray(np.sqrt(total * (np.log(total / r) + wide)))
+    return np.asarray(np.sqrt(total * ((np.log(total) - np.log(r)) + wide)))
