@@ -63,7 +63,8 @@ def main() -> None:
     readers |= {topic: node.read(topic, *limits) for topic in states}
     for topic in ("graph", "progress", "end", *states) if options.forge else ():
         node.write(topic)
-    while node.without_writer():
+    # What it forges must reach another node, not only itself: readers that it does not know yet would miss it.
+    while node.without_writer() or any(not node.readers_of(topic) - {node.name} for topic in node.writers):
         time.sleep(0.01)
     node.announce()
     came: dict[str, list[Any]] = {topic: [] for topic in readers}
