@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import signal
 import subprocess
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -35,6 +37,12 @@ LAWS: dict[str, dict[str, Any]] = {
     "integral_action": {"protocol": {"name": "integral_action"}},
 }
 PROCESSES = ("one_per_agent", 2, 1)
+Cells = list[tuple[str, str, int | str]]  # law, messages, processes
+
+
+def cells(selected: Cells) -> Cells:
+    """The selected combinations of laws and messages; all of them in ``make stress``."""
+    return [(law, messages, 2) for law, messages in product(LAWS, MESSAGES)] if "STRESS" in os.environ else selected
 
 
 def changes(law: str, messages: str, run: dict[str, Any]) -> dict[str, Any]:
@@ -54,13 +62,15 @@ def assert_equal(trajectory: Trajectory) -> None:
 
 @pytest.mark.parametrize(
     ("law", "messages", "processes"),
-    [
-        ("consensus", "all", "one_per_agent"),
-        ("leaders", "bursts", 2),
-        ("grounded", "hold", 2),
-        ("metropolis", "late", "one_per_agent"),
-        ("integral_action", "all", 2),
-    ],
+    cells(
+        [
+            ("consensus", "all", "one_per_agent"),
+            ("leaders", "bursts", 2),
+            ("grounded", "hold", 2),
+            ("metropolis", "late", "one_per_agent"),
+            ("integral_action", "all", 2),
+        ]
+    ),
 )
 def test_lockstep(network: Any, law: str, messages: str, processes: Any) -> None:
     result = network.run(network.experiment(**changes(law, messages, LOCKSTEP | {"processes": processes})))
@@ -70,14 +80,16 @@ def test_lockstep(network: Any, law: str, messages: str, processes: Any) -> None
 
 @pytest.mark.parametrize(
     ("law", "messages", "processes"),
-    [
-        ("consensus", "own", 2),
-        ("leaders", "hold", "one_per_agent"),
-        ("consensus", "late", 2),
-        ("grounded", "all", 2),
-        ("saturated", "own", 2),
-        ("integral_action", "all", "one_per_agent"),
-    ],
+    cells(
+        [
+            ("consensus", "own", 2),
+            ("leaders", "hold", "one_per_agent"),
+            ("consensus", "late", 2),
+            ("grounded", "all", 2),
+            ("saturated", "own", 2),
+            ("integral_action", "all", "one_per_agent"),
+        ]
+    ),
 )
 def test_real_time(network: Any, law: str, messages: str, processes: Any) -> None:
     """What was used is what the rules allow: nothing that was lost, and nothing newer than the delay."""
