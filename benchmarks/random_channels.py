@@ -53,9 +53,8 @@ def losses(channel: Channel, counts: dict[str, Any]) -> tuple[float, bool]:
         link = Link(settings, channel.seed, places[sender], places[receiver])
         same &= lost == sum(link.carry(0, 0.0)[0] is Fate.LOST for _ in range(sent))
         model = settings.loss
-        alike = 1.0 - model.to_bad - model.to_good if model.good != model.bad else 0.0  # correlation of neighbours
         difference += lost - sent * model.mean
-        variance += sent * model.mean * (1.0 - model.mean) * (1.0 + alike) / (1.0 - alike)
+        variance += sent * model.mean * (1.0 - model.mean) * model.inflation
     return difference / math.sqrt(variance) if variance else 0.0, same
 
 

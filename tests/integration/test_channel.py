@@ -120,6 +120,7 @@ def test_real_time_over_a_bad_channel(network: Any) -> None:
     assert used is not None
     pairs = {(pair["sender"], pair["receiver"]): pair for pair in result["channel"]["pairs"]}
     assert pairs["left", "right"]["lost"] > 0
+    assert any(line.startswith("Of the messages between agents, ") for line in result["channel"]["findings"])
     assert pairs["base", "right"]["lost"] == pairs["left", "base"]["lost"] == 0
 
 
@@ -136,7 +137,18 @@ def test_only_active_links_carry_packets(network: Any, pace: str) -> None:
 
 def test_a_limited_rate(network: Any) -> None:
     run = start(network, {"duration": 3}, "--no-analyse", "--no-fork", default={"rate_mbit": 2, "queue": 1000})
-    assert totals(network.completed(run), "queued") > 0
+    result = network.completed(run)
+    assert totals(result, "queued") > 0
+    assert result["channel"]["findings"] == []
+
+
+def test_a_rate_that_is_too_low_is_named(network: Any) -> None:
+    slow = {"sender": "agent_1", "receiver": "agent_2", "rate_mbit": 0.2, "queue": 0}
+    run = start(network, {"duration": 3, "pace": "realtime"}, "--no-analyse", pairs=[slow])
+    result = network.completed(run)
+    assert totals(result, "dropped") > 0
+    (line,) = result["channel"]["findings"]
+    assert "of the packets from agent_1 to agent_2 were dropped by the full queue" in line
 
 
 def test_a_killed_agent_comes_back_on_its_host(network: Any, hosts: set[int]) -> None:

@@ -58,6 +58,15 @@ class LossModel:
         """Share of the packets that is lost."""
         return self.good + self.stationary_bad * (self.bad - self.good)
 
+    @property
+    def inflation(self) -> float:
+        """Variance of the number of losses over that of independent ones, of many packets."""
+        if self.good == self.bad or not 0.0 < self.mean < 1.0:
+            return 1.0
+        bad, persistence = self.stationary_bad, 1.0 - self.to_bad - self.to_good
+        covariance = bad * (1.0 - bad) * (self.bad - self.good) ** 2  # of successive packets, over persistence
+        return 1.0 + 2.0 * covariance / (self.mean * (1.0 - self.mean)) * persistence / (1.0 - persistence)
+
 
 NO_LOSS = LossModel(0.0, 0.0, 0.0, 1.0)
 

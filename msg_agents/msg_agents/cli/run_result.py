@@ -123,6 +123,8 @@ def _show(result: RunResult, as_json: bool) -> None:
         click.echo(f"bag: {document['bag']}")
         if result.interrupted and result.reached > 0:
             click.echo(f"To compare what it holds with the prediction: msg-analysis compare {document['bag']}")
+    for line in (result.channel or {}).get("findings", []):
+        click.echo(f"channel: {line}")
     if result.rate:
         click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
 

@@ -26,6 +26,7 @@ import numpy as np
 from msg_agents.channel.active_graph import ActiveGraphFile
 from msg_agents.channel.channel_file import BASE, Channel
 from msg_agents.channel.counts import read_counts
+from msg_agents.channel.findings import channel_findings
 from msg_agents.channel.namespaces import Host, open_hosts
 from msg_agents.channel.process import hand_over
 from msg_agents.discovery.profiles import LEASE, profile_for_hosts
@@ -80,9 +81,13 @@ class RunChannel:
             for name, host in self.hosts.items()
         }
         counts = read_counts(supervisor.channel_account) or {"pairs": [], "overflowed": 0, "late_ms": None}
+        for pair in counts["pairs"]:
+            model = self.channel.links[pair["sender"], pair["receiver"]].loss
+            pair |= {"loss": model.mean, "inflation": model.inflation}
         predicted = predicted_errors(self.channel, experiment)
         known = {"seed": self.channel.seed, "recorder": BASE, "graph": self.channel.graph, "hosts": hosts}
-        return known | {"predicted": predicted} | counts
+        document = known | {"predicted": predicted} | counts
+        return document | {"findings": channel_findings(document)}
 
 
 def predicted_errors(channel: Channel, experiment: ValidExperiment) -> dict[str, Any] | None:

@@ -135,6 +135,11 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
     from msg_analysis.inference.verdict.compare import compare
 
     comparison = compare(result.trajectory)
+    if result.channel is not None and comparison.timing is not None:
+        from msg_agents.channel.findings import channel_findings
+
+        timing = comparison.timing
+        result.channel["findings"] = channel_findings(result.channel, timing.unheard, timing.period_ms)
     if report == "always" or (report == "on-failure" and comparison.verdict != "agrees"):
         from msg_analysis.report.html.report_page import write_report
 

@@ -130,3 +130,15 @@ def test_lost_packets_take_their_time_on_the_air() -> None:
     link = Link(LinkSettings(certain, rate=1.0, queue=0), 1, 2, 3)
     assert [link.carry(125, time)[0] for time in (0.0, 0.0005)] == [Fate.LOST, Fate.DROPPED]
     assert math.isinf(LinkSettings().rate)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [LossModel(0.3, 0.3, 0.0, 1.0), LossModel.bursts(0.2, 4.0), LossModel(0.05, 0.7, 0.02, 0.1)],
+    ids=["independent", "bursts", "two states"],
+)
+def test_the_variance_of_the_number_of_losses(model: LossModel) -> None:
+    """Against 400 links of 2,000 packets; a chi-square law within 5 standard errors: false alarms below 1e-6 each."""
+    numbers = [fates(LinkSettings(model), seed, 2_000).sum() for seed in range(400)]
+    expected = 2_000 * model.mean * (1.0 - model.mean) * model.inflation
+    assert abs(np.var(numbers, ddof=1) / expected - 1.0) < 5 * math.sqrt(2 / 399)

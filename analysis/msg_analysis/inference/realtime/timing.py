@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.realtime.unheard import UnheardMessages, unheard_messages
 from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.phases import phases
@@ -66,6 +67,7 @@ class Timing:
     uses: int  # neighbours' values that steps needed, those never heard or lost included
     ideal_uses: int  # uses of the value that ideal timers would have used, the own one for a lost one included
     never_heard: int  # uses in which nothing had been heard yet of the neighbour
+    unheard: UnheardMessages
     outdated_graphs: int  # steps made with another graph than the network's at that time
     histogram: tuple[FloatArray, AnyArray]  # of lateness: edges [ms] (BINS + 1,) and counts (BINS,); covers all values
     ages: tuple[FloatArray, AnyArray]  # the same of ``staleness_ms``
@@ -97,6 +99,7 @@ class Timing:
             "staleness_steps": _document(self.staleness_steps),
             "ideal_uses": {"uses": self.uses, "ideal": self.ideal_uses, "share": self.ideal_share},
             "never_heard": self.never_heard,
+            "unheard": self.unheard.to_json(),
             "outdated_graph": {"steps": self.outdated_graphs, "share": self.outdated_share},
             "histogram": {
                 "lateness_ms": edges.tolist(),
@@ -140,6 +143,7 @@ def measure_timing(observation: Observation) -> Timing:
         uses=int(there.sum()),
         ideal_uses=int((there & (timers.used == ideal)).sum()),
         never_heard=int((there & ~heard & (ideal >= 0)).sum()),
+        unheard=unheard_messages(observation),
         outdated_graphs=int((timers.graphs != observation.modes[:, None]).sum()),
         histogram=_histogram(late_ms),
         ages=_histogram(age),

@@ -80,7 +80,19 @@ def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     if timing["never_heard"]:
         facts.append(("uses of neighbours before their first message", str(timing["never_heard"])))
+    unheard = timing.get("unheard")  # results of older versions have none
+    if unheard:
+        numbers = f"{unheard['unheard']} of {unheard['messages']} ({percent(unheard['share'])})"
+        facts.append(
+            ("messages not heard in time", f"{numbers}; lost by the experiment: {percent(unheard['expected'])}")
+        )
     return facts
+
+
+def unheard_words(document: dict[str, Any]) -> list[str]:
+    """That messages between agents were lost or late, in a sentence; empty where the experiment says so."""
+    words = ((document.get("timing") or {}).get("unheard") or {}).get("words")
+    return [with_names(sentence(words), document.get("names"))] if words else []
 
 
 def sentence(words: str) -> str:

@@ -47,6 +47,7 @@ from msg_analysis.report.documents.comparison_words import (
     furthest,
     sentence,
     timing_facts,
+    unheard_words,
     verdict_line,
 )
 from msg_analysis.report.documents.explanation import explain, graph_facts
@@ -126,6 +127,7 @@ def render(
         channel=channel,
         headline=verdict_line(document),
         timing_facts=timing_facts(timing) if timing else [],
+        unheard_words=unheard_words(document),
         times=TIMES,
         quantiles=QUANTILES,
         laws=REAL_TIME_LAWS,

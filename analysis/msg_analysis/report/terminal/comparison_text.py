@@ -37,6 +37,7 @@ from msg_analysis.report.documents.comparison_words import (
     gaps,
     sentence,
     timing_facts,
+    unheard_words,
     verdict_line,
 )
 from msg_analysis.report.terminal.tables import ROWS, fact_table, first_rows, interval_text, number_table, print_table
@@ -154,7 +155,8 @@ def _print_timing(document: dict[str, Any], console: Console) -> None:
         error = law["system_error"]
         table.add_row(title, number_text(error["predicted"]), z_text(error["z"]), Text(SUPPORT[law["supported"]]))
     print_table(console, table)
-    console.print(Text(with_names(laws["why"], document.get("names"))))
+    for line in [with_names(laws["why"], document.get("names")), *unheard_words(document)]:
+        console.print(Text(line))
 
 
 def _print_tests(document: dict[str, Any], console: Console) -> None:
