@@ -52,6 +52,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "inference/hypothesis_tests",
         "inference/errors",
         "inference/sequential",
+        "inference/planning",
         "inference/realtime",
         "inference/blame",
         "inference/verdict",

@@ -39,7 +39,7 @@ from msg_analysis.model.experiment import experiment as model
 from msg_analysis.model.experiment.problems import ExperimentError
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.results import Comparison, Prediction, ShownRun, fields
+from msg_analysis.results import Comparison, PlannedExperiment, Prediction, ShownRun, fields
 from msg_analysis.theory.leaders.search import SearchProgress, ignore
 from msg_analysis.theory.leaders.selection import SearchMethod, Selection, SelectionLaw, select_leaders
 from msg_analysis.theory.prediction import Moments, predict
@@ -65,7 +65,7 @@ __all__ = [
 ]
 
 
-class Experiment(model.ValidExperiment):
+class Experiment(PlannedExperiment):
     """A Markov-switching network and one run of it.
 
     Make one with :meth:`load` (a file) or :meth:`parse` (a dictionary); :meth:`with_run` changes its run.

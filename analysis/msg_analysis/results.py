@@ -12,7 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Results with what the layers below them cannot do: their figures. The names are those of ``msg_analysis`` itself."""
+"""Experiments and results with what the layers below them cannot do: plans, figures.
+
+The names of results are those of ``msg_analysis`` itself.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.inference.verdict import comparison as verdict
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.theory import prediction as theory
 
@@ -29,12 +33,54 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from msg_analysis.inference.planning.plan import RunPlan
     from msg_analysis.report.export.data_frame import Table
 
 
 def fields(instance: Any) -> dict[str, Any]:
     """The fields of a data class, not copied."""
     return {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
+
+
+class PlannedExperiment(ValidExperiment):
+    """An experiment whose runs can be planned."""
+
+    __slots__ = ()
+
+    def plan(
+        self, precision: float = 0.01, *, seconds: float | None = None, rate: float | None = None, level: float = 0.01
+    ) -> RunPlan:
+        """What runs will show, before any run: length and replicas for a precision, time, power for faults.
+
+        Parameters
+        ----------
+        precision
+            half-width of the 95 % interval of the system error that is sought, relative to the predicted error; above
+            0, below 1
+        seconds
+            time budget [s] for which the best number of replicas is sought; None: none
+        rate
+            steps per second of a run in lockstep, such as ``msg-agents run`` prints; None: not known, or in real time,
+            where the clock says it
+        level
+            probability of a false "disagrees", all tests together; above 0, at most 0.5
+
+        Returns
+        -------
+        RunPlan
+            ``precision`` (standard error of any length, and the reverse), ``powers`` (one per fault), ``to_json()``
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for something that cannot be predicted
+        InputError
+            an argument that is not valid, a system error of 0, or one whose variance is not finite
+        """
+        from msg_analysis.inference.planning.plan import plan  # here: it is slow to import, and few need it
+
+        self.require_available("predict")
+        return plan(theory.predict(self), precision, seconds=seconds, rate=rate, level=level)
 
 
 class ShownRun(Trajectory):

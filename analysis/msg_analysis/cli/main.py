@@ -324,6 +324,7 @@ main.add_command(runs.runs)
 main.add_command(runs.diff)
 main.add_command(theory.transient)
 main.add_command(theory.facts)
+main.add_command(theory.plan)
 main.add_command(sweep.sweep)
 
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Commands of ``msg-analysis`` for theory beyond the steady state: ``transient`` and ``facts``."""
+"""Commands of ``msg-analysis`` for theory beyond the steady state: ``transient``, ``facts`` and ``plan``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import click
 
 from msg_analysis.cli.console import examples, print_json, result_console
-from msg_analysis.cli.options import FILE, experiment_argument, json_option
+from msg_analysis.cli.options import FILE, experiment_argument, json_option, level_option
 from msg_analysis.common.files import require_place
 from msg_analysis.errors import InputError
 
@@ -131,3 +131,75 @@ def facts(experiment: Path, as_json: bool) -> None:
         from msg_analysis.report.terminal.theory_text import print_facts
 
         print_facts(document, result_console())
+
+
+UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # of --budget
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis plan line_ring --precision 1%",
+        "msg-analysis plan line_ring --budget 10min --speed 5000",
+        "msg-analysis plan line_ring --json | jq .faults",
+    )
+)
+@experiment_argument
+@click.option(
+    "--precision",
+    metavar="SHARE",
+    default="1%",
+    help="Half-width of the 95 % interval of the system error, relative to it: 1% or 0.01.",
+)
+@click.option("--budget", metavar="TIME", help="Time budget: 90s, 10min, 2h or 1d; finds the best replicas.")
+@click.option(
+    "--speed",
+    type=float,
+    metavar="STEPS",
+    help="Steps per second of a run in lockstep, as msg-agents run prints them.",
+)
+@level_option('Probability of a false "disagrees", all tests together.')
+@json_option
+def plan(
+    experiment: Path, precision: str, budget: str | None, speed: float | None, level: float, as_json: bool
+) -> None:
+    """Plan runs of EXPERIMENT: length, replicas and time for a precision, and power for faults; nothing is run."""
+    from msg_analysis.api import Experiment
+
+    document = (
+        Experiment.load(experiment)
+        .plan(_parse_share(precision), seconds=_parse_duration(budget), rate=speed, level=level)
+        .to_json()
+    )
+    if as_json:
+        print_json(document)
+    else:
+        from msg_analysis.report.terminal.theory_text import print_plan
+
+        print_plan(document, result_console())
+
+
+def _parse_share(text: str) -> float:
+    """A share of 1 from ``1%``, ``1 %`` or ``0.01``; InputError for anything else."""
+    number = text.strip()
+    try:
+        share = float(number.removesuffix("%")) / (100.0 if number.endswith("%") else 1.0)
+    except ValueError:
+        share = -1.0
+    if not 0.0 < share < 1.0:
+        raise InputError(f"--precision {text}: expected a share above 0, below 1: for example 1% or 0.01")
+    return share
+
+
+def _parse_duration(text: str | None) -> float | None:
+    """Seconds from a number and one of ``UNITS``, s if there is none; InputError for anything else."""
+    if text is None:
+        return None
+    number = text.strip()
+    unit = next((unit for unit in ("min", "s", "h", "d") if number.endswith(unit)), "")
+    try:
+        seconds = float(number.removesuffix(unit)) * UNITS[unit or "s"]
+    except ValueError:
+        seconds = -1.0
+    if not 0.0 < seconds < float("inf"):
+        raise InputError(f"--budget {text}: expected a number above 0 with s, min, h or d: for example 10min")
+    return seconds

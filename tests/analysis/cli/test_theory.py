@@ -1,4 +1,4 @@
-"""The commands transient and facts: what is printed where, and what is refused."""
+"""The commands transient, facts and plan: what is printed where, and what is refused."""
 
 import csv
 import json
@@ -146,3 +146,41 @@ def test_facts(name):
     assert result.exit_code == 0
     assert "does not hold" not in result.stdout
     assert ("Two graphs in closed form" in result.stdout) == (document["two_topology"] is not None)
+
+
+def test_plan(tmp_path):
+    document = document_of("plan", LINE_RING, "--precision", "2 %", "--budget", "10min", "--speed", "800")
+    assert document == document_of("plan", LINE_RING, "--precision", "0.02", "--budget", "600", "--speed", "800")
+    assert document["precision"] == 0.02
+    assert document["budget"]["steps"] == 480_000
+    text = call("plan", LINE_RING, "--precision", "2%", "--budget", "1h", "--speed", "800").stdout
+    assert "Length for a 95 % interval of ± 2 % of the system error" in text
+    assert "best run in 1 h 0 min" in text
+    assert "noise variance of agent 1 x 1.05" in text
+    assert "speed: gives" not in text
+    assert "not known: --speed gives the wall time" in call("plan", LINE_RING).stdout
+
+
+def test_plan_of_a_start(from_zero):
+    text = " ".join(call("plan", from_zero, "--budget", "10ms", "--speed", "1").stderr.split())
+    assert text.startswith("error: --budget 10ms: expected a number above 0 with s, min, h or d")
+    text = " ".join(call("plan", from_zero, "--budget", "1s", "--speed", "20").stdout.split())
+    assert "warm-up" in text
+    assert "ends before the effect of the start does" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--precision", "much"], "--precision much: expected a share above 0, below 1: for example 1% or 0.01"),
+        (["--precision", "150%"], "--precision 150%: expected a share"),
+        (["--budget", "soon", "--speed", "9"], "--budget soon: expected a number above 0 with s, min, h or d"),
+        (["--budget", "1h"], "give its speed in steps per second too"),
+        (["--speed", "-3"], "speed: -3 steps per second: expected a number above 0"),
+    ],
+)
+def test_plan_refuses(options, message):
+    result = call("plan", LINE_RING, *options)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stdout == ""

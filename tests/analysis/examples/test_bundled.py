@@ -63,7 +63,9 @@ def test_neither_file_nor_example() -> None:
         text_of("lin_ring")
 
 
-@pytest.mark.parametrize("command", ["predict", "simulate", "leaders --count 1", "transient --times 1", "facts"])
+@pytest.mark.parametrize(
+    "command", ["predict", "simulate", "leaders --count 1", "transient --times 1", "facts", "plan"]
+)
 def test_commands_of_the_analysis(command: str) -> None:
     word, *options = command.split()
     result = CliRunner().invoke(main, [word, "discrete", *options, "--json"])

@@ -60,6 +60,8 @@ def test_every_command(run: Run, tmp_path: Path) -> None:
         assert "agent 2" not in texts, command
         assert json.loads(document)["names"] == NAMES, command
     assert json.loads(document)["leaders"] == [2]
+    plan = CliRunner().invoke(main, ["plan", str(file)]).stdout
+    assert "agent Kiel x 0.5" in plan
     saved = tmp_path / "saved.json"
     saved.write_text(document)
     assert "Bonn" in CliRunner().invoke(main, ["tabulate", str(saved)]).stdout

@@ -46,6 +46,16 @@ def chi2_quantile(tail: Any, dof: Any) -> Any:
     return special.chdtri(dof, tail)
 
 
+def noncentral_chi2_tail(x: Any, dof: Any, noncentrality: Any) -> Any:
+    """P(X > x) of a noncentral chi-square variable."""
+    return 1.0 - special.chndtr(x, dof, noncentrality)
+
+
+def needed_noncentrality(x: Any, dof: Any, tail: Any) -> Any:
+    """The noncentrality parameter with P(X > x) = ``tail``."""
+    return special.chndtrinc(x, dof, 1.0 - tail)
+
+
 def student_quantile(below: Any, dof: Any) -> Any:
     """The t with P(T <= t) = ``below`` for a variable of Student's law with ``dof`` degrees of freedom."""
     return special.stdtrit(dof, below)

@@ -77,6 +77,8 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
         console.print(chain)
     for line in document["unavailable"]:
         console.print(Text(line, style="yellow"))
+    if document["predicted_system_error"]:
+        console.print("How long to run it, and what it will find: msg-analysis plan", style="dim")
 
 
 def add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:

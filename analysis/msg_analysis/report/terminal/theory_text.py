@@ -12,10 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Predictions, sets of leaders, transients and facts as terminal tables, from the documents of ``--json``."""
+"""Predictions, sets of leaders, transients, facts and plans as terminal tables, from the documents of ``--json``."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,7 +24,7 @@ from rich.console import Console
 from rich.text import Text
 
 from msg_analysis.common.text.agent_names import agent_name, agent_text
-from msg_analysis.common.text.number_words import listed, number_text
+from msg_analysis.common.text.number_words import duration_text, listed, number_text, percent
 from msg_analysis.report.terminal.tables import fact_table, first_rows, number_table, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
@@ -176,3 +177,67 @@ def _print_form(law: str, form: dict[str, Any], names: Sequence[str] | None, con
     for agent, row in enumerate(first_rows(table, rows, "agents"), start=1):
         table.add_row(Text(agent_text(agent, names)), *map(number_text, row))
     print_table(console, table)
+
+
+def print_plan(document: dict[str, Any], console: Console) -> None:
+    """Print a document of ``RunPlan.to_json()``: the run of the file, lengths for the precision, power for faults."""
+    rate, sought = document["rate"], percent(document["precision"])
+    facts = fact_table(console, f"Plan of {document['experiment']}")
+    facts.add_row("predicted system error", number_text(document["system_error"]))
+    facts.add_row("run of the file", _run_text(document["file"]))
+    if document["budget"]:
+        budget = document["budget"]
+        facts.add_row(f"best run in {duration_text(budget['time'])}", _run_text(budget))
+    if document["warm_up"]:
+        facts.add_row("warm-up", f"{document['warm_up']} steps, in every length below")
+    if rate:
+        facts.add_row("speed", f"{number_text(rate)} steps per second")
+    else:
+        facts.add_row("speed", "not known: --speed gives the wall time")
+    console.print(facts)
+    table = number_table(
+        console,
+        f"Length for a 95 % interval of ± {sought} of the system error, at one time and at all times",
+        "replicas",
+        *("steps", "duration", "wall time"),
+        *("steps, all times", "wall time, all times"),
+    )
+    table.columns[0].justify = "right"
+    for row in document["lengths"]:
+        table.add_row(
+            str(row["replicas"]),
+            _count(row["steps"]),
+            number_text(row["duration"]),
+            _time(row["wall_time"]),
+            _count(row["any_time_steps"]),
+            _time(row["any_time_wall_time"]),
+        )
+    print_table(console, table)
+    steps = document["file"]["steps"]
+    title = f"Faults, and the power of the tests in {steps} steps, level {percent(document['level'])}"
+    table = number_table(console, title, "fault", "power", "steps for 99 %", "steps, any time")
+    for row in document["faults"]:
+        table.add_row(Text(row["fault"]), percent(row["power"]), _count(row["steps"]), _count(row["any_time_steps"]))
+    if document["faults"]:
+        print_table(console, table)
+    for note in document["notes"]:
+        console.print(Text(f"Note: {note}", style="yellow"))
+
+
+def _run_text(run: dict[str, Any]) -> str:
+    text = f"{run['steps']} steps, replicas {run['replicas']}"
+    if run["wall_time"] is not None:
+        text += f", {duration_text(run['wall_time'])}"
+    if not math.isfinite(run["half_width"]):
+        return f"{text}: ends before the effect of the start does"
+    text += f": ± {percent(run['half_width'])} (95 %)"
+    uniform = run["any_time_half_width"]
+    return text if uniform is None else f"{text}, ± {percent(uniform)} at all times"
+
+
+def _time(seconds: float | None) -> str:
+    return "-" if seconds is None else duration_text(seconds)
+
+
+def _count(steps: float | None) -> str:
+    return "-" if steps is None else f"{steps:.0f}"

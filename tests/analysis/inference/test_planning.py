@@ -1,0 +1,202 @@
+"""Plans of runs: lengths, replicas and power against formulas written out, scipy.stats, and sums over runs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from msg_analysis import Experiment, InputError, NotAvailableError
+from msg_analysis.inference.errors.time_means import time_means
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.planning.fault_power import Fault, FaultPower, StepInformation, fault_powers
+from msg_analysis.inference.planning.precision import REPLICAS
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
+from msg_analysis.inference.statistics.distributions import needed_noncentrality, noncentral_chi2_tail
+from msg_analysis.theory.prediction import predict
+from msg_analysis.twin.simulate import simulate
+
+
+def line_ring(**run: Any) -> Experiment:
+    return Experiment.load("line_ring").with_run(**run)
+
+
+def test_noncentral_chi_square() -> None:
+    for dof, noncentrality in ((1, 3.0), (15, 24.2), (200, 90.0)):
+        x = scipy.stats.chi2.isf(0.001, dof)
+        expected = scipy.stats.ncx2.sf(x, dof, noncentrality)
+        assert noncentral_chi2_tail(x, dof, noncentrality) == pytest.approx(expected, rel=1e-6)
+        assert needed_noncentrality(x, dof, expected) == pytest.approx(noncentrality, rel=1e-6)
+
+
+def test_lengths_are_those_of_the_formulas() -> None:
+    plan = line_ring().plan(0.02)
+    error, variance = plan.precision.error, plan.precision.variance
+    assert error == pytest.approx(predict(line_ring()).emulated.system_error)
+    for row in plan.to_json()["lengths"]:
+        scatter = (variance.path + variance.replica / row["replicas"]) / error**2
+        assert row["steps"] == math.ceil((1.959963984540054 / 0.02) ** 2 * scatter)
+        steps = row["any_time_steps"]
+        half_width = simultaneous_half_width(scatter * steps, scatter * steps) / steps
+        assert half_width == pytest.approx(0.02, rel=1e-3)
+        assert half_width <= 0.02
+        assert row["duration"] == pytest.approx(row["steps"] * 0.05)
+    shown = plan.to_json()["file"]
+    assert shown["half_width"] == pytest.approx(1.96 * math.sqrt(variance.of(16) / 8000) / error, rel=1e-4)
+    assert plan.precision.steps(shown["half_width"], 16) == 8000
+
+
+def test_the_interval_of_a_run_is_the_planned_one() -> None:
+    """The standard error that a run itself states, and its interval for all times."""
+    experiment = line_ring(duration=4000, replicas=4)
+    plan = experiment.plan()
+    run = Observation.of(simulate(experiment), predict(experiment))
+    means = time_means(run)
+    measured = math.sqrt(means.system_variances.sum()) / run.steps / plan.precision.error
+    assert measured == pytest.approx(plan.precision.standard_error(run.steps, 4), rel=0.05)
+    any_time = experiment.simulate().compare().any_time
+    assert any_time is not None
+    assert any_time.half_width is not None
+    planned = plan.to_json()["file"]["any_time_half_width"] * plan.precision.error
+    assert any_time.half_width == pytest.approx(planned, rel=0.05)
+
+
+def test_best_replicas() -> None:
+    """Where the graphs decide the scatter, few; where there is but one graph, as many as are considered."""
+    precision = line_ring().plan().precision
+    best = precision.best_replicas(10_000)
+    assert 1 < best < REPLICAS[-1]
+    infinite = math.sqrt(precision.variance.path / 10_000) / precision.error
+    assert precision.standard_error(10_000, best) < 1.06 * infinite
+    assert precision.standard_error(10_000, best / 2) > 1.05 * precision.standard_error(10_000, REPLICAS[-1])
+    one = Experiment.parse({"name": "one", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "run": {"duration": 10}})
+    assert one.plan().precision.best_replicas(10_000) == REPLICAS[-1]
+
+
+def test_a_budget() -> None:
+    document = line_ring().plan(seconds=60.0, rate=1000.0).to_json()
+    assert document["budget"]["steps"] == 60_000
+    assert document["budget"]["wall_time"] == 60.0
+    assert document["file"]["wall_time"] == 8.0
+    real_time = Experiment.load("line_ring_realtime").plan(seconds=60.0).to_json()
+    assert real_time["rate"] == pytest.approx(100.0)
+    assert real_time["budget"]["steps"] == 6000
+    assert real_time["file"]["wall_time"] == pytest.approx(80.0)
+    assert real_time["file"]["any_time_half_width"] is None
+
+
+def test_the_start_costs_steps() -> None:
+    """Until the expected error is within the precision; no run is shorter."""
+    experiment = line_ring(start="zero")
+    plan, stationary = experiment.plan(0.02), line_ring().plan(0.02)
+    times = np.arange(0.0, 20.0, 0.05)
+    course = experiment.transient(times).system_error
+    outside = np.flatnonzero(np.abs(course - plan.precision.error) > 0.02 * plan.precision.error)
+    assert plan.precision.warm_up == outside[-1] + 1
+    assert plan.precision.steps(0.02, 4) == plan.precision.warm_up + stationary.precision.steps(0.02, 4)
+    assert plan.precision.standard_error(10, 4) == math.inf
+    assert plan.to_json()["warm_up"] == plan.precision.warm_up
+
+
+def powers(experiment: Experiment, *faults: Fault) -> list[FaultPower]:
+    return fault_powers(predict(experiment), experiment.run.replicas, 0.01, faults)
+
+
+def test_noise_is_the_divergence_of_normal_laws() -> None:
+    (found,) = powers(line_ring(replicas=3), Fault("noise", 1.1))
+    assert found.tests == [StepInformation("innovations: covariance", 15, pytest.approx(3 * (0.1 - math.log(1.1))))]
+    x = scipy.stats.chi2.isf(0.01 / 12, 15)
+    assert found.level == pytest.approx(0.01 / 12)
+    assert found.power(5000) == pytest.approx(scipy.stats.ncx2.sf(x, 15, 15000 * (0.1 - math.log(1.1))), rel=1e-6)
+    assert found.power(found.steps()) == pytest.approx(0.99, abs=1e-6)
+    assert found.power(found.steps(0.5)) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_gains_have_the_information_of_a_run() -> None:
+    """Of every link: the sum of the squared regressors of a run, over the variance of the noise."""
+    experiment = line_ring(duration=4000, replicas=4)
+    prediction = predict(experiment)
+    run = Observation.of(simulate(experiment), prediction)
+    sums = EvidenceSums(prediction, run.replicas)
+    sums.add(run, 0, run.steps)
+    (found,) = powers(experiment, Fault("gain", 0.5))
+    assert (found.agent, found.sender) in {(0, 4), (4, 0)}  # only the ring has this link
+    by_name = {test.name: test for test in found.tests}
+    measured = sums.link_information[0, 4] + sums.link_information[4, 0]
+    assert run.steps * by_name["innovations: gains"].noncentrality == pytest.approx(0.125 * measured, rel=0.05)
+    assert by_name["innovations: gains"].dof == 5 + 8 + 10
+    x, ring = run.states[:-1], run.modes == 1
+    line = 0.05 * (x[:, :-1] - x[:, 1:])
+    pulls = np.zeros_like(x)
+    pulls[:, 1:] += line
+    pulls[:, :-1] -= line
+    closing = 0.05 * (x[:, 4] - x[:, 0]) * ring[:, None]
+    pulls[:, 0] += closing
+    pulls[:, 4] -= closing
+    shift = 0.5 * (closing * pulls[:, 0]).sum()
+    expected = shift**2 / (pulls**2).sum() / 0.05
+    assert run.steps * by_name["innovations: common gain"].noncentrality == pytest.approx(expected, rel=0.05)
+
+
+def test_rates_have_the_divergence_of_the_chains() -> None:
+    (found,) = powers(line_ring(), Fault("switching", 1.4))
+    leaving, wrong = (0.5 * (1.0 - math.exp(-2.0 * 0.5 * factor * 0.05)) for factor in (1.0, 1.4))
+    divergence = wrong * math.log(wrong / leaving) + (1.0 - wrong) * math.log((1.0 - wrong) / (1.0 - leaving))
+    assert found.tests == [StepInformation("switching", 2, pytest.approx(2.0 * divergence))]
+
+
+def test_power_is_that_of_runs() -> None:
+    """Noise variance x 1.05 in 20,000 steps: half of the twin runs are rejected (benchmarks/planning.py --power)."""
+    (found,) = powers(line_ring(replicas=1), Fault("noise", 1.05))
+    assert found.power(20_000) == pytest.approx(0.5, abs=0.05)
+
+
+def test_faults_that_a_law_cannot_have() -> None:
+    quiet = Experiment.parse({"name": "one", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "run": {"duration": 10}})
+    assert [row["kind"] for row in quiet.plan().to_json()["faults"]] == ["noise", "noise", "gain", "gain"]
+    half = {"transition": [[0.2, 0.8], [0.8, 0.2]]}
+    graphs = {"a": {"path": [1, 2, 3]}, "b": {"cycle": [1, 2, 3]}}
+    fast = Experiment.parse(
+        {"name": "f", "time": "discrete", "graphs": graphs, "switching": half, "run": {"duration": 9}}
+    )
+    kept = [(row["kind"], row["factor"]) for row in fast.plan().to_json()["faults"]]
+    assert ("switching", 0.7) in kept
+    assert ("switching", 1.4) not in kept
+
+
+def test_notes() -> None:
+    large = Experiment.load("hundred_agents").plan(0.02).to_json()
+    assert large["variance"]["path_followed"] is False
+    assert "the network is large" in large["notes"][0]
+    slow = line_ring(replicas=256).plan(0.5).to_json()
+    assert "expected switches away from some graph" in slow["notes"][0]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"precision": 0.0}, "precision: 0: expected a share"),
+        ({"precision": math.nan}, "precision: nan: expected a share"),
+        ({"level": 0.9}, "level: 0.9: expected a probability"),
+        ({"seconds": 10.0}, "budget: a run in lockstep is as fast as the machine"),
+        ({"seconds": -1.0, "rate": 1.0}, "budget: -1 s: expected"),
+        ({"rate": 0.0}, "speed: 0 steps per second: expected"),
+    ],
+)
+def test_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        line_ring().plan(**options)
+
+
+def test_refused_too() -> None:
+    with pytest.raises(InputError, match="speed: 5 steps per second: in real time these are"):
+        Experiment.load("line_ring_realtime").plan(rate=5.0)
+    quiet = {"name": "q", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "noise": {"process": 0.0}}
+    with pytest.raises(InputError, match="the predicted system error is 0"):
+        Experiment.parse(quiet | {"run": {"duration": 10, "start": "zero"}}).plan()
+    with pytest.raises(NotAvailableError):
+        Experiment.load("ros_ws/src/msg_agents_example_protocols/experiments/saturated.yaml").plan()
