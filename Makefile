@@ -122,7 +122,7 @@ bench: setup ## Measure speed side by side with the bare middleware, other solve
 	$(BIN)/python benchmarks/reading.py
 	$(BIN)/python benchmarks/sweep.py
 
-calibrate: setup ## Measure error rates and power of the verdict into docs/calibration.md: half an hour on two CPUs
+calibrate: setup ## Measure error rates and power of the verdict into docs/calibration.md: an hour on two CPUs
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --write
 
 docs: setup ## Build the documentation into site/
