@@ -11,7 +11,7 @@ from msg_analysis.inference.statistics.mixture_evidence import (
     PROPORTION_STRENGTHS,
     ROW_STRENGTHS,
     SHARES,
-    STRENGTHS,
+    VARIANCES,
     coefficient_evidence,
     log_mean,
     proportion_evidence,
@@ -24,13 +24,13 @@ def test_variances_are_mixed_with_the_inverse_gamma_law() -> None:
     samples = np.random.default_rng(1).normal(scale=1.2, size=40)
     found = variance_evidence(np.array(40), np.array((samples**2).sum()))
     null = stats.norm.logpdf(samples).sum()
-    for a, log in zip(STRENGTHS, found, strict=True):
-        law = stats.invgamma(a, scale=a)
+    for (a, factor), log in zip(VARIANCES, found, strict=True):
+        law = stats.invgamma(a, scale=a * factor)
 
         def ratio(theta: float, law: stats.rv_frozen = law) -> float:
             return float(law.pdf(theta) * np.exp(stats.norm.logpdf(samples, scale=np.sqrt(theta)).sum() - null))
 
-        expected, _ = integrate.quad(ratio, 0.0, 40.0, points=[0.8, 1.0, 1.2, 1.6], limit=400)
+        expected, _ = integrate.quad(ratio, 0.0, 40.0, points=[0.8, 0.9, 0.95, 1.0, 1.05, 1.1, 1.2, 1.6], limit=800)
         assert log == pytest.approx(np.log(expected), abs=1e-6)
 
 

@@ -28,6 +28,7 @@ from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
 from msg_analysis.inference.statistics.mixture_evidence import (
     coefficient_evidence,
     log_mean,
+    log_sum,
     proportion_evidence,
     row_evidence,
     variance_evidence,
@@ -37,6 +38,8 @@ from msg_analysis.theory.prediction import Prediction
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 MOST_PAIRS = 5_000  # of agents whose noises are compared; beyond, none are
+MAIN = ("noise", "gain", "switching", "loss")  # kinds of questions that one part of the law answers, not all at once
+MAIN_WEIGHT = 3.0  # of these in the mean; 1 of the others
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,10 +209,12 @@ class EvidenceSums:
         return Question(kind)
 
     def evidence(self) -> float:
-        """Log of the evidence against the whole law: the mean over the kinds of the mean over their questions."""
+        """Log of the evidence against the whole law: the weighted mean over the kinds of the mean over questions."""
         if self.impossible or self.lost[self._step.losses == 0.0].any():
             return float("inf")
         families = self.families()
         if not families:
             return 0.0
-        return float(log_mean(np.array([float(log_mean(logs.ravel())) for logs in families.values()])))
+        weights = np.array([MAIN_WEIGHT if kind in MAIN else 1.0 for kind in families])
+        each = np.array([float(log_mean(logs.ravel())) for logs in families.values()])
+        return float(log_sum(each + np.log(weights / weights.sum()), axis=0))

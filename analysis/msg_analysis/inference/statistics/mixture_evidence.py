@@ -25,18 +25,18 @@ from scipy.special import betaln, gammaln
 
 from msg_analysis.types import FloatArray, IntArray
 
-STRENGTHS = (2.0, 20.0, 200.0, 2000.0)
-"""Of the alternatives to a variance: the smaller, the more they differ from it (by 0.7, 0.2, 0.07, 0.02 of it)."""
+VARIANCES = ((2.0, 1.0), (1000.0, 1.0), (300.0, 1.1), (300.0, 0.9))
+"""Alternatives to a variance: strengths a, and factors c that they are near; the larger a, the nearer."""
 
-SHARES = (0.03, 0.1, 0.3, 1.0)  # standard deviations tau of the alternatives to a coefficient, 1 in the law
-ROW_STRENGTHS = (1.0, 10.0, 100.0)  # changes of a row that the alternatives are worth
+SHARES = (0.05, 0.3)  # standard deviations tau of the alternatives to a coefficient, 1 in the law
+ROW_STRENGTHS = (3.0, 30.0)  # changes of a row that the alternatives are worth
 PROPORTION_STRENGTHS = (2.0, 20.0, 200.0)  # successes that the alternatives are worth
 
 
 def variance_evidence(samples: FloatArray | IntArray, squares: FloatArray) -> FloatArray:
-    """Against variance 1 of independent normal samples: factors theta of the variance ~ inverse gamma(a, a).
+    """Against variance 1 of independent normal samples: factors theta of the variance ~ inverse gamma(a, b), b = a c.
 
-    log of a^a G(a + n/2) exp(S/2) / (G(a) (a + S/2)^(a + n/2)), the mixture of the likelihood ratios of theta.
+    log of b^a G(a + n/2) exp(S/2) / (G(a) (b + S/2)^(a + n/2)), the mixture of the likelihood ratios of theta.
 
     Parameters
     ----------
@@ -48,12 +48,13 @@ def variance_evidence(samples: FloatArray | IntArray, squares: FloatArray) -> Fl
     Returns
     -------
     FloatArray
-        (..., K) of each a in ``STRENGTHS``
+        (..., K) of each of ``VARIANCES``
     """
-    a = np.array(STRENGTHS)
+    a, factors = np.array(VARIANCES).T
+    b = a * factors
     half, s = np.asarray(samples, dtype=float)[..., None] / 2.0, np.asarray(squares)[..., None] / 2.0
-    # (a + n/2) log(a / (a + s)) instead of two large terms that cancel.
-    return np.asarray(gammaln(a + half) - gammaln(a) - half * np.log(a) - (a + half) * np.log1p(s / a) + s)
+    # (a + n/2) log(b / (b + s)) instead of two large terms that cancel.
+    return np.asarray(gammaln(a + half) - gammaln(a) - half * np.log(b) - (a + half) * np.log1p(s / b) + s)
 
 
 def coefficient_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
