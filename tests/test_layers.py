@@ -42,6 +42,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "wire",
         "theory/system",
         "theory/solvers",
+        "theory/tails",
         "theory",
         "theory/leaders",
         "twin",

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 import networkx as nx
 import numpy as np
 
-from msg_analysis.common.blas_threads import few_blas_threads, one_blas_thread
+from msg_analysis.common.blas_threads import blas_threads, few_blas_threads, one_blas_thread
 from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.common.text.json_numbers import finite
 from msg_analysis.common.text.markdown import markdown_table
@@ -41,6 +41,7 @@ from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.solvers.solver_report import SolverReport
 from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.system.jump_system import JumpSystem
+from msg_analysis.theory.tails.fourth_moments import FourthMoment, fourth_moment
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
@@ -227,6 +228,12 @@ class Prediction:
         """The reduced system of the run's steps."""
         return self.solver.system
 
+    @cached_property
+    def fourth_moment(self) -> FourthMoment:
+        """Whether the fourth moments of the run's steps are finite: without, errors have no standard errors."""
+        with blas_threads(self.experiment.agents):
+            return fourth_moment(build_run_model(self.experiment, self.step), self.system)
+
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis predict --json``."""
         document: dict[str, Any] = {
@@ -241,6 +248,7 @@ class Prediction:
             document["continuous"] = self.continuous_moments.to_json() if self.continuous_moments else None
             document["emulated"] = self.emulated.to_json()
         document["static"] = self.static_moments.to_json() if self.static_moments else None
+        document["fourth_moment"] = self.fourth_moment.to_json()
         return document
 
 

@@ -60,7 +60,9 @@ class GivenPath:
 
     @property
     def variance_ratio(self) -> float | None:
-        """Variance of the corrected system error over that of the measured one; None without noise."""
+        """Variance of the corrected system error over that of the measured one; None where that is 0 or infinite."""
+        if self.means.heavy:
+            return None
         unconditional = _variance(self.means, self.means.trace)
         return _variance(self.given, self.given.trace) / unconditional if unconditional > 0.0 else None
 

@@ -41,6 +41,7 @@ ROUNDING = 64 * float(np.finfo(float).eps)  # of the largest state: what thousan
 PARTS = 20  # of a run, whose variances are compared
 MAX_SPREAD = 0.6  # relative standard error of the variance that follows from these parts, at most
 MIN_SWITCHES = 1.0
+FEW_SWITCHES = 10.0  # expected, below which intervals over all paths cover too much: benchmarks/trust.py
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,10 +63,13 @@ class TimeMeans:
     system_variances: FloatArray  # (N,) Var(D_k | y_k, g_k) of the system error, or its estimate with lost messages
     # Expected number of switches away from the graph with the fewest; infinite where the path is given or certain
     switches: float = math.inf
+    heavy: bool = False  # whether the law over all paths has infinite fourth moments, so that no standard error exists
 
     @property
     def long_enough(self) -> bool:
         """Whether the errors of such runs are nearly normal: many sojourns, none of which decides the variance."""
+        if self.heavy:
+            return False
         if math.isinf(self.switches):
             return True
         if self.switches < MIN_SWITCHES or len(self.system_variances) < PARTS:
@@ -73,6 +77,11 @@ class TimeMeans:
         parts = np.array([part.sum() for part in np.array_split(self.system_variances, PARTS)])
         total = float(parts.sum())
         return total > 0.0 and float((parts / total).std(ddof=1)) * math.sqrt(PARTS) <= MAX_SPREAD
+
+    @property
+    def few_sojourns(self) -> bool:
+        """Whether some graph is left so seldom that intervals over all paths are much too wide (calibration.md)."""
+        return self.switches < FEW_SWITCHES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,6 +245,7 @@ def time_means(observation: Observation) -> TimeMeans:
         system_series=series,
         system_variances=variances,
         switches=_expected_switches(observation),
+        heavy=observation.prediction.fourth_moment.finite is not True,
     )
 
 
@@ -262,6 +272,7 @@ def _without_errors(observation: Observation) -> TimeMeans:
         system_series=series,
         system_variances=np.zeros(steps),
         switches=0.0,
+        heavy=observation.prediction.fourth_moment.finite is not True,
     )
 
 

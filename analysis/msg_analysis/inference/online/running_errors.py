@@ -87,6 +87,8 @@ class LiveEstimate:
             self._note = "in real time the expected errors depend on the lateness of the agents: compare the bag"
         elif prediction is not None and prediction.system.readout is not None:
             self._note = "where values are kept from step to step, intervals need the whole run: compare the bag"
+        elif prediction is not None and prediction.fourth_moment.finite is not True:
+            self._note = "fourth moments are infinite, so that errors have no standard errors: compare the bag"
         elif prediction is not None and not self._errors.nodes_judged:
             self._note = "too many agents for intervals of the agent errors"
 
@@ -142,7 +144,8 @@ class RunningErrors:
         self._expected: _Expected | None = None
         if prediction is not None:
             self._expected = _Expected(prediction)
-            if experiment.run.pace == "lockstep" and prediction.system.readout is None:
+            heavy = prediction.fourth_moment.finite is not True
+            if experiment.run.pace == "lockstep" and prediction.system.readout is None and not heavy:
                 self._judge = _Judge(prediction, self._replicas, nodes=nodes)
                 self.nodes_judged = self._judge.nodes
 

@@ -164,7 +164,7 @@ def _continuous(observation: Observation, sequential: Estimate, level: float, la
         return Law(Estimate(sequential.measured), None, "not available for this experiment")
     predicted = law.system_error
     if sequential.standard_error is None:
-        return Law(Estimate(sequential.measured, predicted), None, "the run is too short to test this law")
+        return Law(Estimate(sequential.measured, predicted), None, "its errors have no standard error here")
     if not sequential.standard_error or sequential.measured is None or not predicted:
         return Law(Estimate(sequential.measured, predicted), None, "without noise the errors cannot be tested")
     if experiment.run.start != "stationary":

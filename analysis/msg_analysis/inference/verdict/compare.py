@@ -37,6 +37,7 @@ from msg_analysis.inference.statistics.batch_means import batch_interval
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.inference.verdict.comparison import Comparison, Test
 from msg_analysis.inference.verdict.evidence import Evidence
+from msg_analysis.inference.verdict.trust import trusted
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.system.jump_system import JumpSystem
@@ -88,7 +89,7 @@ def judge(
 
     Of several runs, ``trajectory`` is one with the completeness of all.
     """
-    means = evidence.means
+    means, lockstep = evidence.means, prediction.experiment.run.pace == "lockstep"
     system_error, node_errors = _over_all_paths(means, prediction.system)
     covariance = _covariance(evidence, prediction.system)
     innovations = evidence.innovations.tests()
@@ -133,6 +134,7 @@ def judge(
         order=rank_agents(means, level) if means.long_enough else None,
         blame=blame,
         any_time=_any_time(prediction, evidence, level),
+        trust=trusted(prediction, means, given=evidence.given is not None) if lockstep else None,
     )
 
 

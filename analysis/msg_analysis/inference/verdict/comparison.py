@@ -38,6 +38,7 @@ from msg_analysis.inference.realtime.laws import Laws
 from msg_analysis.inference.realtime.timing import Timing
 from msg_analysis.inference.sequential.watched_evidence import AnyTimeEvidence
 from msg_analysis.inference.verdict.law_identity import law_identity
+from msg_analysis.inference.verdict.trust import Trust
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.model.step.sequential_law import step_law
@@ -152,6 +153,9 @@ class Comparison:
         the runs, where there are several
     any_time
         evidence that may be looked at any time; None where too few steps arrived, or without a prediction
+    trust
+        in lockstep: which errors have valid intervals, and why; None where too few steps arrived, or without a
+        prediction
     """
 
     trajectory: Trajectory
@@ -177,6 +181,7 @@ class Comparison:
     blame: Sequence[Cause] = ()
     pool: Pool | None = None
     any_time: AnyTimeEvidence | None = None
+    trust: Trust | None = None
 
     def __repr__(self) -> str:
         total, runs = self.system_error, f"{len(self.pool.members)} runs" if self.pool else "run"
@@ -278,6 +283,7 @@ class Comparison:
             "batch_means": {"interval": self.batch or (None, None)},
             "tests": [asdict(test) for test in self.tests],
             "any_time": self.any_time.to_json() if self.any_time else None,
+            "trust": self.trust.to_json() if self.trust else None,
         }
         return {key: _plain(value) for key, value in document.items()}
 

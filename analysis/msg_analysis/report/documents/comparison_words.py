@@ -128,6 +128,12 @@ def any_time_words(document: dict[str, Any]) -> list[str]:
     return [with_names(f"{line}{when}{strongest}.", document.get("names"))]
 
 
+def trust_words(document: dict[str, Any]) -> list[str]:
+    """Which errors to trust, where that is not obvious: with heavy tails, and in runs with few sojourns."""
+    trust = document.get("trust")
+    return [trust["words"]] if trust and trust["reason"] in ("heavy_tails", "few_sojourns") else []
+
+
 def agent_order(document: dict[str, Any]) -> list[str]:
     """Which agents are more certain than which, in sentences; empty where that is not known."""
     if not document.get("order"):

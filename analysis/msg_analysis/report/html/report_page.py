@@ -47,6 +47,7 @@ from msg_analysis.report.documents.comparison_words import (
     furthest,
     sentence,
     timing_facts,
+    trust_words,
     unheard_words,
     verdict_line,
 )
@@ -142,6 +143,7 @@ def render(
         heat_maps=[name for name in models if name.startswith("covariance_")],
         order=agent_order(document),
         any_time=" ".join(any_time_words(document)),
+        trust=" ".join(trust_words(document)),
         agents=agent_errors(document),
         experiment=experiment,
         versions=trajectory.record.versions,

@@ -37,6 +37,7 @@ from msg_analysis.report.documents.comparison_words import (
     gaps,
     sentence,
     timing_facts,
+    trust_words,
     unheard_words,
     verdict_line,
 )
@@ -62,6 +63,8 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
         console.print(f"The errors leave out the first {document['transient']} steps (transient).")
     for cause in (document.get("blame") or [])[:ROWS]:
         console.print(Text(with_names(sentence(cause["words"]), document.get("names"))), style="bold red")
+    for line in trust_words(document):
+        console.print(Text(line))
     _print_bags(document.get("bags") or [], console)
     _print_errors(document, console)
     _print_tests(document, console)

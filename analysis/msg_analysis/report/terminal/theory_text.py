@@ -57,6 +57,24 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     for key, title in LAW_NAMES.items():
         if key in document and document[key] is None:
             console.print(f"{title}: not finite, or not defined with this noise", style="dim")
+    for line in tails_words(document):
+        console.print(Text(line, style="yellow"))
+
+
+def tails_words(document: dict[str, Any]) -> list[str]:
+    """What follows from the fourth moments of a prediction, in sentences; empty where they are finite."""
+    fourth = document["fourth_moment"]
+    if fourth["finite"]:
+        return []
+    what = "Whether the fourth moments of the states are finite is not known"
+    if fourth["finite"] is False:
+        grow = number_text(fourth["lower"], 3)
+        least = "" if fourth["radius"] is not None else "at least "
+        what = f"The fourth moments of the states are infinite: they grow {least}{grow} times per step"
+    return [
+        f"{what}. Then most runs measure less than these errors, which rare large values make, and a run's errors over "
+        "all paths of the graphs have no standard error. A smaller run.dt helps."
+    ]
 
 
 def _named(entry: dict[str, Any], document: dict[str, Any]) -> str:

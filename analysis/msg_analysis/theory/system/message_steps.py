@@ -36,6 +36,18 @@ from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.theory.system.loss_events import LossEvents
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
+_Loss = tuple[int, int, int, float, float]
+"""Entry that it changes; the entries that the message brings, and that take its place; probability; weight."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """A micro-step: the entries ``rows`` of z become matrix @ z, with losses, independent of each other."""
+
+    rows: list[int]
+    matrix: FloatArray  # (r, K) mean over the losses
+    losses: list[_Loss]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MessageSteps:
@@ -49,6 +61,9 @@ class MessageSteps:
     graphs: IntArray  # (n,) graph of every mode
     copies: IntArray  # (k,) the agent whose state every entry is, at some time; the first m are the agents
     start_noise: FloatArray  # (k, k) covariance of the noise in what was heard of x(0)
+    moves: list[list[Move]]  # the micro-steps of every mode, of all K entries
+    kept: IntArray  # (k,) those of the K entries that are read from one step to the next
+    entries: int  # K
 
 
 def message_steps(step: StepModel) -> MessageSteps:
@@ -92,6 +107,9 @@ def message_steps(step: StepModel) -> MessageSteps:
         graphs=np.repeat(np.arange(step.modes), len(states)),
         copies=stack.copies[kept],
         start_noise=stack.start_noise()[np.ix_(kept, kept)],
+        moves=[period.moves for period in periods],
+        kept=kept,
+        entries=stack.size,
     )
 
 
@@ -160,12 +178,14 @@ class _Period:
         self.matrix, self.noise = np.eye(size), np.zeros((size, size))
         self.into, self.differences = np.empty((0, size)), np.empty((0, size))
         self.acts: list[FloatArray] = []  # row by row, R of ``loss_events``
+        self.moves: list[Move] = []
 
     def step(self, rows: list[int], matrix: FloatArray, noise: FloatArray, losses: Iterable[_Loss] = ()) -> None:
         """The entries ``rows`` become matrix (r, k) @ z, with this noise (r, r), and with losses."""
         known = list(losses)
+        self.moves.append(Move(rows, matrix, known))
         entry, brings, instead = (np.array([loss[part] for loss in known], dtype=np.int64) for part in range(3))
-        variance = np.array([loss[3] for loss in known])
+        variance = np.array([p * (1.0 - p) * weight**2 for *_, p, weight in known])
         differences = self.matrix[brings] - self.matrix[instead]
         acts = (self.into[:, brings] - self.into[:, instead]).T ** 2
         n = self.noise
@@ -183,9 +203,6 @@ class _Period:
         self.into = np.concatenate([self.into, into])
         self.differences = np.concatenate([self.differences, differences])
         self.acts += list(acts)
-
-
-_Loss = tuple[int, int, int, float]  # entry that it changes; the entries that the message brings, or loses; variance
 
 
 def _period(step: StepModel, stack: _Stack, graph: int, probability: FloatArray) -> _Period:
@@ -220,7 +237,7 @@ def _move(
             matrix[row, i] += p * weight
             noise[row, row] += (1.0 - p) * (weight * step.link) ** 2
             if 0.0 < p < 1.0:
-                losses.append((i, source, i, p * (1.0 - p) * weight**2))
+                losses.append((i, source, i, p, weight))
     if stack.sources:
         matrix[:, stack.sources] = gain
     else:
@@ -246,7 +263,7 @@ def _hear(period: _Period, step: StepModel, stack: _Stack, probability: FloatArr
         matrix[row, newest], matrix[row, entry] = 1.0 - p, p
         noise[row] = (1.0 - p) * step.link**2
         if 0.0 < p < 1.0:
-            losses.append((entry, newest, entry, p * (1.0 - p)))
+            losses.append((entry, newest, entry, p, 1.0))
     rows, older = [entry for _, entry in links], []
     for line in range(1, step.delay + 1):
         rows += [stack.heard[line][link] for link, _ in links]
