@@ -40,17 +40,18 @@ from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.types import AnyArray, IntArray
 from msg_analysis.wire.cdr_fields import CdrError
-from msg_analysis.wire.messages import ActiveGraph, decode_string
+from msg_analysis.wire.messages import ActiveGraph, Progress, decode_string
 from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
+from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
 
 # Topics are recognised by type and by the end of their name: the network may run in any namespace.
-_STATE, _TRUTH, _GRAPH, _EXPERIMENT = "state", "truth", "graph", "experiment"
-_NUMBERS = {None: 0, _STATE: 1, _TRUTH: 2, _GRAPH: 3, _EXPERIMENT: 4}
+_STATE, _TRUTH, _GRAPH, _EXPERIMENT, _STOP = "state", "truth", "graph", "experiment", "stop"
+_NUMBERS = {None: 0, _STATE: 1, _TRUTH: 2, _GRAPH: 3, _EXPERIMENT: 4, _STOP: 5}
 _TOPICS = {
     AGENT_STATE.full_name: re.compile(r"(?:^|/)agent_\d+/(state|truth)$"),
     ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
     STRING.full_name: re.compile(r"(?:^|/)(experiment)$"),
+    PROGRESS.full_name: re.compile(r"(?:^|/)(stop)$"),
 }
 MOST_RECORDS = 100  # different run records that a bag may have: reading each takes milliseconds
 
@@ -118,6 +119,7 @@ class _Contents:
     truths: Collector = field(default_factory=Collector)
     # By their bytes: every file of a split bag may begin with those in force.
     graphs: dict[bytes, ActiveGraph] = field(default_factory=dict)
+    stops: set[tuple[bytes, int]] = field(default_factory=set)  # run, and the step at which it ended early
     # Run records by text, in order, or why a text is not one: from the topic, and from the metadata of our files.
     experiments: dict[str, RunRecord | InputError] = field(default_factory=dict)
     metadata: dict[str, None] = field(default_factory=dict)
@@ -161,6 +163,12 @@ class _Contents:
                 continue
             try:
                 self.graphs[data] = ActiveGraph.decode(data)
+            except CdrError:
+                self.refused[Refusal.UNDECODABLE] += 1
+        for index in np.flatnonzero(kind == _NUMBERS[_STOP]).tolist():
+            try:
+                stop = Progress.decode(batch.message(index))
+                self.stops.add((stop.run, stop.step))
             except CdrError:
                 self.refused[Refusal.UNDECODABLE] += 1
         for name, collector in ((_STATE, self.states), (_TRUTH, self.truths)):
@@ -249,8 +257,11 @@ def _choose(contents: _Contents) -> RunRecord:
 
 
 def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
+    planned, end = record.experiment.steps, _end(contents, record)
+    if end is not None:
+        record = record.ended(end)
     experiment = record.experiment
-    modes = _modes(contents, record.run.bytes, experiment.steps, len(experiment.graph_list))
+    modes = _modes(contents, record.run.bytes, experiment.steps, planned, len(experiment.graph_list))
     published, widths = None, _widths(record)
     if experiment.truth:
         published = contents.states.finish(record, widths[0])
@@ -288,13 +299,27 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
     )
 
 
-def _modes(contents: _Contents, run: bytes, steps: int, graphs: int) -> IntArray:
-    """(N,) graph of every step from the sojourns, from 0; -1 where none or more than one covers it."""
+def _end(contents: _Contents, record: RunRecord) -> int | None:
+    """The step at which a run ended before its planned one; None: it did not, or two messages contradict each other."""
+    steps = sorted({step for run, step in contents.stops if run == record.run.bytes})
+    if not steps or record.until is None:
+        return None
+    if len(steps) > 1 or not 1 <= steps[0] < record.experiment.steps:
+        contents.refused[Refusal.CONTRADICTION if len(steps) > 1 else Refusal.OUT_OF_RANGE] += len(steps)
+        return None
+    return steps[0]
+
+
+def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: int) -> IntArray:
+    """(N,) graph of every step from the sojourns, from 0; -1 where none or more than one covers it.
+
+    Sojourns may go on after ``steps``, up to the ``planned`` ones.
+    """
     sojourns: set[tuple[int, int, int, int]] = set()
     for graph in contents.graphs.values():
         if graph.run != run:
             contents.refused[Refusal.OTHER_RUN] += 1
-        elif not (1 <= graph.mode <= graphs and graph.first_step <= graph.last_step < steps):
+        elif not (1 <= graph.mode <= graphs and graph.first_step <= graph.last_step < planned):
             contents.refused[Refusal.GRAPH_OUT_OF_RANGE] += 1
         else:
             sojourns.add((graph.sequence, graph.mode, graph.first_step, graph.last_step))

@@ -102,6 +102,7 @@ class Collector:
         collected = self._collected.get(run) or Collected(record, width)
         collected.refused[Refusal.UNDECODABLE] += self._undecodable
         collected.refused[Refusal.OTHER_RUN] += self._position - self._undecodable - self._counts[run]
+        collected.cut(record.experiment.steps)
         collected.finish()
         return collected
 
@@ -257,6 +258,18 @@ class Collected:
         else:
             heard = np.where(self._lost[cell], LOST, _newest(step, self._delay).astype(np.uint64)[:, None])
         return np.where(np.arange(self._links.most) < count[:, None], heard, np.uint64(0))
+
+    def cut(self, steps: int) -> None:
+        """Leave out what comes after this step, of a run that ended there: agents may learn of that a little later."""
+        cells = (steps + 1) * self._shape[1]
+        self._shape = steps + 1, self._shape[1]
+        for name in ("_states", "_position", "_modes", "_used", "_made", "_lost", "_listed"):
+            setattr(self, name, getattr(self, name)[:cells])
+        self._contradicted = [found[found < cells] for found in self._contradicted]
+        if self._realtime:
+            beyond = (self._used > steps + 1).any(axis=1)  # of values that are left out
+            self.refused[Refusal.BAD_HEARD] += int(beyond.sum())
+            self._position[beyond] = 0
 
     def finish(self) -> None:
         """Mark what is missing; call it after the last state."""

@@ -38,7 +38,7 @@ from msg_analysis.wire.messages import (
 )
 from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.signatures import genuine
-from msg_analysis.wire.topics import END, EPOCH, Topic
+from msg_analysis.wire.topics import END, EPOCH, STOP, Topic
 
 Message = TypeVar("Message", ActiveGraph, Progress)
 
@@ -109,7 +109,7 @@ class RunRules:
         message = decode_of_run(Progress, data, self._record.run.bytes)
         if isinstance(message, str):
             return message
-        if message.agent > (0 if topic in (END, EPOCH) else self._record.experiment.agents):
+        if message.agent > (0 if topic in (END, EPOCH, STOP) else self._record.experiment.agents):
             return Refusal.UNKNOWN_AGENT
         if message.step > self._record.experiment.steps:
             return Refusal.OUT_OF_RANGE

@@ -112,6 +112,8 @@ PROGRESS = Topic("progress", schemas.PROGRESS, LATCHED, "agents, recorder", "swi
 RESEND = Topic("resend", schemas.PROGRESS, LATCHED, "agents", "agents")
 EPOCH = Topic("epoch", schemas.PROGRESS, LATCHED, "switcher", "agents")
 END = Topic("end", schemas.PROGRESS, LATCHED, "switcher", "agents, recorder, live, markers")
+# Before the end of a run that ends early (`--until`): at which step. Recorded, so that a bag is that of a shorter run.
+STOP = Topic("stop", schemas.PROGRESS, LATCHED, "switcher", "agents, recorder", recorded=True)
 LEAVE = Topic("leave", schemas.PROGRESS, LATCHED, "agents, switcher, recorder", "agents, switcher, recorder")
 ESTIMATE = Topic("estimate", schemas.ESTIMATE, NEWEST, "live", "")
 MARKERS = Topic("markers", MessageType("visualization_msgs", "MarkerArray"), NEWEST, "markers", "")
@@ -128,6 +130,7 @@ TOPICS = (
     RESEND,
     EPOCH,
     END,
+    STOP,
     LEAVE,
     ESTIMATE,
     MARKERS,
@@ -136,15 +139,16 @@ TOPICS = (
 )
 
 
-def network_topics(agents: int, namespace: str = "", *, truth: bool = False) -> Sequence[Topic]:
+def network_topics(agents: int, namespace: str = "", *, truth: bool = False, stop: bool = False) -> Sequence[Topic]:
     """The recorded topics of so many agents, with absolute names; ``namespace`` is such as ``/lab``, empty: the root.
 
-    ``truth``: the published states are not the true, whole ones, so those are recorded too.
+    ``truth``: the published states are not the true, whole ones, so those are recorded too; ``stop``: the run may end
+    early.
     """
     root = f"/{namespace.strip('/')}/".replace("//", "/")
     return [
         replace(topic, name=root + topic.of(agent))
         for topic in TOPICS
-        if topic.recorded and (truth or topic is not TRUTH)
+        if topic.recorded and (truth or topic is not TRUTH) and (stop or topic is not STOP)
         for agent in range(agents if _NUMBER in topic.name else 1)
     ]

@@ -114,6 +114,13 @@ def _interruption() -> Interruption:
 @seed_option
 @duration_option
 @click.option(
+    "--until",
+    "until_text",
+    metavar="PRECISION|decided",
+    help="End earlier, in order: when the system error is known to a PRECISION such as 1%, or when the evidence "
+    "disagrees or that precision is 5% (decided).",
+)
+@click.option(
     "--pace",
     metavar="PACE",
     shell_complete=suggest("lockstep", "realtime"),
@@ -185,6 +192,7 @@ def run(
     write_report: ReportWhen,
     seed: int | None,
     duration: float | None,
+    until_text: str | None,
     pace: str | None,
     speed: float | None,
     delivery: str | None,
@@ -212,10 +220,12 @@ def run(
     from msg_agents.running.experiment_overrides import load_with_overrides
     from msg_agents.running.runner import run_network
     from msg_agents.watching.run_view import RunView
+    from msg_analysis.model.run.until import Until
 
     interruption = _interruption()
     changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
     changes |= {"delivery": delivery, "processes": processes}
+    until = Until.parse(until_text) if until_text is not None else None
     what = load_with_overrides(experiment, changes)
     channel = None
     if channel_file is not None:
@@ -243,6 +253,7 @@ def run(
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
                 channel=channel,
                 interruption=interruption,
+                until=until,
             )
         say, analyse = view.display.end, not no_analyse
         finish(result, as_json, say, interruption=interruption, analyse=analyse, report=write_report)

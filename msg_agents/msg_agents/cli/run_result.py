@@ -106,6 +106,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         "failures": result.failures,
         "clocks": result.clocks,
         "channel": result.channel,
+        "until": result.until,
     }
     if result.bag is not None and (result.comparison is not None or (result.interrupted and result.recorded)):
         write_whole(result.bag / RESULT_FILE, json_text(document, 1).encode() + b"\n")

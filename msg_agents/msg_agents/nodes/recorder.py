@@ -21,6 +21,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from msg_agents.nodes.diagnostics import Health
 from msg_agents.nodes.network_node import NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.ros.timers import every
@@ -57,15 +59,20 @@ class Recorder(NetworkNode):
         experiment = record.experiment
         # In the bag topics keep their own names, even if they are remapped: readers of bags look for these.
         self._root = self.get_namespace().rstrip("/") + "/"
-        recorded = network_topics(experiment.agents, self._root, truth=experiment.truth)
+        recorded = network_topics(experiment.agents, self._root, truth=experiment.truth, stop=record.until is not None)
         self._last = experiment.steps
         self._kinds = [StateReceiver(record, topics.STATES, topics.STATE, self._root)]
         if experiment.truth:
             self._kinds.append(StateReceiver(record, topics.TRUTHS, topics.TRUTH, self._root))
+        self._newest = [np.full(experiment.agents, -1) for _ in self._kinds]  # steps of each kind that have come
+        self._known_graph = -1  # last step of the newest sojourn that has come
         self._next_sojourn = 0  # the first one that has not been written
         self._sojourns: dict[int, int] = {}  # of those written after it: last step by number
         # Topics whose last message (last state, last sojourn, experiment) has not arrived.
-        self._awaiting = {topic.name for topic in recorded}
+        self._awaiting = {topic.name for topic in recorded} - {self._root + topics.STOP.name}
+        self._stopped = False  # whether it is known that the run ends early
+        if record.until:
+            self.subscribe(topics.STOP, self._record_stop)
         self.subscribe(topics.EXPERIMENT, self._record_experiment)
         self.subscribe(topics.GRAPH, self._record_graph)
         for kind in self._kinds:
@@ -122,12 +129,13 @@ class Recorder(NetworkNode):
         return collect
 
     def _write_states(self) -> None:
-        for kind in self._kinds:
+        for kind, newest in zip(self._kinds, self._newest, strict=True):
             found = kind.take()
             for topic, reason in found.refused:
                 self.refuse(reason, topic)
             if len(found.agent):
                 self.bag.write_many(kind.names, found.agent, found.time, found.data, found.start, found.size)
+            np.maximum.at(newest, found.agent, found.step)
             for agent in found.agent[found.step == self._last].tolist():
                 self._received_last(kind.names[agent])
 
@@ -143,7 +151,25 @@ class Recorder(NetworkNode):
             self.rules.forget(self._sojourns.pop(self._next_sojourn) + 1)
             self._next_sojourn += 1
         until = self._step_clock.nanoseconds(graph.last_step + 1)
-        self._write(topics.GRAPH, data, graph.stamp, until, last=graph.last_step == self._last - 1)
+        self._known_graph = max(self._known_graph, graph.last_step)
+        self._write(topics.GRAPH, data, graph.stamp, until, last=graph.last_step >= self._last - 1)
+
+    def _record_stop(self, data: bytes) -> None:
+        """The run ends early: what agents do after that step, before they know of it, is not awaited."""
+        stop = self.decode_progress(data, topics.STOP)
+        if stop is None:
+            return
+        if self._stopped:
+            self.refuse(Refusal.REPEATED, topics.STOP.name)
+            return
+        self._guarded(self._write_states)()
+        self._stopped, self._last = True, stop.step
+        self._write(topics.STOP, data, stop.stamp, None, last=False)
+        there = [self._root + topics.GRAPH.name] if self._known_graph >= self._last - 1 else []
+        for kind, newest in zip(self._kinds, self._newest, strict=True):
+            there += [kind.names[agent] for agent in np.flatnonzero(newest >= self._last).tolist()]
+        self._awaiting.difference_update(there)
+        self._tell_if_complete()
 
     def _record_experiment(self, data: bytes) -> None:
         known = self._root + topics.EXPERIMENT.name not in self._awaiting
@@ -171,8 +197,11 @@ class Recorder(NetworkNode):
     def _received_last(self, topic: str) -> None:
         if topic in self._awaiting:
             self._awaiting.remove(topic)
-            if not self._awaiting:
-                self.publish(self._progress, self.progress(topics.PROGRESS, NOT_AN_AGENT, self._last))
+            self._tell_if_complete()
+
+    def _tell_if_complete(self) -> None:
+        if not self._awaiting:
+            self.publish(self._progress, self.progress(topics.PROGRESS, NOT_AN_AGENT, self._last))
 
 
 def write_size(agents: int) -> int:

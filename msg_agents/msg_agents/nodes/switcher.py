@@ -19,6 +19,7 @@ In lockstep it keeps ahead of the agents; in real time it publishes the epoch, a
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -32,8 +33,10 @@ from msg_agents.nodes.diagnostics import CLOCK_BOUND, Health
 from msg_agents.nodes.network_node import ACK_TIMEOUT, NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.ros.timers import DueTimer, every
 from msg_agents.processes.process_plan import RECORDER, SWITCHER
+from msg_agents.recovery.stop_files import StopFiles
 from msg_agents.stepping.clock_offsets import MILLISECOND, ClockOffsets
 from msg_agents.stepping.realtime_schedule import Schedule
+from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW
 from msg_analysis.model.arithmetic.step_clock import SECOND
 from msg_analysis.model.run.graph_path import Sojourn, sojourns
 from msg_analysis.model.run.record import RunRecord
@@ -55,6 +58,7 @@ MOST_BEHIND = 5000
 """Sojourns that a reader may be behind: the number of messages that the middleware keeps of a writer."""
 
 REPORT_PERIOD = 0.1  # s
+STOP_NOTICE = 1.0  # s in real time between the news of an early end and that end: time for all nodes to receive it
 
 EPOCH_DELAY = SECOND // 2
 """ns of the clock from the publication of the epoch to the epoch: time for all nodes to receive it."""
@@ -82,9 +86,14 @@ class Switcher(NetworkNode):
         self._reached = [-1] * model.agents
         self._slowest = -1
         self._heard = False  # from an agent since the last call of on_progress
-        self._recorded = RECORDER not in readers
+        self._records = RECORDER in readers
+        self._recorder_reached = -1  # last step of the run of which the recorder has everything
         self._on_progress, self._on_graph, self._on_clocks = on_progress, on_graph, on_clocks
         self._duplicates: set[str] = set()  # names seen at the last check
+        self._stops: StopFiles | None = None  # until an early end of the run is announced; None: it is not to be
+        if record.until:
+            self._stop = self.publisher_of(topics.STOP)
+            self._stops = StopFiles(checkpoints, record.run) if checkpoints else None
         self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
         if self._mark and self._mark.exists():  # in the middle of a run, none of the user's nodes is awaited
             readers = [name for name in readers if name == RECORDER]
@@ -132,6 +141,8 @@ class Switcher(NetworkNode):
     def begin(self) -> None:
         """Publish the experiment."""
         self.publish(self._experiment, encode_string(self.record.to_json()))
+        if self._stops and (step := self._stops.decided()) is not None:
+            self._announce_stop(step)
 
     def _moved(self) -> None:
         """Called when the slowest agent has advanced."""
@@ -146,7 +157,7 @@ class Switcher(NetworkNode):
         if progress is None:
             return
         if progress.agent == NOT_AN_AGENT:
-            self._recorded = self._recorded or progress.step == self._steps
+            self._recorder_reached = progress.step
         else:
             self._reached[progress.agent - 1] = max(progress.step, self._reached[progress.agent - 1])
             self._heard = True
@@ -154,12 +165,36 @@ class Switcher(NetworkNode):
         if slowest > self._slowest:
             self._slowest = slowest
             self._moved()
-        if self._recorded and slowest >= self._steps and not self.done.done():
+        self._end_if_complete()
+
+    def _end_if_complete(self) -> None:
+        recorded = not self._records or self._recorder_reached == self._steps
+        if recorded and self._slowest >= self._steps and not self.done.done():
             self._report()
             self.publish(self._end, self.progress(topics.END, NOT_AN_AGENT, self._steps))
             self.done.set_result(None)
 
+    def _first_end(self) -> int | None:
+        """The first step at which the run can end early; None: not known yet. Agents may be there before they know."""
+        return max(self._reached) + LOCKSTEP_WINDOW if self._slowest >= 0 else None
+
+    def _look_for_stop(self) -> None:
+        """End the run early, if somebody has asked for it and that is before its planned end."""
+        if self._stops is None or not self._stops.asked() or (step := self._first_end()) is None:
+            return
+        if step >= self._steps:
+            self._stops = None
+            return
+        self._stops.decide(step)
+        self._announce_stop(step)
+
+    def _announce_stop(self, step: int) -> None:
+        self._stops, self._steps = None, step
+        self.publish(self._stop, self.progress(topics.STOP, NOT_AN_AGENT, step))
+        self._end_if_complete()
+
     def _report(self) -> None:
+        self._look_for_stop()
         if self._heard:
             self._heard = False
             self._on_progress(self._reached)
@@ -270,6 +305,14 @@ class RealtimeSwitcher(Switcher):
         text = self._mark.read_text(encoding="ascii") if self._mark and self._mark.exists() else ""
         if text:
             self._start(int(text))
+
+    def _first_end(self) -> int | None:
+        """See Switcher. Agents step by the clock, whatever has been reported."""
+        if self._schedule is None or self._slowest < 0:
+            return None
+        experiment = self.record.experiment
+        due = self._schedule.reach(self._timer.now() + round(STOP_NOTICE * SECOND))
+        return max(due, max(self._reached) + math.ceil(STOP_NOTICE * experiment.run.speed / experiment.step_length))
 
     def _report(self) -> None:
         super()._report()

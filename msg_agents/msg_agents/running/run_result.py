@@ -57,6 +57,9 @@ class RunResult:
         when processes were killed and back, and messages first refused: see ``running.event_log``
     reached
         newest step of the slowest agent, as last reported; -1: none
+    until
+        of a run that may end early: "rule", "planned_steps", "ended_early", "step" (the last one, None: not known) and
+        "reason", in words; else None
     clocks
         with several hosts in real time, how far the clocks of the agents' hosts are ahead of the switcher's:
         dictionaries with "node" and "ahead_ms", an interval; None: not compared
@@ -80,6 +83,7 @@ class RunResult:
     strangers: list[dict[str, Any]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
     reached: int = -1
+    until: dict[str, Any] | None = None
     clocks: list[dict[str, Any]] | None = None
     channel: dict[str, Any] | None = None
     trajectory: Trajectory | None = None

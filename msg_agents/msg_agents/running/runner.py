@@ -21,6 +21,7 @@ import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 
 from msg_agents.channel.channel_file import Channel
@@ -45,6 +46,7 @@ from msg_agents.running.supervisor import ACCOUNTS, CLOCKS, CRASHED, STEPS, Supe
 from msg_agents.running.surroundings import ROS_LOGS, surroundings, will_introduce
 from msg_agents.stepping.stall_detection import LagDetector, StallDetector
 from msg_agents.terminal.interruption import Interruption
+from msg_agents.watching.early_end import EarlyEnd
 from msg_agents.watching.view import View
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.reader import read_bag
@@ -55,6 +57,7 @@ from msg_analysis.common.text.agent_names import agent_text, with_names
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.until import Until
 from msg_analysis.twin.simulate import new_record
 from msg_analysis.wire.receiving import state_frame
 
@@ -80,6 +83,7 @@ def run_network(
     share: Share | None = None,
     channel: Channel | None = None,
     interruption: Interruption | None = None,
+    until: Until | None = None,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
 
@@ -123,6 +127,9 @@ def run_network(
         directory that would hold the bag
     channel
         the hosts on which the processes are, and what is between them; None: all are on this one
+    until
+        when the run may end before its duration, in order, as a complete run of fewer steps; None: it does not. Not
+        with a ``share``
     interruption
         keeps signals from the start of the processes on, beyond the end of this call; None: one for this call only
 
@@ -160,13 +167,15 @@ def run_network(
             if share is None and linked is None:  # other hosts and users' tools do not reach those of a channel
                 view.joined(around.domain)
             with NodeServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
-                record = record or new_record(experiment)
+                record = replace(record or new_record(experiment), until=until)
                 run_file = folder / "run.json"
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
                 longest = state_frame(record, whole=True).size
                 kept.keep()
                 with (
-                    workshop(experiment.agents * room_for(longest)) if restarts else nullcontext() as checkpoints,
+                    workshop(experiment.agents * room_for(longest))
+                    if restarts or until
+                    else nullcontext() as checkpoints,
                     Supervisor(
                         folder,
                         variables,
@@ -194,10 +203,15 @@ def run_network(
                     if pin and experiment.run.pace == "lockstep":
                         supervisor.cores = place(plans, available_cores(), first=around.domain)
                     supervisor.start(plans)
-                    view.begin(record, checkpoints if share is None else None)
-                    view.started(supervisor.by_node)
-                    _watch(supervisor, experiment, result, restarts, kept, view, follow_clock=not use_sim_time)
-                    view.end()
+                    ending = EarlyEnd(record, checkpoints) if until and checkpoints else None
+                    with ending or nullcontext():
+                        view.begin(record, checkpoints if share is None else None, ending.observer if ending else None)
+                        view.started(supervisor.by_node)
+                        _watch(
+                            supervisor, experiment, result, restarts, kept, view, ending, follow_clock=not use_sim_time
+                        )
+                        view.end()
+                    result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
                     _collect_failures(supervisor, result, kept, restarts)
             result.strangers = supervisor.account().strangers()
@@ -230,6 +244,7 @@ def _watch(
     restarts: int,
     interruption: Interruption,
     view: View,
+    ending: EarlyEnd | None,
     *,
     follow_clock: bool,  # whether the nodes' clock is that of this machine
 ) -> None:
@@ -242,6 +257,9 @@ def _watch(
     while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
         time.sleep(POLL)
         supervisor.read_status()
+        if ending and ending.look(min(supervisor.steps, default=-1), view.note):
+            supervisor.last_step = steps = ending.last_step
+            view.ends_at(steps)
         events.look(supervisor.steps, supervisor.account)
         if not warned and (warned := supervisor.clocks()[1]):
             view.note(warned)

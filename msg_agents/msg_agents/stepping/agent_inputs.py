@@ -42,6 +42,10 @@ class AgentInputs(Generic[Value]):
         if missing:
             raise ValueError(f"agent {agent} uses {sorted(missing)}, which are not among its peers {sorted(peers)}")
 
+    def end_at(self, steps: int) -> None:
+        """The run ends early, at x(steps); not before the current step."""
+        self.steps = max(steps, self.step)
+
     @property
     def finished(self) -> bool:
         """Whether x(steps) has been reached."""

@@ -188,6 +188,11 @@ class Synchronizer(AgentInputs[Value]):
         self._limit = min(self._newest.values()) + self._window
         return self.step <= self._limit
 
+    def end_at(self, steps: int) -> None:
+        """See AgentInputs."""
+        super().end_at(steps)
+        self._plan()
+
     def waiting_for(self) -> str:
         """What keeps the agent from its next step, as text (agents from 1)."""
         if self.finished:

@@ -43,12 +43,14 @@ MOST_NODES = 20
 class RunObserver:
     """Estimates the errors of a run; ``checkpoints``: directory in which its agents keep their states.
 
-    Its thread sets ``report`` (the newest numbers; None before the first) and ``note`` (why there are none).
+    Its thread sets ``report`` (the newest numbers; None before the first), ``note`` (why there are none any more) and,
+    of a run that may end early, ``reached`` (why it may end now). Whatever happens to it, the run goes on.
     """
 
     def __init__(self, record: RunRecord, checkpoints: Path) -> None:
         self.report: LiveReport | None = None
         self.note: str | None = None
+        self.reached: str | None = None
         self._record, self._reader = record, CheckpointReader(record, checkpoints)
         self._reached = -1
         self._over = threading.Event()
@@ -79,6 +81,8 @@ class RunObserver:
                 self._follow(estimate, time.monotonic() + FAREWELL)
         except InputError as error:
             self.note = str(error)
+        except Exception as error:
+            self.note = f"the errors cannot be followed any more ({type(error).__name__}: {error})"
 
     def _follow(self, estimate: LiveEstimate, deadline: float) -> None:
         if not self._reader.ready():
@@ -90,7 +94,11 @@ class RunObserver:
             estimate.add_whole(*found)
             if self._record.experiment.run.pace == "realtime":
                 self._add_stamps(estimate, found[0])
-        self.report = estimate.report()
+        self.report = report = estimate.report()
+        if self._record.until and self.reached is None:
+            from msg_analysis.inference.online.stopping import reached
+
+            self.reached = reached(self._record.until, report)
 
     def _add_stamps(self, estimate: LiveEstimate, steps: IntArray) -> None:
         from msg_analysis.inference.online.recent_steps import WINDOW

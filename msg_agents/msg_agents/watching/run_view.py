@@ -51,6 +51,8 @@ class RunView(View):
         self.display = Display(self._console, web, panel=self._console.is_terminal, transient=True)
         self._source = SnapshotSource(experiment)
         self._observer: RunObserver | None = None
+        self._made_observer = True  # and has to end it
+        self._last_step = experiment.steps
         self._note: str | None = None
         self._begun = False
         self._shown, self._told = 0.0, time.monotonic()
@@ -80,13 +82,15 @@ class RunView(View):
         if self._tells_domain or self.display.panel:
             self.note(f"ROS_DOMAIN_ID {domain}: to watch the run, msg-agents live --domain {domain}")
 
-    def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
+    def begin(self, record: RunRecord, checkpoints: Path | None, observer: RunObserver | None = None) -> None:
         """Follow the run: its processes have been started. Without ``checkpoints`` its errors are not followed."""
         self._begun = True
         self.display.begin(record.experiment)
         if not self.display.wanted:
             return  # lines do not show errors
-        if checkpoints is None:
+        if observer is not None:
+            self._observer, self._made_observer = observer, False
+        elif checkpoints is None:
             self._note = "errors are not shown: the states are not kept (--restarts 0), or not on this host"
         else:
             self._observer = RunObserver(record, checkpoints)
@@ -99,9 +103,13 @@ class RunView(View):
                 self._replaced.add(agent)
         self._processes = newest
 
+    def ends_at(self, step: int) -> None:
+        """See View."""
+        self._last_step = step
+
     def _ended(self) -> set[int]:
         """Agents whose process has ended before its last step, or had to be replaced."""
-        last, replaced, self._replaced = self._experiment.steps, self._replaced, set()
+        last, replaced, self._replaced = self._last_step, self._replaced, set()
         return replaced.union(
             agent
             for agent, (process, step) in enumerate(zip(self._processes, self._steps, strict=False))
@@ -130,6 +138,7 @@ class RunView(View):
         """Show the last numbers, and stop following the run."""
         if self._observer is not None:
             self._observer.look(min(self._steps, default=-1))
-            self._observer.end()
+            if self._made_observer:
+                self._observer.end()
             self.look(self._steps, force=True)
             self._observer = None

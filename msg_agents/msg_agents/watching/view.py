@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from msg_agents.watching.run_observer import RunObserver
 from msg_analysis.common.forked_processes import Process
 from msg_analysis.model.run.record import RunRecord
 
@@ -32,8 +33,14 @@ class View:
     def joined(self, domain: int) -> None:
         """The run is in this ROS_DOMAIN_ID, and nothing has been started yet."""
 
-    def begin(self, record: RunRecord, checkpoints: Path | None) -> None:
-        """The processes have been started; ``checkpoints``: directory of the agents' states, if they are kept here."""
+    def begin(self, record: RunRecord, checkpoints: Path | None, observer: RunObserver | None = None) -> None:
+        """The processes have been started; ``checkpoints``: directory of the agents' states, if they are kept here.
+
+        ``observer``: follows the run already, and is ended by who has made it.
+        """
+
+    def ends_at(self, step: int) -> None:
+        """The run ends at this step, before its planned end."""
 
     def started(self, processes: Mapping[str, Process]) -> None:
         """The processes, by the names of their nodes; again after each restart."""

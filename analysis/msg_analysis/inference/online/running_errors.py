@@ -32,12 +32,16 @@ from msg_analysis.inference.errors.estimates import Estimate, beside
 from msg_analysis.inference.errors.time_means import Value, forms_of, packed_moments, values_of
 from msg_analysis.inference.observed.observation import bounded
 from msg_analysis.inference.online.recent_steps import Lateness, Recent, RecentSteps
+from msg_analysis.inference.online.running_evidence import AnyTime, RunningEvidence, supports
 from msg_analysis.inference.online.step_collector import StepCollector
+from msg_analysis.inference.statistics.batch_means import RunningBatches
+from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width, steps_to_half_width
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.types import FloatArray, IntArray
 
+TUNING_STEPS = 500  # before the interval that holds at all times is given: their variances say how it is tuned
 EVERY_STEP = 20  # agents up to which every step is used for the standard errors of the nodes; beyond, one in m / 20
 MOST_BYTES = 256 * 2**20  # memory for the standard errors of the nodes; where that is too little, they are left out
 
@@ -53,6 +57,7 @@ class LiveReport:
     system: Estimate
     nodes: list[Estimate]
     note: str | None  # why there is no prediction, or no standard error; None where there are both
+    any_time: AnyTime = field(default_factory=lambda: AnyTime(None))
     refused: dict[str, int] = field(default_factory=dict)  # states or steps that do not count, by reason
     recent: Recent | None = None  # the newest whole steps
     lateness: list[float | None] | None = None  # of each agent in real time, see ``Lateness.medians``
@@ -79,6 +84,10 @@ class LiveEstimate:
         reason = experiment.unpredictable()
         prediction = None if reason else predict(experiment, record.step_model)
         self._errors = RunningErrors(record, prediction, nodes=nodes)
+        self._evidence: RunningEvidence | None = None
+        if prediction is not None and supports(prediction):
+            self._evidence = RunningEvidence(prediction, experiment.run.replicas)
+        self._interval = RunningInterval(record, prediction, self._evidence.variance if self._evidence else None)
         self._recent = RecentSteps()
         self._lateness = None if lockstep else Lateness(experiment)
         self._newest = -1
@@ -100,7 +109,9 @@ class LiveEstimate:
         """Add whole steps k (b,), each only once: graphs of k -> k+1 from 0 (b,), x(k) and x(k+1) (b, m, width)."""
         if not len(steps):
             return
-        self._errors.add(steps, modes, states, after)
+        self._interval.add(self._errors.add(steps, modes, states, after))
+        if self._evidence is not None:
+            self._evidence.add(steps, modes, states, after)
         self._newest = max(self._newest, int(steps.max()))
         self._recent.add(steps, modes, states)
 
@@ -115,6 +126,7 @@ class LiveEstimate:
         self.add_whole(*self.steps.take())
         errors = self._errors
         system, nodes = errors.estimates()
+        half_width = self._interval.half_width(system, errors.count)
         return LiveReport(
             first=errors.first,
             last=errors.last,
@@ -123,10 +135,43 @@ class LiveEstimate:
             system=system,
             nodes=nodes,
             note=self._note,
+            any_time=self._evidence.look(half_width) if self._evidence else AnyTime(half_width),
             refused={reason: count for reason, count in sorted(self.steps.refused.items()) if count},
             recent=self._recent.newest(),
             lateness=self._lateness.medians() if self._lateness else None,
         )
+
+
+class RunningInterval:
+    """Half-width of the 95 % interval of the system error that holds at all times at once.
+
+    By the martingale where there is a standard error; else by batch means of the measured errors, as in real time.
+    """
+
+    def __init__(self, record: RunRecord, prediction: Prediction | None, variance: float | None) -> None:
+        self._until, self._planned = record.until, record.planned_steps
+        self._predicted = prediction.emulated.system_error if prediction is not None else None
+        self._variance = variance  # of a step, as far as it is known before the run
+        self._batches = RunningBatches()
+        self._target: float | None = None  # sum of variances for which the interval is narrowest: set early, and kept
+
+    def add(self, series: FloatArray) -> None:
+        """Add the system errors of steps (b,)."""
+        self._batches.add(series)
+
+    def half_width(self, system: Estimate, steps: int) -> float | None:
+        """Of the mean over so many steps, with this estimate; None: not known yet."""
+        if steps < TUNING_STEPS:
+            return None
+        error = system.standard_error
+        variance = self._batches.variance() if error is None else (error * steps) ** 2
+        if not variance or not system.measured:
+            return None
+        if self._target is None:
+            each, size = self._variance or variance / steps, self._predicted or system.measured
+            wanted = self._planned if self._until is None else steps_to_half_width(each, self._until.precision * size)
+            self._target = each * min(self._planned, wanted)
+        return float(simultaneous_half_width(variance, self._target)) / steps
 
 
 class RunningErrors:
@@ -149,10 +194,10 @@ class RunningErrors:
                 self._judge = _Judge(prediction, self._replicas, nodes=nodes)
                 self.nodes_judged = self._judge.nodes
 
-    def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
-        """Add steps, arrays as in ``LiveEstimate.add_whole``."""
+    def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> FloatArray:
+        """Add steps, arrays as in ``LiveEstimate.add_whole``; their system errors (b,)."""
         if not len(steps):
-            return
+            return np.empty(0)
         self.first = int(steps.min()) if self.first < 0 else min(self.first, int(steps.min()))
         self.last = max(self.last, int(steps.max()))
         self.count += len(steps)
@@ -160,9 +205,11 @@ class RunningErrors:
             known = np.flatnonzero(steps == 0)
             self._expected.add(steps, self._record, int(modes[known[0]]) if len(known) else None)
         deviations, later = self._deviations(states), self._deviations(after)
-        self._squares += (deviations**2).mean(axis=2).sum(axis=0)
+        squares = (deviations**2).mean(axis=2)
+        self._squares += squares.sum(axis=0)
         if self._judge is not None:
             self._judge.add(steps, modes, deviations, later)
+        return np.asarray(squares.sum(axis=1))
 
     def estimates(self) -> tuple[Estimate, list[Estimate]]:
         """System error and node errors so far."""

@@ -108,7 +108,7 @@ def any_time_evidence(
     graphs: Sequence[str],
     variance: float | None = None,
     steps: int | None = None,
-    planned: int | None = None,
+    planned: float | None = None,
 ) -> AnyTimeEvidence:
     """The evidence in words and numbers.
 
@@ -121,8 +121,8 @@ def any_time_evidence(
     graphs
         their names
     variance, steps, planned
-        sum of Var(D_k) of the system error over so many steps, and the number of steps that were planned; None where
-        it is not known
+        sum of Var(D_k) of the system error over so many steps, and the number of steps at which its interval is to be
+        narrowest, chosen before the run; None where it is not known
     """
     threshold, sums = 1.0 / level, watched.sums
     time, crossed = None, None

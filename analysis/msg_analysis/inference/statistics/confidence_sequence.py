@@ -48,3 +48,24 @@ def simultaneous_half_width(variance: FloatArray | float, target: float, level: 
     r = max(target, np.finfo(float).tiny) / (wide + math.log(1.0 + wide))
     total = np.asarray(variance, dtype=float) + r
     return np.asarray(np.sqrt(total * ((np.log(total) - np.log(r)) + wide)))
+
+
+def steps_to_half_width(variance: float, half_width: float, level: float = 0.05) -> float:
+    """Steps after which the interval of a time mean that holds at all times at once is so narrow, if tuned for that.
+
+    Parameters
+    ----------
+    variance
+        conditional variance of the martingale difference of a step
+    half_width
+        of the interval of the time mean
+    level
+        probability that the interval ever misses
+
+    Returns
+    -------
+    float
+        number of steps; inf for a half-width of 0
+    """
+    wide = float(simultaneous_half_width(1.0, 1.0, level))
+    return (wide / half_width) ** 2 * variance if half_width > 0.0 else math.inf

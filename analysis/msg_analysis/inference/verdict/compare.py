@@ -34,10 +34,12 @@ from msg_analysis.inference.observed.measurement import Measurement
 from msg_analysis.inference.observed.observation import Observation, spaced_steps
 from msg_analysis.inference.sequential.watched_evidence import AnyTimeEvidence, any_time_evidence
 from msg_analysis.inference.statistics.batch_means import batch_interval
+from msg_analysis.inference.statistics.confidence_sequence import steps_to_half_width
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.inference.verdict.comparison import Comparison, Test
 from msg_analysis.inference.verdict.evidence import Evidence
 from msg_analysis.inference.verdict.trust import trusted
+from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.system.jump_system import JumpSystem
@@ -133,16 +135,20 @@ def judge(
         given=GivenPath(means, evidence.given) if evidence.given else None,
         order=rank_agents(means, level) if means.long_enough else None,
         blame=blame,
-        any_time=_any_time(prediction, evidence, level),
+        any_time=_any_time(trajectory.record, prediction, evidence, level),
         trust=trusted(prediction, means, given=evidence.given is not None) if lockstep else None,
     )
 
 
-def _any_time(prediction: Prediction, evidence: Evidence, level: float) -> AnyTimeEvidence:
-    means, experiment = evidence.means, prediction.experiment
+def _any_time(record: RunRecord, prediction: Prediction, evidence: Evidence, level: float) -> AnyTimeEvidence:
+    """The interval is tuned by what was known before the run, whatever step it ended at."""
+    means, names = evidence.means, [graph.name for graph in record.experiment.graph_list]
     variance = float(means.system_variances.sum()) if means.long_enough else None
-    names = [graph.name for graph in experiment.graph_list]
-    return any_time_evidence(evidence.watched, level, names, variance, evidence.steps, experiment.steps)
+    planned, error = float(record.planned_steps), evidence.watched.sums.error
+    if record.until and error is not None:
+        wanted = record.until.precision * prediction.emulated.system_error
+        planned = min(planned, steps_to_half_width(error.variance, wanted))
+    return any_time_evidence(evidence.watched, level, names, variance, evidence.steps, planned)
 
 
 def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:

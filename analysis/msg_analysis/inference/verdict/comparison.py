@@ -213,11 +213,14 @@ class Comparison:
     def verdict(self) -> Verdict:
         """Verdict: "incomplete" if data are missing, else "disagrees" if a test of the family is rejected.
 
+        A run that was to end as soon as its evidence disagrees (``--until decided``) disagrees when that has happened.
         Without a prediction the remaining tests cannot show that a run agrees: "unpredicted".
         """
         if not self.trajectory.completeness.complete:
             return "incomplete"
-        if any(test.rejected for test in self.tests):
+        until = self.trajectory.record.until
+        decided = until is not None and until.decided and self.any_time is not None and self.any_time.disagrees
+        if decided or any(test.rejected for test in self.tests):
             return "disagrees"
         return "unpredicted" if self.unpredicted else "agrees"
 
@@ -249,6 +252,7 @@ class Comparison:
             "leaders": (np.flatnonzero(record.experiment.leader_gains) + 1).tolist(),
             "seed": None if self.pool else record.experiment.run.seed,
             "level": self.level,
+            "until": _until(record),
             "completeness": asdict(self.trajectory.completeness) | {"stretch": self.trajectory.stretch},
             "steps": self.steps,
             "simulated_time": self.steps * record.experiment.step_length,
@@ -286,6 +290,14 @@ class Comparison:
             "trust": self.trust.to_json() if self.trust else None,
         }
         return {key: _plain(value) for key, value in document.items()}
+
+
+def _until(record: RunRecord) -> dict[str, Any] | None:
+    """Of a run that was to end early."""
+    if record.until is None:
+        return None
+    early = record.planned is not None
+    return {"rule": str(record.until), "planned_steps": record.planned_steps, "ended_early": early}
 
 
 def _plain(value: Any) -> Any:

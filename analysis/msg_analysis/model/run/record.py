@@ -24,7 +24,7 @@ import datetime
 import json
 import platform
 import uuid
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -35,6 +35,7 @@ from msg_analysis.common.version import __version__, ros_distribution
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.protocol_binding import info_of
+from msg_analysis.model.run.until import Until
 from msg_analysis.model.step.step_model import (
     StepMatrices,
     StepModel,
@@ -93,6 +94,11 @@ class RunRecord:
         example, or not used
     started
         when the record was made; None in records of the first edition
+    until
+        when the run may end before its duration; None: it does not
+    planned
+        number of steps that were planned, of a run that has ended before: ``experiment`` has those that it made. None
+        otherwise
     """
 
     run: uuid.UUID
@@ -102,6 +108,8 @@ class RunRecord:
     matrices: StepMatrices | None = None
     key: bytes | None = field(default=None, repr=False)
     started: datetime.datetime | None = field(default_factory=_now)
+    until: Until | None = None
+    planned: int | None = None
 
     @cached_property
     def model(self) -> Wiring:
@@ -119,6 +127,20 @@ class RunRecord:
         """
         return self.model if isinstance(self.model, StepModel) else build_step_model(self.experiment)
 
+    @property
+    def planned_steps(self) -> int:
+        """Number of steps that were planned before the run."""
+        return self.planned or self.experiment.steps
+
+    def ended(self, step: int) -> RunRecord:
+        """The record of this run, which has ended at a step before its last one: that of a complete, shorter run."""
+        experiment = self.experiment
+        document = experiment.to_document()
+        document["run"]["duration"] = step * experiment.step_length
+        info = experiment.protocol.info if experiment.protocol else None
+        shorter = ValidExperiment.parse(document, source=experiment.source, recorded=info)
+        return replace(self, experiment=shorter, planned=self.planned_steps)
+
     def to_json(self, *, with_key: bool = False) -> str:
         """The document, for the nodes of the run with its key; numbers survive the round trip to the last bit."""
         document: dict[str, Any] = {
@@ -130,6 +152,10 @@ class RunRecord:
         }
         if self.started:
             document["started"] = self.started.isoformat()
+        if self.until:
+            document["until"] = str(self.until)
+        if self.planned:
+            document["planned_steps"] = self.planned
         if self.experiment.protocol:
             document["protocol"] = self.experiment.protocol.info.to_json()
         if self.matrices:
@@ -169,7 +195,11 @@ class RunRecord:
             matrices = _without_matrices(experiment) if step is None else _matrices(step, experiment, source)
             run, versions = uuid.UUID(document["run"]), dict(document["versions"])
             key = bytes.fromhex(document["key"]) if "key" in document else None
-            record = cls(run, experiment, start, versions, matrices, key, _started(document))
+            until = Until.parse(document["until"], f"{source}: until") if "until" in document else None
+            planned = int(document["planned_steps"]) if "planned_steps" in document else None
+            if planned is not None and planned <= experiment.steps:
+                raise InputError(f"{source}: planned_steps: {planned}: expected more than the {experiment.steps} made")
+            record = cls(run, experiment, start, versions, matrices, key, _started(document), until, planned)
         except InputError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:

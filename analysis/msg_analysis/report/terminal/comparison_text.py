@@ -55,6 +55,11 @@ def print_comparison(document: dict[str, Any], console: Console) -> None:
         f"({number_text(document['simulated_time'])} units of time): {count['missing']} missing, "
         f"{count['duplicates']} duplicates, {count['out_of_order']} out of order"
     )
+    if (until := document.get("until")) is not None and until["ended_early"]:
+        step, why = document["steps"], until.get("reason") or f"--until {until['rule']}"
+        console.print(Text(f"The run ended in order at step {step} of {until['planned_steps']}: {why}."))
+    elif until is not None:
+        console.print(Text(f"--until {until['rule']}: {until.get('reason') or 'not reached before the planned end'}."))
     for line in gaps(count):
         console.print(Text(line))
     if document.get("unpredicted"):

@@ -325,6 +325,19 @@ class Agent(NetworkNode):
         """Take a sojourn of the graph; the reason if it is refused, else None."""
         raise NotImplementedError
 
+    def end_at(self, step: int) -> None:
+        """Make no step after this one: the run ends early. An agent that is beyond it stays where it is."""
+        self._last = max(step, self._law.step)
+        self._limit_steps(self._last)
+        if self._law.step >= step:
+            self._last_sent = time.monotonic()
+            self._group.send_batches()
+            self._report()
+
+    def _limit_steps(self, last: int) -> None:
+        """Make no step after this one."""
+        raise NotImplementedError
+
     def _fail(self, error: ProtocolError) -> None:
         """End the run, since a protocol has failed."""
         if not self.done.done():

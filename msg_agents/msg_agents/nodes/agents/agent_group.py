@@ -87,6 +87,8 @@ class AgentGroup:
             self._resend = self._host.publisher_of(topics.RESEND)
         self._host.subscribe(topics.GRAPH, self._receive_graph)
         self._host.subscribe(topics.RESEND, self._receive_resend)
+        if record.until:
+            self._host.subscribe(topics.STOP, self._receive_stop)
         self._host.finish_at_end(self.nodes)
 
     def _connect(self) -> None:
@@ -180,6 +182,12 @@ class AgentGroup:
         for agent in self.nodes:
             if request.agent in (NOT_AN_AGENT, agent.number):
                 agent.send_again(request.step)
+
+    def _receive_stop(self, data: bytes) -> None:
+        stop = self._host.decode_progress(data, topics.STOP)
+        if stop is not None:
+            for agent in self.nodes:
+                agent.end_at(stop.step)
 
     def _receive_graph(self, data: bytes) -> None:
         self._host.rules.forget(min(agent.step for agent in self.nodes))

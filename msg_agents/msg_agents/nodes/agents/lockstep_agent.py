@@ -98,6 +98,10 @@ class LockstepAgent(Agent):
             self._turns.ask(self)
         return reason
 
+    def _limit_steps(self, last: int) -> None:
+        """See Agent."""
+        self._synchronizer.end_at(last)
+
     def learn(self, graph: ActiveGraph) -> str | None:
         """See Agent."""
         reason = self._synchronizer.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step)

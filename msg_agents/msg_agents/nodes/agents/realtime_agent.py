@@ -166,6 +166,10 @@ class RealtimeAgent(Agent):
             self._group.record_contradiction(message, self._newest.known(peer)[0])
         return reason
 
+    def _limit_steps(self, last: int) -> None:
+        """See Agent."""
+        self._newest.end_at(last)
+
     def learn(self, graph: ActiveGraph) -> str | None:
         """See Agent."""
         if self._schedule:  # those before the epoch is known are early, or of a run that this agent comes back to

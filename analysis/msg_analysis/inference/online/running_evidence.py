@@ -1,0 +1,132 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Evidence against the law of a running network, and the interval of its system error that holds at all times at once.
+
+The sums of ``sequential.evidence_sums``, one stretch of whole steps after the other; O(1) per step. Which steps are
+left out, because they were not seen whole, must not depend on what happened in them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS
+from msg_analysis.inference.observed.observation import Observation, bounded
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.sequential.watched_evidence import LARGEST_LOGARITHM, question_words
+from msg_analysis.inference.statistics.mixture_evidence import log_mean
+from msg_analysis.theory.prediction import Prediction
+from msg_analysis.theory.system import packed_symmetric
+from msg_analysis.types import FloatArray, IntArray
+
+LEVEL = 0.01  # of the evidence, as of the verdict
+MOST_BYTES = 64 * 2**20  # memory for the evidence on the system error; where that is too little, there is no evidence
+
+
+@dataclass(frozen=True, slots=True)
+class AnyTime:
+    """What may be said of a running network at any time, however often one looks."""
+
+    half_width: float | None  # of the 95 % interval of the system error that holds at all times at once
+    log_evidence: float | None = None  # None: not known, see ``supports``
+    threshold: float = 1.0 / LEVEL
+    crossed: int | None = None  # steps that had been seen when the evidence was first found above the threshold
+    strongest: str | None = None  # what the strongest evidence is about
+
+    def to_json(self) -> dict[str, Any]:
+        """The document; evidence that is too large for a number is None."""
+        known = self.log_evidence is not None and self.log_evidence < LARGEST_LOGARITHM
+        return {
+            "evidence": math.exp(self.log_evidence) if known and self.log_evidence is not None else None,
+            "log_evidence": self.log_evidence,
+            "threshold": self.threshold,
+            "disagrees": self.crossed is not None,
+            "strongest": self.strongest,
+            "half_width": self.half_width,
+        }
+
+
+def supports(prediction: Prediction) -> bool:
+    """Whether the states alone give the evidence: in lockstep, with nothing on the air, of not too many agents."""
+    noise, run, system = prediction.experiment.noise, prediction.experiment.run, prediction.system
+    numbers = 16 * system.modes**2 * (packed_symmetric.size(system.dimension) + 1)
+    return not (noise.on_air or noise.delay or run.pace == "realtime") and 8 * numbers <= MOST_BYTES
+
+
+class RunningEvidence:
+    """The evidence of a run from its whole steps, as they come; ValueError where ``supports`` says no."""
+
+    def __init__(self, prediction: Prediction, replicas: int) -> None:
+        if not supports(prediction):
+            raise ValueError("the states alone do not give the evidence of this run")
+        self._prediction, self._replicas = prediction, replicas
+        self.sums = EvidenceSums(prediction, replicas)
+        assert self.sums.error is not None
+        step = prediction.step
+        numbers = (4 + step.most_neighbours) * step.agents * replicas
+        numbers = max(numbers + step.agents**2, self.sums.error.numbers * (1 + len(self.sums.error.rates)))
+        self._length = max(1, BLOCK_NUMBERS // numbers)
+        self._names = [graph.name for graph in prediction.experiment.graph_list]
+        self._count = 0
+        self._crossed: int | None = None
+        # The newest step, which counts when the graph after it is known: its number, graph, states before and after.
+        self._kept: tuple[IntArray, IntArray, FloatArray, FloatArray] | None = None
+
+    @property
+    def variance(self) -> float:
+        """Of the martingale difference of the system error in a step, by which its interval is tuned."""
+        assert self.sums.error is not None
+        return self.sums.error.variance
+
+    def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
+        """Add whole steps, each only once; arrays as in ``LiveEstimate.add_whole``."""
+        if not len(steps):
+            return
+        order = np.argsort(steps, kind="stable")
+        found = (steps[order], modes[order], states[order, :, : self._replicas], after[order, :, : self._replicas])
+        if self._kept is not None:
+            joined = [np.concatenate([old, new]) for old, new in zip(self._kept, found, strict=True)]
+            found = (joined[0], joined[1], joined[2], joined[3])
+        ends = [0, *(np.flatnonzero(np.diff(found[0]) != 1) + 1).tolist(), len(found[0])]
+        for first, end in pairwise(ends):
+            for start in range(first, end - 1, self._length):
+                last = min(start + self._length, end - 1)
+                states = np.concatenate([found[2][start : last + 1], found[3][last : last + 1]])
+                start_state = states[0]
+                self.sums.add(
+                    Observation(self._prediction, bounded(states), found[1][start : last + 1], start_state),
+                    0,
+                    last - start,
+                )
+                self._count += last - start
+        self._kept = (found[0][-1:], found[1][-1:], found[2][-1:], found[3][-1:])
+
+    def look(self, half_width: float | None) -> AnyTime:
+        """The evidence now; ``half_width``: of the interval of the system error, which is passed on."""
+        evidence = self.sums.evidence()
+        threshold = 1.0 / LEVEL
+        if self._crossed is None and evidence >= math.log(threshold):
+            self._crossed = self._count
+        strongest = None
+        if self._crossed is not None:
+            best = {kind: log_mean(logs, axis=1) for kind, logs in self.sums.families().items()}
+            kind = max(best, key=lambda kind: float(best[kind].max()))
+            strongest = question_words(self.sums.question(kind, int(best[kind].argmax())), self._names)
+        return AnyTime(half_width, evidence, threshold, self._crossed, strongest)
