@@ -117,6 +117,9 @@ def _show(result: RunResult, as_json: bool) -> None:
         from msg_analysis.report.terminal.comparison_text import print_comparison
 
         print_comparison(document, result_console())
+    for line in (result.channel or {}).get("findings", []):
+        click.echo(f"Channel: {line}")
+    if result.comparison is not None:
         click.echo(f"bag:    {document['bag']}")
         if result.report:
             click.echo(f"report: {result.report}")
@@ -124,8 +127,6 @@ def _show(result: RunResult, as_json: bool) -> None:
         click.echo(f"bag: {document['bag']}")
         if result.interrupted and result.reached > 0:
             click.echo(f"To compare what it holds with the prediction: msg-analysis compare {document['bag']}")
-    for line in (result.channel or {}).get("findings", []):
-        click.echo(f"channel: {line}")
     if result.rate:
         click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
 
