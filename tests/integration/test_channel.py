@@ -20,6 +20,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.errors import NotAvailableError
 
 LEVEL = 1e-6  # false-alarm rate of the test of a loss; the losses have a fixed seed, the numbers of packets do not
+MARK_OF_TESTS = b"MSG_AGENTS_TEST="
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 
 
@@ -56,10 +57,19 @@ def namespaces(network: Any) -> set[int]:
     return found - {own}
 
 
-def holders(inodes: set[int]) -> list[str]:
-    """What still holds one of these namespaces: a process in it, or a descriptor of it."""
+def holders(inodes: set[int], mark: str) -> list[str]:
+    """What still holds one of these namespaces: a process in it, or a descriptor of it.
+
+    Not a process of another test: the kernel gives the number of a removed namespace to a new one.
+    """
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            marks = [word for word in (entry / "environ").read_bytes().split(b"\0") if word.startswith(MARK_OF_TESTS)]
+        except OSError:
+            continue
+        if marks and marks != [MARK_OF_TESTS + mark.encode()]:
+            continue
         for link in (entry / "ns/net", *(entry / "fd").glob("*")):
             try:
                 target = str(link.readlink())
@@ -77,7 +87,7 @@ def hosts(network: Any) -> Iterator[set[int]]:
     yield noted
     network.wait_for(lambda: not network.processes(), 30, "the end of all processes")
     assert len(noted) == 6
-    assert holders(noted) == []
+    assert holders(noted, network.mark) == []
 
 
 def wait_until_moving(network: Any, hosts: set[int]) -> None:
