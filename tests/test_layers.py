@@ -36,6 +36,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "model/network",
         "model/arithmetic",
         "protocol",
+        "model/spec",
         "model/experiment",
         "model/step",
         "model/run",

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator
 
-from msg_analysis.model.experiment.spec import Count, expected, is_number
+from msg_analysis.model.spec.values import Count, expected, is_number
 from msg_analysis.sweep.jobs.job import JobKind
 
 MOST_POINTS = 20_000  # of a sweep: the experiments of all are held in memory

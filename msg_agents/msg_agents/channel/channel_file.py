@@ -30,8 +30,8 @@ from msg_agents.processes.hosts import agent_numbers, assignment_problems
 from msg_agents.processes.process_plan import process_name, split_agents
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.problems import ExperimentError, problem, translate
-from msg_analysis.model.experiment.spec import expected, is_number
 from msg_analysis.model.experiment.yaml_document import read_yaml
+from msg_analysis.model.spec.values import expected, is_number
 from msg_analysis.types import BoolArray, FloatArray
 
 BASE = "base"

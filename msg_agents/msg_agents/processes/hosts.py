@@ -36,8 +36,8 @@ from msg_agents.processes.process_plan import Share, wanted_processes
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show, translate
-from msg_analysis.model.experiment.spec import expected
 from msg_analysis.model.experiment.yaml_document import read_yaml
+from msg_analysis.model.spec.values import expected
 
 VISITORS = 8  # participants on a host besides those of the run, such as tools that watch it
 _RANGE = re.compile(r"([0-9]+)-([0-9]+)")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment, json_schema
-from msg_analysis.model.experiment.spec import ExperimentSpec
+from msg_analysis.model.spec.document import ExperimentSpec
 from msg_analysis.types import FloatArray
 
 ROOT = Path(__file__).parents[3]

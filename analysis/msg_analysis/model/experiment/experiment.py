@@ -30,17 +30,13 @@ from msg_analysis.model.experiment import memory, protocol_binding, topology, va
 from msg_analysis.model.experiment.problems import ExperimentError, problem, show
 from msg_analysis.model.experiment.protocol_binding import ChosenProtocol, ProtocolInfo
 from msg_analysis.model.experiment.sections import Sections
-from msg_analysis.model.experiment.spec import (
-    ExperimentSpec,
-    LeadersSpec,
-    NoiseSpec,
-    Purpose,
-    RunSpec,
-    SwitchingSpec,
-)
 from msg_analysis.model.experiment.yaml_document import other_kind, read_yaml
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.model.network.markov_chain import MarkovChain, Time
+from msg_analysis.model.spec.document import ExperimentSpec, Purpose
+from msg_analysis.model.spec.graphs import SwitchingSpec
+from msg_analysis.model.spec.noise import NoiseSpec
+from msg_analysis.model.spec.run import LeadersSpec, RunSpec
 from msg_analysis.protocol import Network
 from msg_analysis.types import FloatArray
 

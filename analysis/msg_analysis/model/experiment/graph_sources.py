@@ -30,7 +30,8 @@ import numpy as np
 
 from msg_analysis.common.bounded_input import read_bytes
 from msg_analysis.model.experiment.problems import problem, show
-from msg_analysis.model.experiment.spec import NAME_PATTERN, GraphSpec, Link, is_number
+from msg_analysis.model.spec.graphs import GraphSpec, Link
+from msg_analysis.model.spec.values import NAME_PATTERN, is_number
 
 _COLUMNS = ("source", "target", "weight", "type")
 _NODE = f"expected a node's name of the form {NAME_PATTERN.strip('^$')}"

@@ -26,7 +26,8 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.spec import ExperimentSpec, GraphSpec
+from msg_analysis.model.spec.document import ExperimentSpec
+from msg_analysis.model.spec.graphs import GraphSpec
 
 _LONGEST_VALUE = 60
 _MOST_LINES = 100  # problems shown; a file with more mostly repeats one of them

@@ -38,7 +38,8 @@ from msg_analysis.protocol import ENTRY_POINTS, Heard, LinearProtocol, Network, 
 from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.spec import ProtocolSpec, Purpose, RunSpec
+    from msg_analysis.model.spec.document import Purpose
+    from msg_analysis.model.spec.run import ProtocolSpec, RunSpec
 
 Result = TypeVar("Result")
 

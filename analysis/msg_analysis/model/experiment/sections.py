@@ -28,9 +28,12 @@ from msg_analysis.model.experiment import graph_sources, memory, protocol_bindin
 from msg_analysis.model.experiment.graph_sources import ForeignGraph, GraphError, is_networkx
 from msg_analysis.model.experiment.problems import problem, show, translate
 from msg_analysis.model.experiment.protocol_binding import ChosenProtocol, ProtocolInfo
-from msg_analysis.model.experiment.spec import ExperimentSpec, GraphSpec, NoiseSpec, RunSpec
 from msg_analysis.model.network.graphs import Graph
 from msg_analysis.model.network.markov_chain import MarkovChain, Time
+from msg_analysis.model.spec.document import ExperimentSpec
+from msg_analysis.model.spec.graphs import GraphSpec
+from msg_analysis.model.spec.noise import NoiseSpec
+from msg_analysis.model.spec.run import RunSpec
 from msg_analysis.types import FloatArray
 
 

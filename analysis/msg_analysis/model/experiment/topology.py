@@ -24,9 +24,10 @@ import numpy as np
 from msg_analysis.common.text.agent_names import agent_name, agent_text
 from msg_analysis.common.text.number_words import listed
 from msg_analysis.model.experiment.problems import problem, show
-from msg_analysis.model.experiment.spec import GraphSpec, Link, LossSpec
 from msg_analysis.model.network.graphs import Graph, hops
 from msg_analysis.model.network.markov_chain import Time
+from msg_analysis.model.spec.graphs import GraphSpec, Link
+from msg_analysis.model.spec.noise import LossSpec
 from msg_analysis.types import BoolArray, FloatArray
 
 

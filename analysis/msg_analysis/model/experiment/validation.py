@@ -23,9 +23,11 @@ import numpy as np
 
 from msg_analysis.common.text.agent_names import agent_name, agent_text
 from msg_analysis.model.experiment.problems import problem, show
-from msg_analysis.model.experiment.spec import LeadersSpec, LossSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
 from msg_analysis.model.network.graphs import Graph, hops
 from msg_analysis.model.network.markov_chain import MarkovChain, Time
+from msg_analysis.model.spec.graphs import SwitchingSpec
+from msg_analysis.model.spec.noise import LossSpec, NoiseGain, NoiseSpec
+from msg_analysis.model.spec.run import LeadersSpec, RunSpec
 from msg_analysis.types import BoolArray, FloatArray
 
 SUM_TOLERANCE = 1e-9

@@ -34,7 +34,7 @@ from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.experiment.spec import LeadersSpec
+from msg_analysis.model.spec.run import LeadersSpec
 from msg_analysis.model.step.sequential_law import build_run_model
 from msg_analysis.theory.leaders.search import Leaders, LeaderSearch, SearchProgress, ignore
 from msg_analysis.theory.moments import MomentSolver
