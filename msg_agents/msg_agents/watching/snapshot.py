@@ -244,6 +244,7 @@ def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = Non
         "sojourn": None if sojourn is None else [sojourn.sequence + 1, sojourn.first_step, sojourn.last_step],
         "system": report.system.to_json() if report else None,
         "nodes": [node.to_json() for node in report.nodes] if report else None,
+        "any_time": report.any_time.to_json() if report else None,
         "values": None if recent is None else recent.states[-1].tolist(),
         "values_step": None if recent is None else int(recent.steps[-1]),
         "trace": None if recent is None else _trace(snapshot, recent, before and before["trace"]),

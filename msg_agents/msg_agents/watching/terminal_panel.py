@@ -28,7 +28,7 @@ from rich.text import Text
 from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.common.text.agent_names import agent_name
 from msg_analysis.report.figures.palette import shorten
-from msg_analysis.report.terminal.live_text import coverage, error_text
+from msg_analysis.report.terminal.live_text import any_time_text, coverage, error_text
 
 if TYPE_CHECKING:
     from msg_agents.watching.snapshot import Snapshot
@@ -45,7 +45,7 @@ COLOURS = (
     "bright_yellow",
     "white",
 )  # of graphs; names say the same
-FIXED_LINES = 9  # of the panel besides the agents
+FIXED_LINES = 10  # of the panel besides the agents
 FAR = 2.0  # standard errors
 _LEGEND = "  ● measured ◆ predicted"
 
@@ -123,13 +123,15 @@ def _coverage(snapshot: Snapshot, experiment: ValidExperiment) -> Text:
 def _system(snapshot: Snapshot, width: int) -> list[RenderableType]:
     report = snapshot.report
     if report is None or report.system.measured is None:
-        return [Text(snapshot.note or "system error: no data yet", no_wrap=True, overflow="ellipsis"), Text()]
+        return [Text(snapshot.note or "system error: no data yet", no_wrap=True, overflow="ellipsis"), Text(), Text()]
     system = report.system
     style = "bold red" if abs(system.z or 0.0) > 4 else ""
     text = Text(f"system error {error_text(system)}", style=style, no_wrap=True, overflow="ellipsis")
     if snapshot.note:
         text.append(f"  {snapshot.note}")
-    return [text, gauge(system, min(width - len(_LEGEND), 60))]
+    seen = report.any_time
+    any_time = Text(any_time_text(report), style="bold red" if seen.crossed else "", no_wrap=True, overflow="ellipsis")
+    return [text, gauge(system, min(width - len(_LEGEND), 60)), any_time]
 
 
 def gauge(estimate: Estimate, width: int) -> Text:

@@ -215,6 +215,31 @@ def test_agents_may_be_killed_at_any_time(case: Case, seed: int) -> None:
     network.check_end(serial(case))
 
 
+@settings(max_examples=300, deadline=None)
+@given(cases(), st.data(), st.integers(0, 2**32))
+def test_the_run_may_end_early_at_any_time(case: Case, data: st.DataObject, seed: int) -> None:
+    """Agents learn of the last step at different times: all make every step up to it, and none waits for ever."""
+    end = data.draw(st.integers(1, case.steps))
+    rng = random.Random(seed)
+    network, told = Network(case), set[int]()
+    while True:
+        events = network.events()
+        untold = [agent for agent in range(case.agents) if agent not in told]
+        if untold and (not events or rng.random() < 0.05):
+            agent = rng.choice(untold)
+            told.add(agent)
+            network.nodes[agent].end_at(end)
+            assert network.nodes[agent].steps == max(end, network.nodes[agent].step)
+        elif events:
+            network.happen(rng.choice(events))
+        else:
+            break
+    assert all(node.finished for node in network.nodes)
+    assert all(len(states) > end for states in network.states)
+    made = [list(row) for row in zip(*(states[: end + 1] for states in network.states), strict=True)]
+    assert made == serial(case)[: end + 1]
+
+
 def explore(case: Case) -> Iterator[Network]:
     """Every end that any order of events leads to."""
     start = Network(case)

@@ -57,10 +57,10 @@ class LiveReport:
     system: Estimate
     nodes: list[Estimate]
     note: str | None  # why there is no prediction, or no standard error; None where there are both
-    any_time: AnyTime = field(default_factory=lambda: AnyTime(None))
     refused: dict[str, int] = field(default_factory=dict)  # states or steps that do not count, by reason
     recent: Recent | None = None  # the newest whole steps
     lateness: list[float | None] | None = None  # of each agent in real time, see ``Lateness.medians``
+    any_time: AnyTime = field(default_factory=lambda: AnyTime(None))
 
     @property
     def missing(self) -> int:

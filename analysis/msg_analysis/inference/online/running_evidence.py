@@ -121,6 +121,8 @@ class RunningEvidence:
     def look(self, half_width: float | None) -> AnyTime:
         """The evidence now; ``half_width``: of the interval of the system error, which is passed on."""
         evidence = self.sums.evidence()
+        if math.isnan(evidence):  # numbers too large to compute with: the law never gives one
+            evidence = math.inf
         threshold = 1.0 / LEVEL
         if self._crossed is None and evidence >= math.log(threshold):
             self._crossed = self._count

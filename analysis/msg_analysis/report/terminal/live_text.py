@@ -40,6 +40,7 @@ def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
         "simulated_time": report.steps * dt,
         "system_error": report.system.to_json(),
         "node_errors": [node.to_json() for node in report.nodes],
+        "any_time": report.any_time.to_json(),
         "refused": report.refused,
         "note": report.note,
     }
@@ -48,7 +49,22 @@ def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
 def live_line(report: LiveReport, record: RunRecord, rate: float) -> str:
     """Step, system error and missing steps in one line; ``rate`` in steps per second."""
     parts = [f"step {max(report.newest, 0)} of {record.experiment.steps}", f"system error {error_text(report.system)}"]
+    if any_time := any_time_text(report):
+        parts.append(any_time)
     return ", ".join(parts + (coverage(report) if report.steps else ["no complete step yet"]) + [f"{rate:.0f} steps/s"])
+
+
+def any_time_text(report: LiveReport) -> str:
+    """What is valid however often one looks: half-width of the interval, evidence; may be empty."""
+    seen, parts = report.any_time, []
+    if seen.half_width is not None:
+        parts.append(f"any time ± {number_text(seen.half_width, 2)}")
+    if seen.log_evidence is not None:
+        evidence = seen.to_json()["evidence"]
+        shown = "more than 1e300" if evidence is None else number_text(evidence, 2)
+        limit = f"disagrees: {seen.strongest}" if seen.crossed else f"disagrees at {seen.threshold:g}"
+        parts.append(f"evidence against the prediction {shown} ({limit})")
+    return ", ".join(parts)
 
 
 def coverage(report: LiveReport) -> list[str]:

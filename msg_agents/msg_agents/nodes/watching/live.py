@@ -90,7 +90,7 @@ class Live(Watcher):
         report = self._estimate.report()
         for reason, count in self._refused.items():
             report.refused[reason] = report.refused.get(reason, 0) + count
-        last = self.record.experiment.steps
+        last = self.last_step
         return Watched(self.record, report, self._estimate.steps.newest >= last, list(self._reached))
 
     def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:
@@ -114,7 +114,7 @@ class Live(Watcher):
         with until_shutdown(self):
             self._writer.publish(self._message(watched))
         self._on_report(watched, (newest - before) / max(now - then, 1e-9) if before >= 0 else 0.0)
-        last = watched.record.experiment.steps
+        last = self.last_step
         self._silent = self._silent + 1 if newest == before else 0
         # All states have arrived, or no more will, because the run has ended or its publishers have gone.
         quiet = self._silent >= (1 if newest >= 0 else MOST_SILENT)

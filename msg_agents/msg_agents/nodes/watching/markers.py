@@ -105,7 +105,7 @@ class Markers(Watcher):
             with until_shutdown(self):
                 self._writer.publish(self._picture(states))
         quiet = time.monotonic() - self._moved > SILENT_TIME
-        over = min(steps) >= self.record.experiment.steps or (quiet and (self._ended or not self._has_publishers()))
+        over = min(steps) >= self.last_step or (quiet and (self._ended or not self._has_publishers()))
         if over and not self.done.done():
             self.done.set_result(None)
 

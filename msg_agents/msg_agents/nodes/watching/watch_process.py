@@ -67,9 +67,11 @@ class Watcher(LeanNode):
         self._refused: Counter[str] = Counter()
         self._others: set[str] = set()
         self._ended = False
+        self._end: int | None = None  # last step of the run, if it has said so
         self._topics: list[str] = []  # topics of states: the run is there while they have publishers
         self.subscribe(topics.EXPERIMENT, self._receive_experiment)
         self.subscribe(topics.END, self._receive_end)
+        self.subscribe(topics.STOP, self._receive_stop)
 
     def follow(self) -> None:
         """Read the states of the run that has been found; InputError: not possible with this run."""
@@ -119,9 +121,29 @@ class Watcher(LeanNode):
                 self._on_note(f"there are two records of run {record.run}, and one is forged: the first is used")
             self._refused[Refusal.CONTRADICTION] += 1
 
+    @property
+    def last_step(self) -> int:
+        """The last step of the run that is known, as far as it is known that it ends early."""
+        assert self.record is not None
+        planned = self.record.experiment.steps
+        return planned if self._end is None else min(self._end, planned)
+
     def _receive_end(self, data: bytes) -> None:
-        if self.record is not None and isinstance(decode_of_run(Progress, data, self.record.run.bytes), Progress):
-            self._ended = True
+        self._ended = self._take_last_step(data) or self._ended
+
+    def _receive_stop(self, data: bytes) -> None:
+        self._take_last_step(data)
+
+    def _take_last_step(self, data: bytes) -> bool:
+        """Take the last step of the run; False: of another one."""
+        if self.record is None:
+            return False
+        found = decode_of_run(Progress, data, self.record.run.bytes)
+        if not isinstance(found, Progress):
+            return False
+        if self.record.until is not None:
+            self._end = found.step
+        return True
 
     def look(self) -> None:
         """Look whether the run whose record was given is there."""

@@ -141,6 +141,13 @@ function show(data) {
     at("measured").textContent = number(system.measured);
     at("interval").textContent = half === null ? "–" : `${number(system.measured - half)} … ${number(system.measured + half)}`;
     at("predicted").textContent = number(system.predicted);
+    const seen = data.any_time, wide = seen ? seen.half_width : null;
+    at("anytime").textContent = wide === null ? "–" : `${number(system.measured - wide)} … ${number(system.measured + wide)}`;
+    if (seen && seen.log_evidence !== null) {
+      const evidence = seen.evidence === null ? "more than 1e300" : number(seen.evidence, 2);
+      at("evidence").textContent = `${evidence} (${seen.disagrees ? `disagrees: ${seen.strongest}` : `disagrees at ${seen.threshold}`})`;
+    }
+    at("against").classList.toggle("far", Boolean(seen && seen.disagrees));
     const last = points[points.length - 1];
     if (!last || last[0] !== data.values_step) points.push([data.values_step, system.measured, system.predicted, system.standard_error]);
     if (points.length > 1200) points = points.filter((_, place) => place % 2 === 1);

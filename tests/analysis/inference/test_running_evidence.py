@@ -1,0 +1,157 @@
+"""Evidence and intervals of a running network: against the sums over the whole run, and how often they miss."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from msg_analysis.inference.errors.estimates import Estimate
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.online import running_errors
+from msg_analysis.inference.online.running_errors import LiveEstimate, LiveReport
+from msg_analysis.inference.online.running_evidence import AnyTime, RunningEvidence, supports
+from msg_analysis.inference.online.stopping import precision_words, reached
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.statistics.batch_means import RunningBatches
+from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width, steps_to_half_width
+from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.run.until import Until
+from msg_analysis.theory.prediction import predict
+from msg_analysis.twin.simulate import simulate
+
+
+def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:
+    run = {"dt": 0.05, "duration": duration, "replicas": 2, "seed": seed} | changes.pop("run", {})
+    return ValidExperiment.parse(
+        {
+            "name": "net",
+            "problem": "consensus",
+            "time": "continuous",
+            "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
+            "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
+            "run": run,
+            **changes,
+        }
+    )
+
+
+@pytest.mark.parametrize("pieces", [1, 7, 300])
+@pytest.mark.parametrize("missing", [False, True])
+def test_is_the_sum_over_the_whole_run(pieces: int, missing: bool) -> None:
+    law = experiment()
+    run, prediction = simulate(law), predict(law)
+    seen = RunningEvidence(prediction, 2)
+    gaps = [0, 700, 701, 1500] if missing else [0]  # steps that were not seen
+    for steps in np.array_split(np.delete(np.arange(1, 2000), gaps), pieces):
+        steps = steps[::-1]  # in any order within a piece
+        seen.add(steps, run.modes[steps], run.states[steps], run.states[steps + 1])
+    observation, expected = Observation.of(run, prediction), EvidenceSums(prediction, 2)
+    # The arrays without the places 0, 700, 701 and 1500 of the steps from 1 on.
+    stretches = [(2, 701), (703, 1501), (1502, 2000)] if missing else [(2, 2000)]
+    for first, end in stretches:
+        part = Observation(
+            prediction, observation.states[first : end + 1], observation.modes[first:end], observation.states[first]
+        )
+        expected.add(part, 0, end - first - 1)
+    assert seen.sums.counts.tolist() == expected.counts.tolist()
+    assert seen.look(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
+
+
+def test_what_the_states_alone_do_not_give() -> None:
+    for changes in ({"noise": {"loss": 0.1}}, {"noise": {"delay": 1}}, {"run": {"pace": "realtime"}}):
+        prediction = predict(experiment(**changes))
+        assert not supports(prediction)
+        with pytest.raises(ValueError, match="do not give the evidence"):
+            RunningEvidence(prediction, 2)
+
+
+def test_a_fault_is_found_and_named() -> None:
+    """Noise that is half as strong as the law says, seen in pieces."""
+    run = simulate(experiment(noise={"process": 0.7}))
+    seen = RunningEvidence(predict(experiment()), 2)
+    for steps in np.array_split(np.arange(2000), 20):
+        seen.add(steps, run.modes[steps], run.states[steps], run.states[steps + 1])
+        found = seen.look(0.1)
+        if found.crossed:
+            break
+    assert found.crossed is not None
+    assert found.crossed < 1000
+    assert found.strongest is not None
+    assert found.strongest.startswith("noise of agent")
+    assert found.to_json()["disagrees"]
+
+
+def record_of(law: ValidExperiment, until: Until | None) -> tuple[RunRecord, Any]:
+    run = simulate(law)
+    return RunRecord(run.record.run, law, run.record.start, until=until), run
+
+
+def test_the_interval_is_that_of_the_comparison() -> None:
+    record, run = record_of(experiment(duration=400), Until(0.1))
+    live = LiveEstimate(record)
+    steps = np.arange(8000)
+    live.add_whole(steps, run.modes, run.states[:-1], run.states[1:])
+    half = live.report().any_time.half_width
+    object.__setattr__(run, "record", record)
+    assert half == pytest.approx(compare(run).any_time.half_width, rel=1e-9)
+
+
+def test_intervals_hold_at_all_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 40 runs, looked at every 50 steps, at most 5 ever miss: more do with probability 0.014 at a level of 5 %."""
+    law = predict(experiment())
+    monkeypatch.setattr(running_errors, "predict", lambda experiment, _: replace(law, experiment=experiment))
+    missed = 0
+    for seed in range(40):
+        record, run = record_of(experiment(seed=seed), Until(0.2))
+        live = LiveEstimate(record, nodes=False)
+        for steps in np.array_split(np.arange(2000), 40):
+            live.add_whole(steps, run.modes[steps], run.states[steps], run.states[steps + 1])
+            report = live.report()
+            half = report.any_time.half_width
+            if half is not None and abs(report.system.measured - report.system.predicted) > half:
+                missed += 1
+                break
+    assert missed <= 5
+
+
+def test_running_batches() -> None:
+    """Against numpy on batches of the length that they then have; independent values have their own variance."""
+    series = np.random.default_rng(3).standard_normal(5000) + 2.0
+    batches = RunningBatches()
+    assert batches.variance() is None
+    for part in np.array_split(series, 37):
+        batches.add(part)
+    length = 128  # 5000 / 64 < 128
+    means = series[: 5000 // length * length].reshape(-1, length).mean(axis=1)
+    assert batches.count == 5000
+    assert batches.variance() == pytest.approx(means.var(ddof=1) * length * 5000)
+    assert batches.variance() == pytest.approx(5000, rel=0.5)
+
+
+def test_steps_to_half_width() -> None:
+    """The interval that is tuned for so many steps is then as narrow as wanted."""
+    steps = steps_to_half_width(3.0, 0.02)
+    assert simultaneous_half_width(3.0 * steps, 3.0 * steps) / steps == pytest.approx(0.02)
+    assert steps_to_half_width(3.0, 0.0) == np.inf
+
+
+def report(half_width: float | None, crossed: int | None = None, steps: int = 1000) -> LiveReport:
+    seen = AnyTime(half_width, 0.0, crossed=crossed)
+    return LiveReport(0, steps - 1, steps, steps, Estimate(2.0, 2.0, 0.1), [], None, any_time=seen)
+
+
+def test_when_a_run_may_end() -> None:
+    assert reached(Until(0.05), report(0.11)) is None
+    assert reached(Until(0.05), report(None)) is None
+    assert reached(Until(0.05), report(0.1)) == "precision 5 % reached at step 1000"
+    assert reached(Until(0.05), report(0.1, steps=99)) is None  # too early
+    assert reached(Until(0.05), report(0.11, crossed=800)) is None
+    words = reached(Until.parse("decided"), report(0.11, crossed=800))
+    assert words == "evidence against the prediction passed 100 at step 1000"
+    assert precision_words(report(0.11)) == "precision 5.5 % at step 1000"
+    assert precision_words(report(None)) == "the precision is not known"

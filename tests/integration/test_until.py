@@ -1,0 +1,175 @@
+"""Runs that end before their duration, in order: each is complete, equal to its twin, and says how it ended."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msg_agents.running.run_result import RunResult, conclude
+from msg_agents.watching import early_end, run_observer
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.inference.online import running_errors, stopping
+from msg_analysis.model.run.until import Until
+from msg_analysis.twin.check import check
+
+LONG = {"duration": 2000, "replicas": 8, "processes": 2}  # 40,000 steps
+PLANNED = 40_000
+PROGRAM = Path(sys.executable).with_name("msg-analysis")
+
+
+def ended(result: dict[str, Any], planned: int = PLANNED) -> int:
+    """The step at which a run ended, before the planned one, as result, run record and bag say it."""
+    until, record = result["until"], read_bag(result["bag"]).record
+    assert until["ended_early"]
+    assert until["planned_steps"] == planned == record.planned_steps
+    step: int = until["step"]
+    assert 0 < step < planned
+    assert record.experiment.steps == step == record.planned_steps - (planned - step)
+    return step
+
+
+def complete(result: RunResult) -> None:
+    """The run of a test in this process is complete, and equal to its twin."""
+    assert result.failures == []
+    assert result.trajectory is not None
+    assert result.trajectory.completeness.complete
+    outcome = check(result.trajectory)
+    assert (outcome.difference, outcome.missing) == (None, 0)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"noise": {"process": 1.0, "loss": 0.2, "link": 0.1, "broadcast": 0.1}},
+        {"noise": {"process": 1.0, "loss": 0.2, "on_loss": "hold"}},
+        {"noise": {"process": 1.0, "delay": 2}, "run": {"processes": "one_per_agent"}},
+    ],
+    ids=["plain", "air", "hold", "delay"],
+)
+def test_ends_at_a_precision(network: Any, changes: dict[str, Any]) -> None:
+    changes = changes | {"run": LONG | changes.get("run", {})}
+    run = network.start("run", network.file(**changes), "--out", network.directory, "--json", "--until", "30%")
+    result = network.completed(run)
+    step = ended(result)
+    assert result["steps"] == step
+    assert result["until"]["reason"].startswith("precision 30 % reached at step ")
+    assert int(result["until"]["reason"].rsplit(" ", 1)[1]) <= step
+    assert any(note.startswith("--until 30%: precision 30 % reached") for note in result["notes"])
+    # The bag alone says it, too.
+    command = [str(PROGRAM), "compare", result["bag"]]
+    shown = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    assert f"The run ended in order at step {step} of {PLANNED}: --until 30%." in shown
+    if not changes.get("noise"):
+        assert result["any_time"]["half_width"] <= 0.31 * result["system_error"]["measured"]
+
+
+def test_real_time(network: Any) -> None:
+    run = {"pace": "realtime", "speed": 20, "duration": 4000, "replicas": 8, "processes": 2}
+    command = ("run", network.file(run=run), "--out", network.directory, "--json", "--until", "30%")
+    result = network.completed(network.start(*command))
+    assert ended(result, 80_000) == result["steps"]
+
+
+def test_restarts_0_and_no_record(network: Any) -> None:
+    """States are kept for the observer, although not for restarts; without a bag, the result says how it ended."""
+    options = ("--until", "40%", "--restarts", "0", "--json", "--out", network.directory)
+    result = network.completed(network.start("run", network.file(run=LONG), *options))
+    ended(result)
+    stdout, stderr = network.start("run", network.file(run=LONG), *options, "--no-record").communicate(timeout=100)
+    assert '"ended_early": true' in stdout, stderr
+
+
+def test_not_reached(network: Any) -> None:
+    command = ("run", network.file(run={"duration": 50}), "--out", network.directory, "--json", "--until", "0.1%")
+    result = network.completed(network.start(*command))
+    assert (result["until"]["ended_early"], result["steps"]) == (False, 1000)
+    assert result["until"]["reason"].startswith("not reached: precision ")
+
+
+def test_killed_processes(network: Any, repetition: int, rng: random.Random) -> None:
+    """An agent and the switcher are killed and come back, before or after the end is announced."""
+    command = ("run", network.file(run=LONG), "--out", network.directory, "--json", "--until", "25%", "--restarts", "9")
+    run = network.start(*command)
+    network.wait_for(lambda: network.recorded_bytes(".") > 50_000, 60, "recorded states")
+    for kind in rng.sample(["agent", "switcher", "switcher"], 3):
+        there = network.processes(kind)
+        if there:
+            rng.choice(there).kill()
+        try:
+            run.wait(rng.uniform(0.2, 1.5))
+            break
+        except subprocess.TimeoutExpired:
+            continue
+    ended(network.completed(run))
+
+
+def test_switcher_killed_when_it_has_announced_the_end(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next one announces the same step."""
+    decided = []
+
+    def kill(files: Any) -> int | None:
+        step = found(files)
+        if step is not None and not decided:
+            decided.append(step)
+            for process in network.processes("switcher"):
+                process.kill()
+        return step
+
+    found = early_end.StopFiles.decided
+    monkeypatch.setattr(early_end.StopFiles, "decided", kill)
+    result = network.run(network.experiment(run=LONG), until=Until(0.3))
+    complete(result)
+    assert result.until["step"] == decided[0]
+    assert result.trajectory.record.experiment.steps == decided[0]
+
+
+def test_evidence_ends_a_run(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The observer is told of a law with a third of the noise: ``decided`` ends the run by the evidence against it."""
+    experiment = network.experiment(run=LONG)
+    other = network.experiment(run=LONG, noise={"process": 0.6})
+
+    def observer(record: Any, checkpoints: Path) -> run_observer.RunObserver:
+        return run_observer.RunObserver(replace(record, experiment=other), checkpoints)
+
+    monkeypatch.setattr(early_end, "RunObserver", observer)
+    result = network.run(experiment, until=Until.parse("decided"))
+    complete(result)
+    assert result.until["reason"].startswith("evidence against the prediction passed 100 at step ")
+    assert result.until["ended_early"]
+    conclude(result, "never")
+    assert result.comparison.verdict == "agrees"  # with its own law
+
+
+@pytest.mark.parametrize("error", [MemoryError("too little"), ZeroDivisionError("a fault")])
+def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    """The run goes on to its planned end, and says that it was not watched."""
+
+    def fail(_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(running_errors.LiveEstimate, "report", fail)
+    notes: list[str] = []
+    result = network.run(network.experiment(run={"duration": 200}), until=Until(0.5), on_note=notes.append)
+    complete(result)
+    assert len(result.trajectory.modes) == 4000
+    assert not result.until["ended_early"]
+    assert result.until["reason"].startswith(
+        f"not known: the errors cannot be followed any more ({type(error).__name__}"
+    )
+    assert any("the run goes on to step 4000" in note for note in notes)
+
+
+def test_too_late(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In 40 steps, agents can be at the end before they know of an earlier one: the run stays whole."""
+    monkeypatch.setattr(stopping, "reached", lambda *_: "precision 50 % reached at step 1")
+    result = network.run(network.experiment(run={"duration": 2}), until=Until(0.5))
+    complete(result)
+    assert len(result.trajectory.modes) == 40
+    assert not result.until["ended_early"]
