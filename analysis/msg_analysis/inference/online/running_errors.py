@@ -204,7 +204,8 @@ class RunningErrors:
         if self._expected is not None:
             known = np.flatnonzero(steps == 0)
             self._expected.add(steps, self._record, int(modes[known[0]]) if len(known) else None)
-        deviations, later = self._deviations(states), self._deviations(after)
+        deviations = self._deviations(states)
+        later = self._deviations(after) if self._judge is not None and self._judge.needs_later else deviations
         squares = (deviations**2).mean(axis=2)
         self._squares += squares.sum(axis=0)
         if self._judge is not None:
@@ -248,6 +249,7 @@ class _Judge:
         self.nodes = nodes and 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
         forms, _, trace = forms_of(system, "nodes" if self.nodes else "system")
         self._system, self._replicas = system, replicas
+        self.needs_later = system.lossy  # whether the states after a step count, beside those before it
         self._largest = 0.0  # size of the largest deviation so far
         self._values = values_of(prediction, forms)
         self._each = np.eye(len(forms)) if self.nodes else np.empty((0, len(forms)))
@@ -270,8 +272,7 @@ class _Judge:
 
     def _add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
         a = self._packed(deviations)
-        shared = self._system.lossy
-        b = self._packed(later) if shared else a
+        b = self._packed(later) if self.needs_later else a
         looked = steps % self._stride == 0
         self._looked += int(looked.sum())
         self._count += len(steps)

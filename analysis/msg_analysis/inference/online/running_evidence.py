@@ -86,8 +86,8 @@ class RunningEvidence:
         self._names = [graph.name for graph in prediction.experiment.graph_list]
         self._count = 0
         self._crossed: int | None = None
-        # The newest step, which counts when the graph after it is known: its number, graph, states before and after.
-        self._kept: tuple[IntArray, IntArray, FloatArray, FloatArray] | None = None
+        # The newest step, which counts when the graph after it is known: its number, graph, states before it.
+        self._kept: tuple[int, IntArray, FloatArray] | None = None
 
     @property
     def variance(self) -> float:
@@ -99,24 +99,27 @@ class RunningEvidence:
         """Add whole steps, each only once; arrays as in ``LiveEstimate.add_whole``."""
         if not len(steps):
             return
-        order = np.argsort(steps, kind="stable")
-        found = (steps[order], modes[order], states[order, :, : self._replicas], after[order, :, : self._replicas])
-        if self._kept is not None:
-            joined = [np.concatenate([old, new]) for old, new in zip(self._kept, found, strict=True)]
-            found = (joined[0], joined[1], joined[2], joined[3])
-        ends = [0, *(np.flatnonzero(np.diff(found[0]) != 1) + 1).tolist(), len(found[0])]
+        if (np.diff(steps) < 0).any():
+            order = np.argsort(steps, kind="stable")
+            steps, modes, states, after = steps[order], modes[order], states[order], after[order]
+        ends = [0, *(np.flatnonzero(np.diff(steps) != 1) + 1).tolist(), len(steps)]
         for first, end in pairwise(ends):
-            for start in range(first, end - 1, self._length):
-                last = min(start + self._length, end - 1)
-                states = np.concatenate([found[2][start : last + 1], found[3][last : last + 1]])
-                start_state = states[0]
-                self.sums.add(
-                    Observation(self._prediction, bounded(states), found[1][start : last + 1], start_state),
-                    0,
-                    last - start,
-                )
-                self._count += last - start
-        self._kept = (found[0][-1:], found[1][-1:], found[2][-1:], found[3][-1:])
+            self._add_stretch(int(steps[first]), modes[first:end], states[first:end], after[end - 1])
+
+    def _add_stretch(self, first: int, modes: IntArray, states: FloatArray, end: FloatArray) -> None:
+        """Add steps in a row from ``first`` on; ``end``: the states after the last one."""
+        parts = [states[:, :, : self._replicas], end[None, :, : self._replicas]]
+        if self._kept is not None and self._kept[0] == first - 1:
+            modes, parts = np.concatenate([self._kept[1], modes]), [self._kept[2], *parts]
+            first -= 1
+        whole = bounded(np.concatenate(parts))
+        last = len(modes) - 1  # its next graph is not known yet
+        for start in range(0, last, self._length):
+            stop = min(start + self._length, last)
+            part = whole[start : stop + 2]
+            self.sums.add(Observation(self._prediction, part, modes[start : stop + 1], part[0]), 0, stop - start)
+        self._count += last
+        self._kept = first + last, modes[last:], whole[last : last + 1]
 
     def look(self, half_width: float | None) -> AnyTime:
         """The evidence now; ``half_width``: of the interval of the system error, which is passed on."""

@@ -77,6 +77,8 @@ class EvidenceSums:
         # In real time a value that is used may contain a part of the noise of the same step.
         usable = self.noisy if not (real_time and correlated) else np.zeros(m, dtype=bool)
         pull = np.abs(step.nominal.sum(axis=2) - 1.0).max(axis=0) > 1e-12
+        self._pulled = pull
+        self._quadratic = self.plain and bool((variances > self._floor).all())
         self.links: IntArray = np.argwhere((step.listens() | np.diag(pull)) & usable[:, None])  # (L, 2)
         first, second = np.triu_indices(m, 1)
         paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
@@ -99,6 +101,64 @@ class EvidenceSums:
 
     def add(self, observation: Observation, first: int, last: int) -> None:
         """Add the steps first..last-1 of a run, which follow those that were added before."""
+        if self._quadratic:
+            self._add_quadratic(observation, first, last)
+        else:
+            self._add_heard(observation, first, last)
+        graphs = observation.modes[first : last + 1]
+        np.add.at(self.counts, (graphs[:-1], graphs[1:]), 1)
+        if observation.published is not None and self._noise.broadcast:
+            added = observation.published[first:last] - observation.states[first:last]
+            self.broadcast_samples += added.shape[0] * added.shape[2]
+            self.broadcast_squares += (added**2).sum(axis=(0, 2)) / self._noise.broadcast**2
+        if self.error is not None and len(graphs) > 1:
+            steps = len(graphs) - 1
+            a = np.ones((steps + 1, self.error.numbers))
+            a[:, :-1] = moments(observation, first, first + steps + 1, observation.states)
+            self.error.add(graphs[:-1], graphs[1:], a[:-1], a[1:])
+
+    def _add_quadratic(self, observation: Observation, first: int, last: int) -> None:
+        """Noise, gains and pairs where all agents hear the states themselves, and all have noise.
+
+        Every sum is then a quadratic form in z = (x(k) - c, x(k+1) - c, 1), so that for each graph the sum of z z^T is
+        enough; c, the reference or the mean of x(k), keeps the numbers small.
+        """
+        step, m = self._step, self._step.agents
+        states, modes = observation.states[first : last + 1], observation.modes[first:last]
+        pull = step.nominal.sum(axis=2) - 1.0  # (n, m)
+        pulled = bool(self._pulled.any())
+        self.samples += observation.replicas * len(modes)
+        for mode in np.unique(modes).tolist():
+            at = np.flatnonzero(modes == mode)
+            now, after = states[at], states[at + 1]
+            centre = step.reference if pulled else now.mean(axis=1, keepdims=True)
+            z = np.ones((2 * m + 1, len(at), observation.replicas))
+            z[:m], z[m:-1] = (now - centre).transpose(1, 0, 2), (after - centre).transpose(1, 0, 2)
+            flat = z.reshape(2 * m + 1, -1)
+            gram = flat @ flat.T
+            deviation = np.sqrt(np.diagonal(self._process[mode]))[:, None]
+            # White innovations and the effects of links, as rows that are multiplied with z.
+            offset = step.offsets[mode] + (pull[mode] * step.reference if pulled else 0.0)
+            white = np.column_stack([-step.nominal[mode], np.eye(m), -offset]) / deviation
+            weights = step.nominal[mode] * ~np.eye(m, dtype=bool) / deviation
+            own = pull[mode] / deviation[:, 0] if pulled else np.zeros(m)
+            seen, now_now = white @ gram, gram[:m, :m]
+            products, size = seen @ white.T, np.diagonal(now_now)
+            self.squares += np.diagonal(products)
+            score = weights * (seen[:, :m] - np.diagonal(seen[:, :m])[:, None])
+            information = weights**2 * (size[None, :] + size[:, None] - 2.0 * now_now)
+            self.link_score += score + np.diag(own * np.diagonal(seen[:, :m]))
+            self.link_information += information + np.diag(own**2 * size)
+            if len(self.pairs):
+                self.pair_score += products
+                self.pair_information += np.diagonal(products)[None, :]
+            if self._common:
+                common = weights + np.diag(own - weights.sum(axis=1))
+                self.common_score += float((common * seen[:, :m]).sum())
+                self.common_information += float(((common @ now_now) * common).sum())
+
+    def _add_heard(self, observation: Observation, first: int, last: int) -> None:
+        """The same by what was heard, and losses."""
         reception = HeardValues.of(observation, first, last)
         e = innovations(observation, first, last, reception)
         agents = np.arange(self._step.agents)
@@ -117,17 +177,6 @@ class EvidenceSums:
             products = flat @ flat.T
             self.pair_score += products
             self.pair_information += np.diag(products)[None, :]
-        graphs = observation.modes[first : last + 1]
-        np.add.at(self.counts, (graphs[:-1], graphs[1:]), 1)
-        if observation.published is not None and self._noise.broadcast:
-            added = observation.published[first:last] - observation.states[first:last]
-            self.broadcast_samples += added.shape[0] * added.shape[2]
-            self.broadcast_squares += (added**2).sum(axis=(0, 2)) / self._noise.broadcast**2
-        if self.error is not None and len(graphs) > 1:
-            steps = len(graphs) - 1
-            a = np.ones((steps + 1, self.error.numbers))
-            a[:, :-1] = moments(observation, first, first + steps + 1, observation.states)
-            self.error.add(graphs[:-1], graphs[1:], a[:-1], a[1:])
 
     def _add_links(self, reception: HeardValues, white: FloatArray, scale: FloatArray, lost: BoolArray | None) -> None:
         """Scores of the gains; regressors and innovations over the standard deviation of the noise."""
