@@ -9,7 +9,7 @@ import pytest
 
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
-from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, kind_weights
 from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence, any_time_evidence
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.inference.verdict.pool import compare_pooled
@@ -201,3 +201,15 @@ def test_runs_together_are_one_game() -> None:
     sums[0].merge(sums[1])
     assert both.log_evidence == pytest.approx(sums[0].evidence())
     assert all(alone is not None and np.isfinite(alone.log_evidence) for alone in apart)
+
+
+def test_questions_of_single_parts_keep_their_share() -> None:
+    """Weights are fixed, of sum 1, and those of the main kinds do not depend on how many others there are."""
+    few = dict(zip(kinds := ["noise", "gains", "switching"], kind_weights(kinds), strict=True))
+    many = dict(zip(kinds := [*kinds, "pair", "system error"], kind_weights(kinds), strict=True))
+    assert few == pytest.approx({"noise": 0.375, "switching": 0.375, "gains": 0.25})
+    assert many == pytest.approx(
+        {"noise": 0.375, "switching": 0.375} | dict.fromkeys(["gains", "pair", "system error"], 1 / 12)
+    )
+    assert kind_weights(["loss"]) == pytest.approx([1.0])
+    assert kind_weights(["gains", "pair"]) == pytest.approx([0.5, 0.5])

@@ -39,7 +39,7 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 MOST_PAIRS = 5_000  # of agents whose noises are compared; beyond, none are
 MAIN = ("noise", "gain", "switching", "loss")  # kinds of questions that one part of the law answers, not all at once
-MAIN_WEIGHT = 3.0  # of these in the mean; 1 of the others
+MAIN_SHARE = 0.75  # of these together in the mean, however many others there are
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,6 +264,12 @@ class EvidenceSums:
         families = self.families()
         if not families:
             return 0.0
-        weights = np.array([MAIN_WEIGHT if kind in MAIN else 1.0 for kind in families])
         each = np.array([float(log_mean(logs.ravel())) for logs in families.values()])
-        return float(log_sum(each + np.log(weights / weights.sum()), axis=0))
+        return float(log_sum(each + np.log(kind_weights(list(families))), axis=0))
+
+
+def kind_weights(kinds: list[str]) -> FloatArray:
+    """Of kinds of questions in the mean, of sum 1: fixed before the run, since they depend on the law only."""
+    main: BoolArray = np.array([kind in MAIN for kind in kinds])
+    weights = np.where(main, MAIN_SHARE / max(main.sum(), 1), (1.0 - MAIN_SHARE) / max((~main).sum(), 1))
+    return np.asarray(weights / weights.sum())
