@@ -23,11 +23,15 @@ import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.inference.verdict import comparison as verdict
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.theory import prediction as theory
+from msg_analysis.theory import spectrum as spectra
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,7 +47,7 @@ def fields(instance: Any) -> dict[str, Any]:
 
 
 class PlannedExperiment(ValidExperiment):
-    """An experiment whose runs can be planned."""
+    """An experiment with the plan of its runs, and their spectrum."""
 
     __slots__ = ()
 
@@ -81,6 +85,67 @@ class PlannedExperiment(ValidExperiment):
 
         self.require_available("predict")
         return plan(theory.predict(self), precision, seconds=seconds, rate=rate, level=level)
+
+    def spectrum(self, lags: ArrayLike | None = None, frequencies: ArrayLike | None = None) -> Spectrum:
+        """Autocovariance and spectral density of the errors in the steady state, exactly.
+
+        Parameters
+        ----------
+        lags
+            (L,) ascending, >= 0 [steps]; None: up to 200, from 0 to where 1 % of lag 0 is left
+        frequencies
+            (F,) ascending, from 0 to 1 / (2 dt) [cycles per unit of simulated time]; None: 200, equally spaced on a
+            logarithmic axis
+
+        Returns
+        -------
+        Spectrum
+            ``covariances`` (L, m, m), ``system_autocovariance`` (L,), ``system_density`` (F,), ``node_densities``
+            (F, m)
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for something that cannot be predicted
+        InputError
+            lags or frequencies that are not valid, too large, or without finite steady errors
+        """
+        self.require_available("predict")
+        wanted = None if lags is None else np.asarray(lags, dtype=np.int64)
+        where = None if frequencies is None else np.asarray(frequencies, dtype=float)
+        return Spectrum.of(spectra.spectrum(theory.predict(self), wanted, where))
+
+
+class Spectrum(spectra.Spectrum):
+    """Predicted autocovariance and spectral density of the errors.
+
+    The attributes are those of :class:`msg_analysis.theory.spectrum.Spectrum`.
+    """
+
+    __slots__ = ()
+
+    @classmethod
+    def of(cls, spectrum: spectra.Spectrum) -> Self:
+        """The same spectrum with the methods of this class.
+
+        Parameters
+        ----------
+        spectrum
+            of an experiment
+        """
+        return spectrum if isinstance(spectrum, cls) else cls(**fields(spectrum))
+
+    def plot(self) -> Figure:
+        """Draw the autocovariance over the lag, and the density over the frequency.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            notebooks show it; ``figure.savefig("spectrum.png")`` writes it
+        """
+        from msg_analysis.report.figures.spectrum_figure import spectrum_figure  # here: it loads matplotlib
+
+        return spectrum_figure(self)
 
 
 class ShownRun(Trajectory):

@@ -325,6 +325,7 @@ main.add_command(runs.diff)
 main.add_command(theory.transient)
 main.add_command(theory.facts)
 main.add_command(theory.plan)
+main.add_command(theory.spectrum)
 main.add_command(sweep.sweep)
 
 

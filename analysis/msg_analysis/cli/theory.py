@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Commands of ``msg-analysis`` for theory beyond the steady state: ``transient``, ``facts`` and ``plan``."""
+"""Commands of ``msg-analysis`` for theory beyond the steady state: ``transient``, ``facts``, ``plan``, ``spectrum``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import click
 
 from msg_analysis.cli.console import examples, print_json, result_console
-from msg_analysis.cli.options import FILE, experiment_argument, json_option, level_option
+from msg_analysis.cli.options import FILE, SOURCE, experiment_argument, is_bag, json_option, level_option
 from msg_analysis.common.files import require_place
 from msg_analysis.errors import InputError
 
@@ -203,3 +203,43 @@ def _parse_duration(text: str | None) -> float | None:
     if not 0.0 < seconds < float("inf"):
         raise InputError(f"--budget {text}: expected a number above 0 with s, min, h or d: for example 10min")
     return seconds
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis spectrum line_ring",
+        "msg-analysis spectrum runs/line_ring_1 --figure spectrum.png",
+        "msg-analysis spectrum line_ring --json | jq .system_density",
+    )
+)
+@click.argument("source", metavar="EXPERIMENT|BAG", type=SOURCE)
+@click.option("--figure", type=FILE, metavar="FILE", help="Also draw it: a file that ends with .png, .svg or .pdf.")
+@level_option("Of the test of a bag: probability of a false 'disagrees'.")
+@json_option
+@click.pass_context
+def spectrum(context: click.Context, source: Path, figure: Path | None, level: float, as_json: bool) -> None:
+    """Predict the autocovariance and the spectral density of the errors, exactly; of a BAG, also measure and test them.
+
+    Exit code 0: predicted, or agrees, 1: disagrees, 3: data incomplete.
+    """
+    from msg_analysis.api import Experiment
+    from msg_analysis.common.exit_codes import ExitCode
+    from msg_analysis.report.documents.spectrum import measure_spectrum, predicted_spectrum
+
+    require_place(figure)
+    if figure:
+        from msg_analysis.report.figures.spectrum_figure import require_format, spectrum_figure, write_spectrum
+
+        require_format(figure)
+    found = measure_spectrum(source, level) if is_bag(source) else predicted_spectrum(Experiment.load(source))
+    if figure:
+        write_spectrum(spectrum_figure(found.predicted, found.log, found.density), figure)
+    if as_json:
+        print_json(found.to_json())
+    else:
+        from msg_analysis.report.terminal.theory_text import print_spectrum
+
+        print_spectrum(found.to_json(), result_console())
+    if not found.complete:
+        context.exit(ExitCode.INCOMPLETE)
+    context.exit(ExitCode.DISAGREES if found.disagrees else ExitCode.FINE)

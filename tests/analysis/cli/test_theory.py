@@ -1,6 +1,7 @@
-"""The commands transient, facts and plan: what is printed where, and what is refused."""
+"""The commands transient, facts, plan and spectrum: what is printed where, and what is refused."""
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from msg_analysis import Experiment, Run, read_bag
 from msg_analysis.cli import main as cli
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
@@ -181,6 +183,84 @@ def test_plan_of_a_start(from_zero):
 )
 def test_plan_refuses(options, message):
     result = call("plan", LINE_RING, *options)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stdout == ""
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    """A run of the line and the ring."""
+    directory = tmp_path_factory.mktemp("runs") / "run"
+    Experiment.load(LINE_RING).with_run(duration=100, seed=4).simulate().save(directory)
+    return directory
+
+
+def test_spectrum_of_an_experiment(tmp_path):
+    document = document_of("spectrum", LINE_RING)
+    assert document["system_autocovariance"][0] == pytest.approx(document["system_error"])
+    assert [len(row) for row in document["node_autocovariances"]] == [5] * len(document["lags"])
+    assert [len(row) for row in document["node_densities"]] == [5] * len(document["frequencies"])
+    assert document["log"] is document["log_density"] is document["agrees"] is document["level"] is None
+    text = call("spectrum", LINE_RING, "--figure", tmp_path / "figure.svg").stdout
+    assert "Autocovariance of line_ring" in text
+    assert "The log" not in text
+    assert (tmp_path / "figure.svg").read_text().startswith("<?xml")
+
+
+def test_spectrum_of_a_bag(bag, tmp_path):
+    document = document_of("spectrum", bag)
+    assert document["agrees"] is True
+    log = document["log"]
+    assert log["p"] > document["level"] == 0.01
+    assert log["steps"] == 2000
+    assert log["lags"][:2] == [0.0, 0.05]
+    low, high = np.transpose(log["intervals"])
+    assert (low < log["corrected"]).all()
+    assert (high > log["corrected"]).all()
+    assert len(document["log_density"]["frequencies"]) == len(document["log_density"]["system"])
+    text = call("spectrum", bag, "--figure", tmp_path / "figure.png").stdout
+    assert "The log agrees with the predicted autocovariance: p = " in text
+    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_spectrum_of_a_wrong_run(bag, tmp_path):
+    """States that are 10 % too large: exit code 1."""
+    run = read_bag(bag)
+    wrong = tmp_path / "wrong"
+    Run.of(dataclasses.replace(run, states=1.1 * run.states)).save(wrong)
+    result = call("spectrum", wrong)
+    assert result.exit_code == 1
+    assert "The log disagrees with the predicted autocovariance" in result.stdout
+
+
+def test_spectrum_of_runs_that_are_not_tested(tmp_path):
+    Experiment.load("line_ring_realtime").with_run(duration=20).simulate().save(tmp_path / "real_time")
+    document = document_of("spectrum", tmp_path / "real_time")
+    assert document["log"] is None
+    assert document["agrees"] is None
+    assert document["note"] == "the log is not tested: in real time agents use values of different steps"
+    assert document["log_density"] is not None
+    run = read_bag(tmp_path / "real_time")
+    states = Experiment.load(LINE_RING).with_run(duration=20).simulate()
+    broken = states.states.copy()
+    broken[150, 2] = np.nan
+    Run.of(dataclasses.replace(states, states=broken)).save(tmp_path / "torn")
+    result = call("spectrum", tmp_path / "torn", "--json")
+    assert result.exit_code == 3
+    assert json.loads(result.stdout)["log"]["steps"] == 149
+    assert run.completeness.complete
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--figure", "picture.gif"], "picture.gif: expected a name that ends with .png, .svg or .pdf"),
+        (["--figure", "/nowhere/a.png"], "no such directory /nowhere"),
+    ],
+)
+def test_spectrum_refuses(options, message):
+    result = call("spectrum", LINE_RING, *options)
     assert result.exit_code == 2
     assert message in result.stderr
     assert result.stdout == ""

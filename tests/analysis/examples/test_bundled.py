@@ -64,7 +64,7 @@ def test_neither_file_nor_example() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["predict", "simulate", "leaders --count 1", "transient --times 1", "facts", "plan"]
+    "command", ["predict", "simulate", "leaders --count 1", "transient --times 1", "facts", "plan", "spectrum"]
 )
 def test_commands_of_the_analysis(command: str) -> None:
     word, *options = command.split()

@@ -207,7 +207,8 @@ def test_packages_that_cannot_be_used(offer: Callable[..., None]) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", [["predict"], ["facts"], ["plan"], ["leaders", "--count", "1"], ["transient", "--times", "0"]]
+    "command",
+    [["predict"], ["facts"], ["plan"], ["spectrum"], ["leaders", "--count", "1"], ["transient", "--times", "0"]],
 )
 def test_no_prediction_is_refused_clearly(command: list[str], tmp_path: Path) -> None:
     file = tmp_path / "net.json"

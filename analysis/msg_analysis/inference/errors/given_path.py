@@ -118,7 +118,7 @@ def means_given_path(observation: Observation) -> TimeMeans | None:
     if kind is None:
         return None
     forms, nodes, trace = forms_of(system, kind)
-    kinds = _steps(observation)
+    kinds = steps_of_path(observation)
     if kinds is None:
         return None
     which, matrices, noise = kinds
@@ -192,7 +192,7 @@ def _backwards(
     return seen, covariance, series, variances
 
 
-def _steps(observation: Observation) -> tuple[IntArray, FloatArray, FloatArray] | None:
+def steps_of_path(observation: Observation) -> tuple[IntArray, FloatArray, FloatArray] | None:
     """(N,) kind of every step; and of every kind the reduced matrix and noise covariance, (kinds, d, d) each."""
     system, step, lost = observation.prediction.system, observation.step, observation.lost
     if lost is None or not step.loss:

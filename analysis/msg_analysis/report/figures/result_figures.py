@@ -50,7 +50,7 @@ class NotebookFigure(Figure):
         return rendered(self, "png", _DPI)
 
 
-def _figure(*sizes: float) -> tuple[NotebookFigure, Sequence[Axes]]:
+def stacked_panels(*sizes: float) -> tuple[NotebookFigure, Sequence[Axes]]:
     """A figure with panels of these heights [inches] below each other."""
     figure = NotebookFigure(figsize=(7.2, sum(sizes)), layout="constrained")
     panels = figure.subplots(len(sizes), 1, squeeze=False, gridspec_kw={"height_ratios": sizes})
@@ -75,7 +75,7 @@ def run_figure(trajectory: Trajectory, agents: Sequence[int] | None, replica: in
     release(trajectory.states)
     times = np.arange(0, len(trajectory.states), every) * experiment.step_length
     with mpl.rc_context(STYLE):
-        figure, (axes, band) = _figure(3.4, 0.7)
+        figure, (axes, band) = stacked_panels(3.4, 0.7)
         for place, agent in enumerate(chosen):
             label = plain(shorten(f"agent {agent_name(agent + 1, experiment.names)}"))
             axes.plot(times, values[:, place], lw=0.9, color=LINE_COLOURS[place % MOST_LINES], label=label)
@@ -113,7 +113,7 @@ def comparison_figure(comparison: Comparison) -> NotebookFigure:
     nodes, given_path = agent_errors(document)
     running = comparison.running
     with mpl.rc_context(STYLE):
-        figure, (above, below) = _figure(2.3, 2.6)
+        figure, (above, below) = stacked_panels(2.3, 2.6)
         time, mean, error = running["time"], running["system_error"], running["standard_error"]
         predicted = comparison.system_error.predicted
         if len(time):
@@ -151,7 +151,7 @@ def prediction_figure(prediction: Prediction) -> NotebookFigure:
     experiment, laws = prediction.experiment, prediction.laws()
     numbers = np.arange(1, experiment.agents + 1)
     with mpl.rc_context(STYLE):
-        figure, (axes,) = _figure(3.2)
+        figure, (axes,) = stacked_panels(3.2)
         for place, (name, moments) in enumerate(laws.items()):
             shift = 0.16 * (place - (len(laws) - 1) / 2)
             label = f"{name}: system error {moments.system_error:.4g}"

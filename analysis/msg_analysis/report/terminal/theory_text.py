@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Predictions, sets of leaders, transients, facts and plans as terminal tables, from the documents of ``--json``."""
+"""Predictions, leaders, transients, facts, plans and spectra as terminal tables, from the documents of ``--json``."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from rich.console import Console
 from rich.text import Text
 
 from msg_analysis.common.text.agent_names import agent_name, agent_text
-from msg_analysis.common.text.number_words import duration_text, listed, number_text, percent
-from msg_analysis.report.terminal.tables import fact_table, first_rows, number_table, print_table
+from msg_analysis.common.text.number_words import duration_text, listed, number_text, p_text, percent, z_text
+from msg_analysis.report.terminal.tables import fact_table, first_rows, interval_text, number_table, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _METHODS = {
@@ -259,3 +259,36 @@ def _time(seconds: float | None) -> str:
 
 def _count(steps: float | None) -> str:
     return "-" if steps is None else f"{steps:.0f}"
+
+
+def print_spectrum(document: dict[str, Any], console: Console) -> None:
+    """Print a document of ``MeasuredSpectrum.to_json()``: some lags and frequencies, and the test of a log."""
+    lags = number_table(console, f"Autocovariance of {document['experiment']}", "lag", "system", "correlation")
+    course, error = document["system_autocovariance"], document["system_error"]
+    for place in _some(len(course)):
+        share = "-" if not error else number_text(course[place] / error, 3)
+        lags.add_row(number_text(document["lags"][place]), number_text(course[place]), share)
+    console.print(lags)
+    density = number_table(console, "Spectral density, one-sided", "frequency", "system")
+    for place in _some(len(document["frequencies"])):
+        density.add_row(number_text(document["frequencies"][place], 3), number_text(document["system_density"][place]))
+    console.print(density)
+    log = document["log"]
+    if log:
+        heads = ("predicted", "measured", "corrected for the path", "95 % interval", "z")
+        table = number_table(console, f"The log, {log['steps']} steps", "lag", *heads)
+        keys = ("lags", "predicted", "measured", "corrected", "intervals", "z")
+        for lag, *numbers, interval, z in zip(*(log[key] for key in keys), strict=True):
+            cells = (*map(number_text, numbers), interval_text(interval), z_text(z))
+            table.add_row(number_text(lag), *cells)
+        print_table(console, table)
+        if log["p"] is not None:
+            verdict = "agrees with" if log["p"] >= document["level"] else "disagrees with"
+            console.print(f"The log {verdict} the predicted autocovariance: p = {p_text(log['p'])}.")
+    if document["note"]:
+        console.print(Text(f"Note: {document['note']}", style="yellow"))
+
+
+def _some(count: int, most: int = 12) -> list[int]:
+    """Places of some of so many rows, at equal distances."""
+    return sorted({round(k * (count - 1) / (most - 1)) for k in range(most)}) if count else []

@@ -1,0 +1,244 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Autocovariance of the errors of a run next to its law given the path of the graphs and the lost messages.
+
+Given the path, y(k + 1) = W_k y(k) + w_k with independent w_k ~ N(0, N_k) (``given_path``). For lag l let
+Phi_k = W_k+l-1 ... W_k, so that sum_k y(k)^T y(k + l) has the expectation sum_k tr(H_k M(k)), H_k the symmetric part of
+Phi_k. With Y(j) = H_j + W_j^T Y(j + 1) W_j and a_j = sum over j - l < k <= j of (W_k+l-1 ... W_j+1)^T y(k), the sum
+minus its expectation is the sum of martingale differences
+
+    D_j = w_j^T Y(j + 1) w_j - tr(Y(j + 1) N_j) + b_j^T w_j,    b_j = 2 Y(j + 1) W_j y(j) + a_j
+
+with Cov(D_j of lag l, of lag l' | past) = 2 tr(Y N Y' N) + b^T N b': for any correlation in time, and exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from msg_analysis.common.intervals import HALF_WIDTH_95
+from msg_analysis.inference.errors.given_path import steps_of_path
+from msg_analysis.inference.errors.time_means import without_rounding
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.statistics.distributions import chi2_tail
+from msg_analysis.inference.statistics.known_covariance import quadratic_form
+from msg_analysis.theory.spectrum import Spectrum, spectrum
+from msg_analysis.types import FloatArray, IntArray
+
+MOST_NUMBERS = 2e7  # in the matrices of all lags and steps: of longer runs the beginning is tested
+LAGS = 8  # that are tested, beside lag 0
+CORRELATED = 0.05  # the longest one still has this share of the variance
+LEAST_STEPS = 100
+MOST_WINDOW = 4096  # steps, of Welch's method
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoggedAutocovariance:
+    """Measured autocovariances of the system error, R(l) = E[e(k + l) . e(k)], and their test.
+
+    Corrected are measured values minus what the path of the graphs should have changed: measured - (expected given the
+    path - predicted).
+    """
+
+    steps: int  # that were used, from the beginning of the run
+    times: FloatArray  # (L,) lags [units of simulated time]
+    predicted: FloatArray  # (L,)
+    measured: FloatArray  # (L,)
+    expected: FloatArray  # (L,) given the path
+    covariance: FloatArray  # (L, L) of measured, given the path
+    p: float | None  # of all lags together; None without noise
+
+    @property
+    def corrected(self) -> FloatArray:
+        """(L,) see above."""
+        return np.asarray(self.measured - self.expected + self.predicted)
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """(L,) of ``corrected``: given the path."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance).clip(0.0)))
+
+    def to_json(self) -> dict[str, Any]:
+        """The key ``log`` of ``msg-analysis spectrum --json``."""
+        errors, corrected = self.standard_errors, self.corrected
+        z = np.divide(corrected - self.predicted, errors, out=np.full_like(errors, np.nan), where=errors > 0.0)
+        half = HALF_WIDTH_95 * errors
+        return {
+            "steps": self.steps,
+            "lags": self.times.tolist(),
+            "predicted": self.predicted.tolist(),
+            "measured": self.measured.tolist(),
+            "expected": self.expected.tolist(),
+            "corrected": corrected.tolist(),
+            "standard_errors": errors.tolist(),
+            "intervals": np.column_stack([corrected - half, corrected + half]).tolist(),
+            "z": z.tolist(),
+            "p": self.p,
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoggedDensity:
+    """Spectral density of a run by Welch's method; its standard error is not known, so it is not tested."""
+
+    frequencies: FloatArray  # (F,) [cycles per unit of simulated time]
+    system: FloatArray  # (F,) one-sided, sum over the agents, mean over the replicas
+
+    @classmethod
+    def of(cls, observation: Observation) -> LoggedDensity:
+        """Mean over windows of a sixteenth of the run, which overlap by a half."""
+        from scipy.signal import welch  # here, since it takes long to import
+
+        deviations = observation.states - observation.step.reference
+        if observation.prediction.experiment.problem == "consensus":
+            deviations = deviations - deviations.mean(axis=1, keepdims=True)
+        window = max(8, min(len(deviations) // 16, MOST_WINDOW))
+        frequencies, found = welch(
+            deviations, fs=1.0 / observation.step.dt, nperseg=min(window, len(deviations)), detrend=False, axis=0
+        )
+        return cls(frequencies, found.sum(axis=1).mean(axis=1))
+
+
+def why_not_tested(observation: Observation) -> str | None:
+    """Why the law given the path does not cover a run; None where it does."""
+    if observation.prediction.experiment.run.pace == "realtime":
+        return "in real time agents use values of different steps"
+    if observation.prediction.system.readout is not None:
+        return "agents use values that are older than a step"
+    if observation.steps < LEAST_STEPS:
+        return f"{observation.steps} steps are too few: at least {LEAST_STEPS} are needed"
+    return None
+
+
+def logged_autocovariance(observation: Observation, lags: IntArray | None = None) -> LoggedAutocovariance | None:
+    """Autocovariances of a run in lockstep, with their expectation and covariance given its path.
+
+    Time and memory are those of the steps, lags and squared coordinates.
+
+    Parameters
+    ----------
+    observation
+        of a run of which ``why_not_tested`` is None
+    lags
+        (L,) ascending, >= 0 [steps]; None: 0 and up to 8 more, to where 5 % of the correlation is left
+
+    Returns
+    -------
+    LoggedAutocovariance | None
+        None where the losses make too many kinds of steps
+    """
+    kinds = steps_of_path(observation)
+    if kinds is None:
+        return None
+    system, replicas = observation.prediction.system, observation.replicas
+    chosen = _chosen_lags(observation) if lags is None else np.asarray(lags)
+    d = system.dimension
+    steps = min(observation.steps, int(MOST_NUMBERS / max(1, len(chosen) * d * max(d, replicas))))
+    chosen = chosen[chosen < steps]
+    which, matrices, noise = kinds[0][:steps], kinds[1], kinds[2]
+    deviations = observation.states[: steps + 1] - observation.step.reference
+    y = without_rounding(np.einsum("kmr,md->krd", deviations, system.frame), system, observation.largest)
+    along = matrices[which]  # (N, d, d) W_k
+    windows = [_windows(along, lag) for lag in chosen.tolist()]
+    forms = np.zeros((len(chosen), steps + 1, d, d))
+    measured, expected, counts = np.empty(len(chosen)), np.empty(len(chosen)), steps + 1 - chosen
+    for place, (lag, window) in enumerate(zip(chosen.tolist(), windows, strict=True)):
+        forms[place, : len(window)] = (window + window.transpose(0, 2, 1)) / 2.0
+        measured[place] = (y[: len(window)] * y[lag:]).sum() / replicas
+    moments = _moments(which, matrices, noise, y[0].T @ y[0] / replicas)
+    for place, form in enumerate(forms):
+        expected[place] = np.einsum("kab,kab->", form, moments)
+    covariance = _covariance(which, matrices, noise, forms, y, chosen)
+    chi2, dof = quadratic_form(measured - expected, covariance)
+    found: Spectrum = spectrum(observation.prediction, chosen, np.empty(0))
+    return LoggedAutocovariance(
+        steps=steps,
+        times=found.times,
+        predicted=found.system_autocovariance,
+        measured=measured / counts,
+        expected=expected / counts,
+        covariance=covariance / np.outer(counts, counts),
+        p=float(chi2_tail(chi2, dof)) if dof else None,
+    )
+
+
+def _chosen_lags(observation: Observation) -> IntArray:
+    """0 and up to ``LAGS`` more, equally spaced on a logarithmic axis."""
+    found = spectrum(observation.prediction, frequencies=np.empty(0))
+    course = found.system_autocovariance
+    last = int(found.lags[np.flatnonzero(np.abs(course) >= CORRELATED * course[0])[-1]]) if course[0] > 0.0 else 1
+    last = max(1, min(last, observation.steps // 10))
+    return np.unique(np.concatenate([[0], np.geomspace(1, last, LAGS).round().astype(np.int64)]))
+
+
+def _windows(along: FloatArray, lag: int) -> FloatArray:
+    """(N - lag + 1, d, d): W_k+lag-1 ... W_k for every k, by products within blocks of so many steps."""
+    steps, d = along.shape[:2]
+    if lag == 0:
+        return np.broadcast_to(np.eye(d), (steps + 1, d, d))
+    blocks = -(-steps // lag) + 1
+    padded = np.broadcast_to(np.eye(d), (blocks * lag, d, d)).copy()
+    padded[:steps] = along
+    parts = padded.reshape(blocks, lag, d, d)
+    early, late = np.empty_like(parts), np.empty_like(parts)  # products before and from each place of a block
+    early[:, 0], late[:, -1] = np.eye(d), parts[:, -1]
+    for place in range(1, lag):
+        early[:, place] = parts[:, place - 1] @ early[:, place - 1]
+        late[:, -1 - place] = late[:, -place] @ parts[:, -1 - place]
+    products = (early[1:] @ late[:-1]).reshape(-1, d, d)
+    return np.asarray(products[: steps - lag + 1])
+
+
+def _moments(which: IntArray, matrices: FloatArray, noise: FloatArray, start: FloatArray) -> FloatArray:
+    """(N + 1, d, d) M(0..N) given the path."""
+    found = np.empty((len(which) + 1, *start.shape))
+    found[0] = start
+    for k, kind in enumerate(which.tolist()):
+        found[k + 1] = matrices[kind] @ found[k] @ matrices[kind].T + noise[kind]
+    return found
+
+
+def _covariance(
+    which: IntArray, matrices: FloatArray, noise: FloatArray, forms: FloatArray, y: FloatArray, lags: IntArray
+) -> FloatArray:
+    """(L, L): sum of Cov(D_j | past), backwards over the steps; forms (L, N + 1, d, d) H, y (N + 1, R, d)."""
+    steps, replicas, number = len(which), y.shape[1], len(lags)
+    along = matrices[which]
+    left = np.zeros((number, steps + 1, *y.shape[1:]))  # (W_k+l-1 ... W_k+1)^T y(k), what leaves a_j with k
+    for place, lag in enumerate(lags.tolist()):
+        if lag:
+            window = _windows(along[1:], lag - 1)  # from k + 1 on
+            left[place, : len(window)] = y[: len(window)] @ window
+    total = np.zeros((number, number))
+    dual = forms[:, -1].copy()  # Y(j + 1)
+    felt = np.zeros((number, *y.shape[1:]))  # a_j + 1, without what leaves it
+    transposed = [matrix.T for matrix in matrices]
+    for j, kind in zip(range(steps - 1, -1, -1), which[::-1].tolist(), strict=True):
+        felt = felt @ matrices[which[j + 1]] if j + 1 < steps else felt
+        for place, lag in enumerate(lags.tolist()):
+            if lag and j - lag + 1 >= 0:
+                felt[place] += y[j - lag + 1]
+        seen = dual @ noise[kind]
+        total += 2.0 / replicas * (seen.reshape(number, -1) @ seen.transpose(0, 2, 1).reshape(number, -1).T)
+        slope = (2.0 * (y[j] @ transposed[kind]) @ dual + felt).reshape(number * replicas, -1)
+        weighted = (slope @ noise[kind]).reshape(number, -1)
+        total += weighted @ slope.reshape(number, -1).T / replicas**2
+        felt = felt - left[:, j]
+        dual = forms[:, j] + transposed[kind] @ dual @ matrices[kind]
+    return (total + total.T) / 2.0

@@ -1,0 +1,202 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Autocovariance and power spectral density of the errors in the steady state, exact. Discrete time.
+
+With q_i(l) = E[y(k + l) y(k)^T; g(k + l) = i] and W_i the mean over losses (Costa, Fragoso and Marques, Discrete-Time
+Markov Jump Linear Systems, 2005, section 3.4: the operator of first moments B),
+
+    q_j(l + 1) = sum_i P_ij W_i q_i(l),    q_i(0) = C_i,    R(l) = sum_i q_i(l),
+
+so R(l) = S B^l q(0) with S the sum over the graphs, and the density needs no sum over lags:
+
+    sum_l R(l) exp(-i w l) = G(w) + G(w)^* - R(0),    G(w) = S (1 - exp(-i w) B)^-1 q(0)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from msg_analysis.common.text.number_words import number_text
+from msg_analysis.errors import InputError
+from msg_analysis.theory.prediction import Prediction
+from msg_analysis.theory.system.jump_system import JumpSystem
+from msg_analysis.types import FloatArray, IntArray
+
+MAX_SIZE = 600  # graphs times coordinates, of the resolvent
+FADED = 0.01  # of the autocovariance at lag 0: where the default lags end
+MAX_LAG = 100_000
+SHOWN_LAGS = 200
+SHOWN_FREQUENCIES = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Spectrum:
+    """Predicted autocovariance and spectral density of the errors e of a run, in the steady state.
+
+    Attributes
+    ----------
+    prediction
+        of the experiment
+    lags
+        (L,) ascending, from 0 [steps]
+    covariances
+        (L, m, m) E[e(k + l) e(k)^T]: of the disagreement of the agents with their mean, or of their distance from the
+        reference
+    frequencies
+        (F,) ascending [cycles per unit of simulated time]
+    node_densities
+        (F, m) one-sided spectral density of each agent: its integral from 0 to 1 / (2 dt) is the node error
+    """
+
+    prediction: Prediction
+    lags: IntArray
+    covariances: FloatArray
+    frequencies: FloatArray
+    node_densities: FloatArray
+
+    def __repr__(self) -> str:
+        last = number_text(float(self.times[-1]))
+        return f"<Spectrum of {self.prediction.experiment.name!r}: {len(self.lags)} lags up to {last}>"
+
+    @property
+    def times(self) -> FloatArray:
+        """(L,) the lags [units of simulated time]."""
+        return np.asarray(self.lags * self.prediction.step.dt, dtype=float)
+
+    @property
+    def node_autocovariances(self) -> FloatArray:
+        """(L, m) of each agent; at lag 0 its node error."""
+        return np.asarray(np.diagonal(self.covariances, axis1=1, axis2=2))
+
+    @property
+    def system_autocovariance(self) -> FloatArray:
+        """(L,) E[e(k + l) . e(k)], the sum over the agents; at lag 0 the system error."""
+        return np.asarray(self.node_autocovariances.sum(axis=1))
+
+    @property
+    def system_density(self) -> FloatArray:
+        """(F,) the sum over the agents; its integral from 0 to 1 / (2 dt) is the system error."""
+        return np.asarray(self.node_densities.sum(axis=1))
+
+    def to_json(self) -> dict[str, Any]:
+        """The keys of ``msg-analysis spectrum --json`` that are predicted."""
+        experiment = self.prediction.experiment
+        return {
+            "experiment": experiment.name,
+            "names": experiment.names,
+            "system_error": self.prediction.emulated.system_error,
+            "lags": self.times.tolist(),
+            "system_autocovariance": self.system_autocovariance.tolist(),
+            "node_autocovariances": self.node_autocovariances.tolist(),
+            "frequencies": self.frequencies.tolist(),
+            "system_density": self.system_density.tolist(),
+            "node_densities": self.node_densities.tolist(),
+        }
+
+
+def spectrum(prediction: Prediction, lags: IntArray | None = None, frequencies: FloatArray | None = None) -> Spectrum:
+    """Autocovariance and spectral density of the errors, from the steady moments of a prediction.
+
+    Parameters
+    ----------
+    prediction
+        of the experiment
+    lags
+        (L,) ascending, >= 0 [steps]; None: up to 200, from 0 to where 1 % of lag 0 is left
+    frequencies
+        (F,) ascending, from 0 to 1 / (2 dt) [cycles per unit of simulated time]; None: 200, equally spaced on a
+        logarithmic axis
+
+    Raises
+    ------
+    InputError
+        lags or frequencies that are not valid; too large
+    """
+    system, dt = prediction.system, prediction.step.dt
+    if lags is not None and (not len(lags) or lags[0] < 0 or (np.diff(lags) <= 0).any()):
+        raise InputError("lags: expected ascending whole numbers of steps, not below 0")
+    chosen = _fading_lags(system, prediction.steady) if lags is None else np.asarray(lags)
+    nyquist = 0.5 / dt
+    if frequencies is None:
+        lowest = 0.05 / (dt * max(int(chosen[-1]), 10))
+        frequencies = np.minimum(np.geomspace(lowest, nyquist, SHOWN_FREQUENCIES), nyquist)
+    frequencies = np.asarray(frequencies, dtype=float)
+    if not ((frequencies >= 0.0) & (frequencies <= nyquist * (1.0 + 1e-12))).all() or (np.diff(frequencies) < 0).any():
+        raise InputError(f"frequencies: expected ascending numbers from 0 to 1 / (2 dt) = {nyquist:g}")
+    return Spectrum(
+        prediction,
+        chosen,
+        _covariances(system, prediction.steady, chosen),
+        frequencies,
+        2.0 * dt * _densities(system, prediction.steady, 2.0 * np.pi * dt * frequencies),
+    )
+
+
+def _ahead(system: JumpSystem, moments: FloatArray) -> FloatArray:
+    """(n, d, a): q(l + 1) from q(l) (n, d, a)."""
+    moved = system.matrices @ moments
+    return np.asarray((system.chain.T @ moved.reshape(len(moved), -1)).reshape(moved.shape))
+
+
+def _fading_lags(system: JumpSystem, steady: FloatArray) -> IntArray:
+    moments, weights = steady, system.output.T @ system.output
+    start = float((weights * steady.sum(axis=0)).sum())
+    last = 1
+    for lag in range(1, MAX_LAG + 1):
+        moments = _ahead(system, moments)
+        if abs(float((weights * moments.sum(axis=0)).sum())) > FADED * start:
+            last = lag
+        elif lag >= 2 * last:
+            break
+    return np.unique(np.linspace(0, last, SHOWN_LAGS).round().astype(np.int64))
+
+
+def _covariances(system: JumpSystem, steady: FloatArray, lags: IntArray) -> FloatArray:
+    """(L, m, m) of the agents."""
+    found, moments, lag = [], steady, 0
+    for wanted in lags.tolist():
+        while lag < wanted:
+            moments, lag = _ahead(system, moments), lag + 1
+        found.append(system.lifted(moments.sum(axis=0)))
+    return np.stack(found)
+
+
+def _densities(system: JumpSystem, steady: FloatArray, angles: FloatArray) -> FloatArray:
+    """(F, m): sum over all lags of R(l) exp(-i w l) of every agent, for angles w (F,) per step."""
+    n, d = system.modes, system.dimension
+    if n * d > MAX_SIZE:
+        raise InputError(
+            f"spectrum: {n} graphs or states of the network and {d} coordinates make {n * d} unknowns; at most "
+            f"{MAX_SIZE} are computed: use fewer agents or graphs"
+        )
+    output = system.output
+    if not d:
+        return np.zeros((len(angles), len(output)))
+    operator = (system.chain.T[:, None, :, None] * system.matrices.transpose(1, 0, 2)).reshape(n * d, n * d)
+    triangle, vectors = scipy.linalg.schur(operator.astype(complex), output="complex")
+    right = vectors.conj().T @ (steady @ output.T).reshape(n * d, -1)  # (n d, m)
+    left = np.tile(output, (1, n)) @ vectors  # (m, n d)
+    variance = np.diagonal(system.lifted(steady.sum(axis=0)))
+    eye = np.eye(n * d)
+    found = np.empty((len(angles), len(output)))
+    for place, angle in enumerate(angles.tolist()):
+        solved = scipy.linalg.solve_triangular(eye - np.exp(-1j * angle) * triangle, right)
+        found[place] = 2.0 * np.einsum("ia,ai->i", left, solved).real - variance
+    return np.maximum(found, 0.0)
