@@ -39,6 +39,7 @@ from msg_analysis.common.text.number_words import percent
 from msg_analysis.inference.errors.time_means import time_means
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.planning.fault_power import Fault, fault_powers
+from msg_analysis.inference.planning.precision import precision_of
 from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
 from msg_analysis.inference.verdict.compare import judge
 from msg_analysis.inference.verdict.evidence import Evidence
@@ -157,6 +158,8 @@ def main() -> None:
             prediction, replicas = law(kind), experiment(kind, 1).run.replicas
             error, variance = prediction.emulated.system_error, mean_variance(prediction).of(replicas)
             if options.lengths:
+                if not precision_of(prediction, options.lengths).any_time:
+                    continue
                 planned = float(simultaneous_half_width(variance, variance) / (options.lengths * error)) ** 2
                 task = partial(length, kind, options.lengths, round(1.5 * planned))
                 found = float(np.median(list(pool.map(task, seeds))))

@@ -33,7 +33,7 @@ import scipy.linalg
 
 from msg_analysis.inference.hypothesis_tests.gain_regression import MAX_REGRESSORS, regressors
 from msg_analysis.inference.observed.heard_values import NO_NOISE
-from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.sequential.evidence_sums import MAIN, MAIN_WEIGHT, EvidenceSums
 from msg_analysis.inference.statistics.distributions import (
     chi2_quantile,
     needed_noncentrality,
@@ -139,6 +139,7 @@ def fault_powers(
     """
     step, sums = prediction.step, EvidenceSums(prediction, replicas)
     questions = {kind: logs.size for kind, logs in sums.families().items()}
+    weights = sum(MAIN_WEIGHT if kind in MAIN else 1.0 for kind in questions)
     share = level / _family(prediction)
     found = []
     for fault in faults:
@@ -155,7 +156,8 @@ def fault_powers(
         (agent, sender), tests = min(
             informations.items(), key=lambda entry: max(test.noncentrality for test in entry[1])
         )
-        price = math.log(len(questions) * questions.get(fault.kind, 1) / level)
+        weight = (MAIN_WEIGHT if fault.kind in MAIN else 1.0) / weights
+        price = math.log(questions.get(fault.kind, 1) / (weight * level))
         found.append(FaultPower(fault, agent, sender, tests, share, price))
     return found
 
