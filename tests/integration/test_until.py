@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import random
 import subprocess
 import sys
@@ -10,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from msg_agents.running.run_result import RunResult, conclude
 from msg_agents.watching import early_end, run_observer
@@ -145,6 +148,41 @@ def test_evidence_ends_a_run(network: Any, monkeypatch: pytest.MonkeyPatch) -> N
     assert result.until["ended_early"]
     conclude(result, "never")
     assert result.comparison.verdict == "agrees"  # with its own law
+
+
+def test_is_watched_to_its_end(network: Any, domain: int) -> None:
+    """While it runs and, from its bag in two files, when it is played again: the watcher knows where it ends."""
+
+    def watched(other: subprocess.Popen[str]) -> dict[str, Any]:
+        stdout, stderr = live.communicate(timeout=100)
+        assert live.returncode == 0, stderr
+        assert other.wait(100) == 0
+        found: dict[str, Any] = json.loads(stdout)
+        return found
+
+    options = ("--until", "30%", "--json", "--out", network.directory, "--split-size", "1", "--domain", str(domain))
+    live = network.start("live", "--json", "--timeout", "60")
+    run = network.start("run", network.file(run=LONG), *options)
+    result = network.completed(run)
+    step = ended(result)
+    assert watched(run)["last_step"] >= step - 1  # an agent may have gone a little further
+    live = network.start("live", "--reliable", "--json", "--timeout", "60")
+    found = watched(network.start("play", result["bag"], "--rate", "max", "--await", "live"))
+    assert (found["first_step"], found["missing"]) == (0, 0)
+    assert found["any_time"]["log_evidence"] < math.log(100)
+    assert found["any_time"]["half_width"] == pytest.approx(result["any_time"]["half_width"], rel=0.05)
+
+
+def test_networks_of_a_sweep(network: Any) -> None:
+    file = network.directory / "rates.yaml"
+    over = {"run.replicas": [8, 16]}
+    sweep = {"experiment": network.experiment(run=LONG).to_document(), "over": over, "kind": "network", "until": "30%"}
+    file.write_text(yaml.safe_dump(sweep))
+    command = [str(PROGRAM), "sweep", str(file), "--json", "--out", str(network.directory / "out")]
+    shown = subprocess.run(command, capture_output=True, text=True, check=False, timeout=150)
+    points = json.loads(shown.stdout)["points"]
+    assert [point["status"] for point in points] == ["done", "done"], shown.stderr
+    assert all(500 < point["steps"] < PLANNED for point in points)
 
 
 @pytest.mark.parametrize("error", [MemoryError("too little"), ZeroDivisionError("a fault")])

@@ -117,6 +117,9 @@ def _spec_problems(spec: SweepSpec) -> list[str]:
     if spec.kind == "predict" and spec.repetitions > 1:
         wanted = "expected 1: a prediction does not depend on chance"
         found.append(problem("repetitions", spec.repetitions, wanted, "remove it, or use kind: simulate"))
+    if spec.until and spec.kind != "network":
+        wanted = "expected none: only a network can end early"
+        found.append(problem("until", spec.until, wanted, "remove it, or use kind: network"))
     if SEED in spec.over and spec.repetitions > 1:
         found.append(problem("repetitions", spec.repetitions, f"expected 1, since {SEED} is swept", "use one of both"))
     total = spec.repetitions
@@ -172,7 +175,7 @@ def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: ValidExperimen
         if SEED not in values:
             seed = seed + repetition if spec.seeds == "common" else own_seed(seed, values, repetition)
         document["run"]["seed"] = seed
-        yield Point(values, repetition, seed, Job.of(spec.kind, document, spec.level))
+        yield Point(values, repetition, seed, Job.of(spec.kind, document, spec.level, spec.until))
 
 
 def own_seed(seed: int, values: Mapping[str, Any], repetition: int) -> int:

@@ -20,8 +20,10 @@ import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator
 
+from msg_analysis.errors import InputError
+from msg_analysis.model.run.until import Until
 from msg_analysis.model.spec.values import Count, expected, is_number
 from msg_analysis.sweep.jobs.job import JobKind
 
@@ -97,6 +99,16 @@ def _experiment(value: object) -> str | dict[str, Any]:
     raise expected("the name of a file, or the keys of an experiment")
 
 
+def _precision(value: str) -> str:
+    try:
+        until = Until.parse(value)
+    except InputError as error:
+        raise expected("a precision such as 5%") from error
+    if until.decided:  # the tests of a sweep are judged together
+        raise expected("a precision such as 5%")
+    return str(until)
+
+
 class SweepSpec(BaseModel):
     """One experiment at many values of its keys."""
 
@@ -134,6 +146,12 @@ class SweepSpec(BaseModel):
         description="independent: every run has its own seed, made of run.seed and its point; common: run.seed, "
         "run.seed + 1, ... at every point, so that differences between points are seen better",
         examples=["independent"],
+    )
+    until: Annotated[str, AfterValidator(_precision)] | None = Field(
+        None,
+        description="network: every run ends when its system error is known to this precision, at its duration at "
+        "the latest",
+        examples=["5%"],
     )
     level: Annotated[float, Field(strict=True, gt=0, le=0.5)] = Field(
         0.01, description="probability of a false 'disagrees', all runs together", examples=[0.01]

@@ -171,6 +171,9 @@ def test_what_this_version_cannot_do_is_refused(tmp_path: Path) -> None:
         ({"over": {"run.dt": [0.1]}, "kind": "predikt"}, "did you mean 'predict'?"),
         ({"over": {"run.dt": [0.1]}, "kynd": "predict"}, "kynd: unknown key"),
         ({"over": {"run.dt": [0.1]}, "repetitions": 2}, "a prediction does not depend on chance"),
+        ({"over": {"run.dt": [0.1]}, "until": "5%"}, "until: 5%: expected none: only a network can end early"),
+        ({"over": {"run.dt": [0.1]}, "kind": "network", "until": "decided"}, "expected a precision such as 5%"),
+        ({"over": {"run.dt": [0.1]}, "kind": "network", "until": "soon"}, "expected a precision such as 5%"),
         ({"over": {"run.seed": [1, 2]}, "repetitions": 2, "kind": "simulate"}, "since run.seed is swept"),
         ({"over": {"run.seed": {"from": 1, "to": 15000, "step": 1}, "run.dt": [0.1, 0.2]}}, "30000 points"),
         ({"over": {"run.dt": [0.1]}, "experiment": 3}, "the name of a file, or the keys of an experiment"),
@@ -248,3 +251,14 @@ def test_names_with_dots() -> None:
     assert put({}, "noise.loss", 0.5) == {"noise": {"loss": 0.5}}
     with pytest.raises(KeyProblemError, match="expected a list"):
         put({"a": {}}, "a.b[1]", 1)
+
+
+def test_until_is_part_of_a_job(tmp_path: Path) -> None:
+    """What was run to its duration is not the result of a run that may end early, nor of one with another precision."""
+    jobs = [
+        load(tmp_path, over={"run.dt": [0.1]}, kind="network", **changes).points[0].job
+        for changes in ({}, {"until": "5%"}, {"until": "5.0 %"}, {"until": "1%"})
+    ]
+    assert [job.until for job in jobs] == [None, "5%", "5%", "1%"]
+    assert jobs[1].id == jobs[2].id
+    assert len({job.id for job in jobs}) == 3

@@ -37,7 +37,7 @@ from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.types import FloatArray, IntArray
 
 LEVEL = 0.01  # of the evidence, as of the verdict
-MOST_BYTES = 64 * 2**20  # memory for the evidence on the system error; where that is too little, there is no evidence
+MOST_BYTES = 4 * 2**20  # memory for the evidence on the system error; where that is too little, there is no evidence
 
 
 @dataclass(frozen=True, slots=True)

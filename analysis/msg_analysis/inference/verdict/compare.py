@@ -37,7 +37,7 @@ from msg_analysis.inference.statistics.batch_means import batch_interval
 from msg_analysis.inference.statistics.confidence_sequence import steps_to_half_width
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.inference.verdict.comparison import Comparison, Test
-from msg_analysis.inference.verdict.evidence import Evidence
+from msg_analysis.inference.verdict.evidence import DECIDED_LOOKS, LOOKS, Evidence
 from msg_analysis.inference.verdict.trust import trusted
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
@@ -77,7 +77,9 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     observation = Observation.of(trajectory, prediction)
     if observation.steps < MIN_STEPS and not trajectory.completeness.complete:
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
-    return judge(trajectory, prediction, Evidence.of(observation, level), level)
+    until = trajectory.record.until
+    looks = DECIDED_LOOKS if until is not None and until.decided else LOOKS
+    return judge(trajectory, prediction, Evidence.of(observation, level, looks), level)
 
 
 def judge(

@@ -35,6 +35,7 @@ from msg_analysis.inference.realtime.timing import Timing, measure_timing
 from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence
 
 LOOKS = 80  # at most, at the evidence over time
+DECIDED_LOOKS = 400  # where the evidence has decided when the run ended, and so decides the verdict
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,13 +64,13 @@ class Evidence:
         return [*laws, *([self.means] if self.means.long_enough else [])] if self.decisive else []
 
     @classmethod
-    def of(cls, observation: Observation, level: float) -> Evidence:
+    def of(cls, observation: Observation, level: float, looks: int = LOOKS) -> Evidence:
         """Evidence of one run; laws of a run in real time are tested at ``level``."""
         with blas_threads(observation.step.agents):
-            return cls._of(observation, level)
+            return cls._of(observation, level, looks)
 
     @classmethod
-    def _of(cls, observation: Observation, level: float) -> Evidence:
+    def _of(cls, observation: Observation, level: float, looks: int) -> Evidence:
         laws, timing, position, given = None, None, None, None
         if observation.timers:
             timing, order = measure_timing(observation), order_events(observation)
@@ -88,7 +89,7 @@ class Evidence:
             transitions=Transitions.of(observation.modes, observation.step.modes),
             loss=LossTally.of(observation),
             broadcast=BroadcastSums.of(observation),
-            watched=WatchedEvidence.of(observation, spaced_steps(observation.steps, LOOKS)),
+            watched=WatchedEvidence.of(observation, spaced_steps(observation.steps, looks)),
             timing=timing,
             laws=laws,
         )

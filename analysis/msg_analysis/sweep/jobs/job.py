@@ -44,20 +44,22 @@ class NetworkOptions:
 class Job:
     """One thing to do, self-contained: a worker needs no file for it."""
 
-    id: str  # hash of kind, document and, of runs, level
+    id: str  # hash of kind, document and, of runs, level and until
     kind: JobKind
     document: str  # the experiment, as JSON
     level: float  # of the tests of a run
+    until: str | None = None  # `--until` of a network
     network: NetworkOptions | None = field(default=None, compare=False)
 
     @classmethod
-    def of(cls, kind: JobKind, document: Mapping[str, Any], level: float = 0.01) -> Self:
+    def of(cls, kind: JobKind, document: Mapping[str, Any], level: float = 0.01, until: str | None = None) -> Self:
         """The job for an experiment, a document as in its file; ``level`` of the tests of a run."""
         text = json.dumps(document)
         what = json.dumps([kind, None if kind == "predict" else level, document], sort_keys=True)
         # The order of the graphs, which sort_keys hides, is that of the modes.
         what += json.dumps(list(document["graphs"]))
-        return cls(hashlib.sha256(what.encode()).hexdigest()[:20], kind, text, level)
+        what += until or ""
+        return cls(hashlib.sha256(what.encode()).hexdigest()[:20], kind, text, level, until)
 
 
 @dataclass(frozen=True, slots=True)

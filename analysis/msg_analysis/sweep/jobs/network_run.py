@@ -89,7 +89,7 @@ def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
         file = directory / "experiment.json"
         file.write_text(job.document, encoding="utf-8")
         try:
-            document, said, code = _run(options, file, directory, slot, stopping)
+            document, said, code = _run(options, job.until, file, directory, slot, stopping)
         except NetworkStoppedError:
             shutil.rmtree(directory, ignore_errors=True)
             raise
@@ -104,11 +104,17 @@ def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
 
 
 def _run(
-    options: NetworkOptions, file: Path, directory: Path, slot: int, stopping: Callable[[], bool]
+    options: NetworkOptions,
+    until: str | None,
+    file: Path,
+    directory: Path,
+    slot: int,
+    stopping: Callable[[], bool],
 ) -> tuple[dict[str, Any] | None, str, int]:
     """Its result (None: not JSON), what it wrote to stderr, and its exit code."""
     report = "always" if options.keep else "on-failure"
     arguments = ["run", str(file), "--out", str(directory), "--write-report", report, "--json"]
+    arguments += ["--until", until] if until else []
     with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
         process = _start(options.program, arguments, [stdout.fileno(), stderr.fileno(), slot])
         try:
