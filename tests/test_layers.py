@@ -52,6 +52,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "inference/statistics",
         "inference/observed",
         "inference/hypothesis_tests",
+        "inference/departures",
         "inference/errors",
         "inference/sequential",
         "inference/planning",

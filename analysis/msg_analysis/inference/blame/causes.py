@@ -25,14 +25,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
 from msg_analysis.common.text.number_words import percent
 from msg_analysis.inference.blame import suspects
+from msg_analysis.inference.blame.cause import Cause, numbers_text
+from msg_analysis.inference.blame.departure_words import departure_causes, frozen_cause
 from msg_analysis.inference.blame.switching_rates import find_rates
+from msg_analysis.inference.departures.departure import Finding
 from msg_analysis.inference.hypothesis_tests.broadcast import BroadcastSums
 from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums
 from msg_analysis.inference.hypothesis_tests.losses import LossTally
@@ -41,49 +44,7 @@ from msg_analysis.inference.statistics.distributions import binomial_interval, l
 from msg_analysis.inference.statistics.forward_selection import Selected, select
 from msg_analysis.model.network.markov_chain import MarkovChain
 
-CauseKind = Literal[
-    "frozen",
-    "gain",
-    "ignored",
-    "reference",
-    "offset",
-    "noise",
-    "correlation",
-    "switching",
-    "loss",
-    "broadcast",
-    "unknown",
-]
 MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
-
-
-@dataclass(frozen=True, slots=True)
-class Cause:
-    """One thing that is wrong."""
-
-    kind: CauseKind
-    words: str  # a sentence
-    agent: int | None = None  # from 1; None where the cause is not one agent
-    link: tuple[int, int] | None = None  # from 1: sender and receiver, or the two ends of an edge or of a correlation
-    graph: str | list[str] | None = None  # name; for switching [from, to] or [from]; None: all graphs
-    estimate: float | None = None  # measured: factor of a gain or variance, share, rate, correlation or value
-    interval: tuple[float, float] | None = None  # 95 %, for this cause alone
-    expected: float | None = None  # the same according to the experiment; 1 for a factor
-    p: float | None = None  # adjusted for all candidate causes; 0 where the law makes it impossible
-
-    def to_json(self) -> dict[str, Any]:
-        """The JSON document."""
-        return {
-            "kind": self.kind,
-            "words": self.words,
-            "agent": self.agent,
-            "link": list(self.link) if self.link else None,
-            "graph": self.graph,
-            "estimate": self.estimate,
-            "interval": list(self.interval) if self.interval else None,
-            "expected": self.expected,
-            "p": self.p,
-        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +59,7 @@ class Accused:
     transitions: Transitions
     loss: LossTally | None  # None without loss
     broadcast: BroadcastSums | None  # None without broadcast noise
+    departures: Sequence[Finding] = ()  # of every kind that is tested
 
 
 def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list[Cause]:
@@ -119,7 +81,8 @@ def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list
     guess = suspects.noise(sums, pardoned, np.zeros(len(sums.terms)))
     groups = (gains, guess, losses, broadcast)
     families = sum(len(group.classes) for group in groups if group) + 4
-    found = [_frozen_words(*entry) for entry in still]
+    families += len(accused.departures)
+    found = [frozen_cause(*entry, accused.departures) for entry in still]
     found += _switching(accused, families, level)
     change = np.zeros(len(sums.terms))
     if gains:
@@ -137,17 +100,10 @@ def find_causes(accused: Accused, level: float, rejected: Sequence[str]) -> list
     if broadcast:
         selected, _ = select(broadcast.score, broadcast.information, broadcast.classes, families, level)
         found += [_broadcast_words(one) for one in selected]
+    found += departure_causes(accused.departures, names, found, families, level)
     if not found:
         return [_unknown(rejected)]
     return sorted(found, key=lambda cause: (cause.kind != "frozen", cause.p or 0.0))
-
-
-def _frozen_words(agent: int, still: int, steps: int) -> Cause:
-    share = still / steps
-    low, high = binomial_interval(still, steps)
-    when = "in any of its steps" if still == steps else f"in {percent(share)} of its steps"
-    words = f"agent {agent + 1} does not move {when}, although it has noise"
-    return Cause("frozen", words, agent=agent + 1, estimate=share, interval=(low, high), expected=0.0, p=0.0)
 
 
 def _gain_words(one: Selected, accused: Accused) -> Cause:
@@ -156,12 +112,12 @@ def _gain_words(one: Selected, accused: Accused) -> Cause:
     low, high = one.interval
     if part == "reference":
         at = accused.reference
-        numbers = _numbers(at + one.estimate, (at + low, at + high))
+        numbers = numbers_text(at + one.estimate, (at + low, at + high))
         words = f"the leaders are pulled to {numbers}, not to the reference {at:g}"
         return Cause("reference", words, None, None, None, at + one.estimate, (at + low, at + high), at, p)
     if part == "offset":
         value, interval = one.estimate / accused.dt, (low / accused.dt, high / accused.dt)
-        words = f"agent {what + 1} has an additional drift of {_numbers(value, interval)} per unit of time"
+        words = f"agent {what + 1} has an additional drift of {numbers_text(value, interval)} per unit of time"
         return Cause("offset", words, what + 1, None, None, value, interval, 0.0, p)
     factor, interval = 1.0 + one.estimate, (1.0 + low, 1.0 + high)
     if part in ("all", "sender") and -1.2 < one.estimate < 0.0:
@@ -173,7 +129,7 @@ def _gain_words(one: Selected, accused: Accused) -> Cause:
     whose, agent, link, graph = _whose_gain(part, what)
     name = None if graph is None else names[graph]
     where = "" if name is None else f" in graph {name}"
-    words = f"{whose}{where} is {_numbers(factor, interval)} times what the file says"
+    words = f"{whose}{where} is {numbers_text(factor, interval)} times what the file says"
     return Cause("gain", words, agent, link, name, factor, interval, 1.0, p)
 
 
@@ -207,7 +163,7 @@ def _noise_words(one: Selected, names: Sequence[str]) -> Cause:
     whose = "the noise variance of all agents" if agent is None else f"agent {agent + 1}'s noise variance"
     where = "" if name is None else f" in graph {name}"
     factor, interval = math.exp(one.estimate), (math.exp(one.interval[0]), math.exp(one.interval[1]))
-    words = f"{whose}{where} is {_numbers(factor, interval)} times what the file says"
+    words = f"{whose}{where} is {numbers_text(factor, interval)} times what the file says"
     number = None if agent is None else agent + 1
     return Cause("noise", words, number, None, name, factor, interval, 1.0, math.exp(one.log_p))
 
@@ -236,7 +192,7 @@ def _correlations(sums: InnovationSums, pardoned: Sequence[int], families: int, 
             half = HALF_WIDTH_95 / math.sqrt(samples - 3)
             interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
             words = (
-                f"the noise of agents {j + 1} and {i + 1} has correlation {_numbers(seen, interval)}, "
+                f"the noise of agents {j + 1} and {i + 1} has correlation {numbers_text(seen, interval)}, "
                 f"not {expected:.3g}"
             )
             link = (j + 1, i + 1)
@@ -262,7 +218,7 @@ def _switching(accused: Accused, families: int, level: float) -> list[Cause]:
             expected = float(accused.chain.matrix[g, h])
             estimate, interval = rate.factor * expected, (low * expected, high * expected)
             words = (
-                f"the {what} of switching from {names[g]} to {names[h]} is {_numbers(estimate, interval)}, "
+                f"the {what} of switching from {names[g]} to {names[h]} is {numbers_text(estimate, interval)}, "
                 f"not {expected:.3g}"
             )
             where: list[str] | None = [names[g], names[h]]
@@ -272,7 +228,7 @@ def _switching(accused: Accused, families: int, level: float) -> list[Cause]:
             whose = f"all {what}s" if where is None else f"the {what}s of switching away from {where[0]}"
             whose = f"{whose} of switching" if where is None else whose
             whose = whose.replace("probabilitys", "probabilities")
-            words = f"{whose} are {_numbers(estimate, interval)} times what the file says"
+            words = f"{whose} are {numbers_text(estimate, interval)} times what the file says"
         found.append(Cause("switching", words, None, None, where, estimate, interval, expected, math.exp(rate.log_p)))
     return found
 
@@ -309,7 +265,7 @@ def _broadcast_words(one: Selected) -> Cause:
     factor, interval = math.exp(one.estimate), (math.exp(one.interval[0]), math.exp(one.interval[1]))
     agent = what + 1 if part == "agent" else None
     whose = "all agents publish" if agent is None else f"agent {agent} publishes"
-    words = f"the variance of the noise in what {whose} is {_numbers(factor, interval)} times what the file says"
+    words = f"the variance of the noise in what {whose} is {numbers_text(factor, interval)} times what the file says"
     return Cause("broadcast", words, agent, None, None, factor, interval, 1.0, math.exp(one.log_p))
 
 
@@ -320,9 +276,5 @@ def _unknown(rejected: Sequence[str]) -> Cause:
     elif set(rejected) <= {"system error", "covariance"} or all(name.startswith("error of") for name in rejected):
         words = f"the steps follow the law, but the errors differ: chance, or another start than in the file ({names})"
     else:
-        words = f"no single gain, noise variance or rate explains the rejected tests ({names})"
+        words = f"no single cause that is searched for explains the rejected tests ({names})"
     return Cause("unknown", words)
-
-
-def _numbers(value: float, interval: tuple[float, float]) -> str:
-    return f"{value:#.3g} ({interval[0]:#.3g} to {interval[1]:#.3g})"

@@ -20,6 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msg_analysis.inference.departures.departure import Block, Law
+from msg_analysis.inference.departures.departures import Departures
 from msg_analysis.inference.errors.time_means import moments
 from msg_analysis.inference.hypothesis_tests.innovations import QUIET_ROUNDING, innovations
 from msg_analysis.inference.observed.heard_values import NO_NOISE, HeardValues, process_noise
@@ -58,9 +60,10 @@ class EvidenceSums:
     "noise" of an agent, "gain" of a link or of a leader's pull, "gains" of all at once, "pair" of noises, "switching"
     away from a graph, "loss" of a link, "broadcast" noise of an agent, "system error". Given its past and, on the air
     and in real time, what was heard, each is exact; the system error only in lockstep without noise or loss on the air.
+    With ``in_detail``, the kinds of ``departures`` are added, which take as much time as all others together.
     """
 
-    def __init__(self, prediction: Prediction, replicas: int) -> None:
+    def __init__(self, prediction: Prediction, replicas: int, *, in_detail: bool = False) -> None:
         experiment, step = prediction.experiment, prediction.step
         noise, m = experiment.noise, step.agents
         self._step, self._noise = step, noise
@@ -98,13 +101,22 @@ class EvidenceSums:
             False  # whether anything happened that cannot: movement without noise, a loss of what never is
         )
         self.error = ErrorMartingale(prediction, replicas) if self.plain else None
+        self.departures: Departures | None = None
+        if in_detail:
+            heard = np.argwhere(step.listens() & usable[:, None])
+            law = Law(step, experiment.steps, replicas, self.noisy, self._common, heard, self.plain)
+            self.departures = Departures(law)
 
     def add(self, observation: Observation, first: int, last: int) -> None:
         """Add the steps first..last-1 of a run, which follow those that were added before."""
         if self._quadratic:
             self._add_quadratic(observation, first, last)
-        else:
-            self._add_heard(observation, first, last)
+        if self.departures or not self._quadratic:
+            block = self._block(observation, first, last)
+            if not self._quadratic:
+                self._add_heard(observation, block)
+            if self.departures:
+                self.departures.add(block)
         graphs = observation.modes[first : last + 1]
         np.add.at(self.counts, (graphs[:-1], graphs[1:]), 1)
         if observation.published is not None and self._noise.broadcast:
@@ -157,8 +169,8 @@ class EvidenceSums:
                 self.common_score += float((common * seen[:, :m]).sum())
                 self.common_information += float(((common @ now_now) * common).sum())
 
-    def _add_heard(self, observation: Observation, first: int, last: int) -> None:
-        """The same by what was heard, and losses."""
+    def _block(self, observation: Observation, first: int, last: int) -> Block:
+        """The steps, with their innovations over the standard deviations, by what was heard."""
         reception = HeardValues.of(observation, first, last)
         e = innovations(observation, first, last, reception)
         agents = np.arange(self._step.agents)
@@ -166,12 +178,19 @@ class EvidenceSums:
         still = variances <= self._floor
         if self._independent and still.any() and np.abs(e[still]).max() > QUIET_ROUNDING * observation.largest:
             self.impossible = True
-        scale = np.sqrt(np.where(still, np.inf, variances))[:, :, None]
-        white = e / scale
-        self.samples += np.where(still, 0, observation.replicas).sum(axis=0)
+        scale = np.sqrt(np.where(still, np.inf, variances))
+        graphs, after = observation.modes[first : last + 1], observation.states[first + 1 : last + 1]
+        return Block(first, graphs, e / scale[:, :, None], scale, after, reception)
+
+    def _add_heard(self, observation: Observation, block: Block) -> None:
+        """The same by what was heard, and losses."""
+        white, first = block.white, block.first
+        self.samples += np.where(np.isinf(block.scale), 0, observation.replicas).sum(axis=0)
         self.squares += (white**2).sum(axis=(0, 2))
-        lost = observation.lost[first:last] if len(self.lossy) and observation.lost is not None else None
-        self._add_links(reception, white, scale, lost)
+        lost = None
+        if len(self.lossy) and observation.lost is not None:
+            lost = observation.lost[first : first + len(white)]
+        self._add_links(block.reception, white, block.scale[:, :, None], lost)
         if len(self.pairs):
             flat = white.transpose(1, 0, 2).reshape(len(white[0]), -1)
             products = flat @ flat.T
@@ -213,6 +232,8 @@ class EvidenceSums:
         ):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.impossible |= other.impossible
+        if self.departures and other.departures:
+            self.departures.merge(other.departures)
         if self.error is not None and other.error is not None:
             self.error.merge(other.error)
 
@@ -242,7 +263,7 @@ class EvidenceSums:
             found["broadcast"] = variance_evidence(samples, self.broadcast_squares)
         if self.error is not None and len(self.error.rates):
             found["system error"] = self.error.total[None]
-        return found
+        return found | self.departures.families() if self.departures else found
 
     def question(self, kind: str, row: int) -> Question:
         """What a row of ``families`` is about."""

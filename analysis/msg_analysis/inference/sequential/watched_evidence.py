@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from msg_analysis.inference.departures.departure import Finding
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, Question
 from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
@@ -45,7 +46,7 @@ class WatchedEvidence:
     def of(cls, observation: Observation, looks: IntArray) -> WatchedEvidence:
         """Of a run, at the numbers of steps ``looks`` (T,), ascending, the last of which is all steps."""
         prediction, step = observation.prediction, observation.step
-        sums = EvidenceSums(prediction, observation.replicas)
+        sums = EvidenceSums(prediction, observation.replicas, in_detail=True)
         numbers = (4 + step.most_neighbours) * observation.states[0].size + step.agents**2
         if sums.error is not None:
             numbers = max(numbers, sums.error.numbers * (1 + len(sums.error.rates)))
@@ -61,6 +62,10 @@ class WatchedEvidence:
                     logarithms[number] = sums.evidence()
                     number, end = next(ends, (number, observation.steps + 1))
         return cls(sums, step.dt, looks, logarithms)
+
+    def findings(self) -> list[Finding]:
+        """The clearest departure of each kind that is tested."""
+        return self.sums.departures.findings() if self.sums.departures else []
 
     def merged(self, other: WatchedEvidence) -> WatchedEvidence:
         """Of these and other runs of the same experiment; the sums of ``self`` are changed in place."""
@@ -134,7 +139,8 @@ def any_time_evidence(
     for kind, logarithms in sums.families().items():
         each = log_mean(logarithms, axis=1)
         best = int(np.argmax(each))
-        questions.append((question_words(sums.question(kind, best), graphs), float(each[best])))
+        words = (sums.departures.question(kind, best, graphs) if sums.departures else None) or question_words(sums.question(kind, best), graphs)
+        questions.append((words, float(each[best])))
     half_width = None
     if variance and steps and planned and sums.error is not None:
         half_width = float(simultaneous_half_width(variance, sums.error.variance * planned)) / steps

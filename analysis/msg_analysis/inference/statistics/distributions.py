@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from scipy import special
@@ -34,6 +35,28 @@ def two_sided(z: Any) -> Any:
 def chi2_tail(x: Any, dof: Any) -> Any:
     """P(X > x) of a chi-square variable with ``dof`` degrees of freedom."""
     return special.chdtrc(dof, x)
+
+
+def log_chi2_tail(x: float, dof: float) -> float:
+    """Logarithm of P(X > x) of a chi-square variable; where that is too small for a number, of a bound just above."""
+    tail = float(special.chdtrc(dof, x))
+    if tail > 0.0 or not x > dof:
+        return math.log(tail) if tail > 0.0 else 0.0
+    half = dof / 2.0
+    # Integration by parts: a geometric series of the ratio (dof - 2) / x bounds what follows the first term.
+    first = (half - 1.0) * math.log(x / 2.0) - x / 2.0 - float(special.gammaln(half))
+    return first - math.log1p(-max(dof - 2.0, 0.0) / x)
+
+
+def log_chi2_below(x: float, dof: float) -> float:
+    """Logarithm of P(X <= x) of a chi-square variable; where that is too small for a number, of a bound just above."""
+    below = float(special.chdtr(dof, x))
+    if below > 0.0 or not 0.0 < x < dof:
+        return math.log(below) if below > 0.0 else -math.inf
+    half = dof / 2.0
+    # The power series of the incomplete gamma function, bounded by a geometric one.
+    first = half * math.log(x / 2.0) - x / 2.0 - float(special.gammaln(half + 1.0))
+    return first - math.log1p(-x / (dof + 2.0))
 
 
 def chi2_below(x: Any, dof: Any) -> Any:

@@ -22,7 +22,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from msg_analysis.inference.blame.causes import Accused, Cause, find_causes
+from msg_analysis.inference.blame.cause import Cause
+from msg_analysis.inference.blame.causes import Accused, find_causes
 from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate, covariance_test, estimates
 from msg_analysis.inference.errors.given_path import GivenPath
 from msg_analysis.inference.errors.ranking import rank_agents
@@ -108,6 +109,7 @@ def judge(
         ("innovations: gains", innovations.p_gain),
         ("innovations: common gain", innovations.p_common_gain),
         ("switching", switching.p),
+        *((finding.test, math.exp(finding.log_p)) for finding in evidence.watched.findings()),
         ("loss", loss.p if loss else None),
         ("broadcast", p_broadcast),
         *more,
@@ -188,6 +190,7 @@ def _accused(prediction: Prediction, evidence: Evidence) -> Accused:
         transitions=evidence.transitions,
         loss=evidence.loss,
         broadcast=evidence.broadcast,
+        departures=evidence.watched.findings(),
     )
 
 

@@ -27,7 +27,7 @@ from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.text.agent_names import agent_text, with_names
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import half_width_text, measured_text, number_text, z_text
-from msg_analysis.inference.blame.causes import Cause
+from msg_analysis.inference.blame.cause import Cause
 from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.errors.given_path import GivenPath
 from msg_analysis.inference.errors.ranking import Ranking

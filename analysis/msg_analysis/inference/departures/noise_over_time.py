@@ -1,0 +1,142 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Noise over time: innovations have the variance of the law in every stretch of the run, short or long."""
+
+from __future__ import annotations
+
+import math
+from typing import Self
+
+import numpy as np
+
+from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Place, Question
+from msg_analysis.inference.statistics.distributions import log_chi2_below, log_chi2_tail
+from msg_analysis.inference.statistics.mixture_evidence import log_mean, variance_evidence
+from msg_analysis.inference.statistics.windows import WindowEvidence, Windows
+from msg_analysis.types import FloatArray, IntArray
+
+
+class NoiseOverTime(Departure):
+    """Squares of standardised innovations in windows of 1, 2, 4, ... steps, by agent and of all where independent.
+
+    The sum over a window is chi-square. The law of the largest and the smallest is bounded by the union over windows:
+    every length has the same share of the level, and within it every window and agent (weighted Bonferroni).
+    """
+
+    test = "innovations: noise over time"
+
+    def __init__(self, law: Law) -> None:
+        self._agents, self._together = np.flatnonzero(law.noisy), law.apart and law.noisy.sum() > 1
+        columns = len(self._agents) + bool(self._together)
+        self._columns = columns
+        # Numbers in a window of one step.
+        self._numbers = np.full(columns, law.replicas)
+        if self._together:
+            self._numbers[-1] *= len(self._agents)
+        self._windows = Windows(law.planned, columns)
+        self._evidence = WindowEvidence(self._windows, columns)
+        levels = self._windows.levels
+        self._counts = np.zeros(levels, np.int64)  # windows of runs that were merged
+        self._runs = 1
+        # Largest and smallest sum of each length and column, the first step, and the run.
+        shape = (2, levels, columns)
+        self._extreme = np.stack([np.full((levels, columns), -np.inf), np.full((levels, columns), np.inf)])
+        self._first, self._run = np.zeros(shape, np.int64), np.ones(shape, np.int64)
+
+    def add(self, block: Block) -> None:
+        """The windows that end in the block."""
+        if not self._columns:
+            return
+        squares = (block.white[:, self._agents] ** 2).sum(axis=2)
+        if self._together:
+            squares = np.column_stack([squares, squares.sum(axis=1)])
+        every = np.arange(self._columns)
+        for level, first, sums in self._windows.add(squares):
+            if not len(sums):
+                continue
+            for side, at in enumerate((sums.argmax(axis=0), sums.argmin(axis=0))):
+                self._take(side, level, sums[at, every], first[at], np.ones(self._columns, np.int64))
+            mixed = log_mean(variance_evidence(self._numbers << level, sums), axis=-1)
+            self._evidence.add(level, mixed)
+
+    def _take(self, side: int, level: int, sums: FloatArray, first: IntArray, run: IntArray) -> None:
+        """Keep what is more extreme."""
+        old = self._extreme[side, level]
+        more = sums > old if side == 0 else sums < old
+        more |= np.isnan(sums)
+        self._extreme[side, level] = np.where(more, sums, old)
+        self._first[side, level] = np.where(more, first, self._first[side, level])
+        self._run[side, level] = np.where(more, run, self._run[side, level])
+
+    def merge(self, other: Self) -> None:
+        """No window goes over from one run to another."""
+        levels = max(len(self._counts), len(other._counts))
+        for each in (self, other):
+            each._extend(levels)
+        for side in range(2):
+            for level in range(levels):
+                place = other._first[side, level], other._run[side, level] + self._runs
+                self._take(side, level, other._extreme[side, level], *place)
+        self._counts += other._counts + other._seen(levels)
+        self._runs += other._runs
+        self._evidence.merge(other._evidence)
+
+    def _extend(self, levels: int) -> None:
+        """Room for the lengths of longer runs."""
+        more = levels - len(self._counts)
+        self._counts = np.append(self._counts, np.zeros(more, np.int64))
+        row = np.full((1, more, self._columns), np.inf)
+        self._extreme = np.concatenate([self._extreme, np.concatenate([-row, row])], axis=1)
+        widths = ((0, 0), (0, more), (0, 0))
+        self._first, self._run = np.pad(self._first, widths), np.pad(self._run, widths, constant_values=1)
+
+    def _seen(self, levels: int) -> IntArray:
+        seen = self._windows.seen()
+        return np.append(seen, np.zeros(levels - len(seen), np.int64))
+
+    def finding(self) -> Finding | None:
+        """The window, and the agent or all agents, whose variance is the least likely."""
+        counts = self._counts + self._seen(len(self._counts))
+        lengths = np.flatnonzero(counts).tolist()
+        if not lengths or not self._columns:
+            return None
+        candidates = []
+        for level in lengths:
+            share = math.log(2.0 * len(lengths) * float(counts[level]) * self._columns)
+            for column, numbers in enumerate((self._numbers << level).tolist()):
+                largest, smallest = self._extreme[:, level, column].tolist()
+                tails = log_chi2_tail(largest, numbers), log_chi2_below(smallest, numbers)
+                candidates += [(tail + share, level, column, side) for side, tail in enumerate(tails)]
+        log_p, level, column, side = min(candidates)
+        first, numbers = int(self._first[side, level, column]) + 1, int(self._numbers[column] << level)
+        ratio = float(self._extreme[side, level, column] / numbers)
+        return Finding(
+            self.test,
+            min(0.0, log_p),
+            agent=int(self._agents[column]) if column < len(self._agents) else None,
+            place=Place(first, first + (1 << level) - 1, int(self._run[side, level, column])),
+            estimate=ratio,
+            standard_error=ratio * math.sqrt(2.0 / numbers),
+            expected=1.0,
+        )
+
+    def evidence(self) -> FloatArray:
+        """(agents, 1)."""
+        return self._evidence.logarithms()[:, None]
+
+    def questions(self) -> list[Question]:
+        """Noise of an agent, or of all, over time."""
+        agents = [f"agent {agent + 1}" for agent in self._agents.tolist()]
+        return [(f"noise of {whose} over time", ()) for whose in [*agents, "all agents"][: self._columns]]

@@ -1,0 +1,359 @@
+"""Departures in time or in detail: sums and p-values against loops over the steps, windows and links."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+from scipy import stats
+from tests.support.switching_systems import LINE_RING
+
+from msg_analysis.inference.departures.departure import Departure, Law
+from msg_analysis.inference.departures.largest_innovation import LargestInnovation
+from msg_analysis.inference.departures.long_lags import LongLags
+from msg_analysis.inference.departures.noise_by_graph import NoiseByGraph
+from msg_analysis.inference.departures.noise_over_time import NoiseOverTime
+from msg_analysis.inference.departures.sojourns import PARTS, Sojourns
+from msg_analysis.inference.departures.stale_values import StaleValues
+from msg_analysis.inference.departures.standing_still import StandingStill
+from msg_analysis.inference.departures.swapped_graphs import SwappedGraphs
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.statistics.mixture_evidence import variance_evidence
+from msg_analysis.inference.statistics.windows import WindowEvidence, Windows
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.theory.prediction import predict
+from msg_analysis.twin.simulate import simulate
+
+Kind = TypeVar("Kind", bound=Departure)
+AIR = {"process": 1.0, "loss": 0.3, "link": 0.2, "broadcast": 0.1}
+
+
+def observed(seed: int = 1, duration: float = 20.0, replicas: int = 2, **changes: Any) -> Observation:
+    run = {"dt": 0.05, "duration": duration, "replicas": replicas, "seed": seed} | changes.pop("run", {})
+    law = ValidExperiment.parse(LINE_RING | changes | {"run": run})
+    return Observation.of(simulate(law), predict(law))
+
+
+def summed(observation: Observation, kind: type[Kind], size: int = 37) -> Kind:
+    """The sums of a run, in blocks of so many steps."""
+    sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
+    for first in range(0, observation.steps, size):
+        sums.add(observation, first, min(first + size, observation.steps))
+    assert sums.departures is not None
+    return next(each for each in sums.departures.kinds if isinstance(each, kind))
+
+
+def whitened(observation: Observation) -> np.ndarray:
+    """(N, m, R) of a law without noise on the air, whose noise has the variance dt."""
+    step, x = observation.step, observation.states
+    steps = zip(observation.modes.tolist(), x[:-1], x[1:], strict=True)
+    return np.array([after - step.weights[g] @ now for g, now, after in steps]) / np.sqrt(0.05)
+
+
+def windows_of(steps: int) -> list[tuple[int, int]]:
+    """(level, first step) of every window."""
+    found = []
+    for level in range(steps.bit_length()):
+        half = max(1, 2**level // 2)
+        found += [(level, first) for first in range(0, steps - 2**level + 1, half)]
+    return found
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 64, 100, 127])
+@pytest.mark.parametrize("size", [1, 7, 200])
+def test_windows_are_those_of_a_loop(steps: int, size: int) -> None:
+    numbers = np.random.default_rng(steps).standard_normal((steps, 2))
+    windows = Windows(steps, 2)
+    found = {}
+    for begin in range(0, steps, size):
+        for level, first, sums in windows.add(numbers[begin : begin + size]):
+            found |= {(level, int(f)): s for f, s in zip(first, sums, strict=True)}
+        there = [(level, first) for level, first in windows_of(steps) if first + 2**level <= windows.steps]
+        assert sorted(found) == sorted(there)
+        begun = [level for level, first in windows_of(steps) if first < windows.steps]
+        assert windows.begun().tolist() == [begun.count(level) for level in range(windows.levels)]
+    assert windows.planned.tolist() == [
+        [level for level, _ in windows_of(steps)].count(level) for level in range(windows.levels)
+    ]
+    assert (windows.seen() == windows.planned).all()
+    for (level, first), total in found.items():
+        assert total == pytest.approx(numbers[first : first + 2**level].sum(axis=0))
+
+
+@pytest.mark.parametrize("seen", [0, 1, 13, 50])
+def test_the_evidence_of_windows_is_their_mean(seen: int) -> None:
+    logs = np.random.default_rng(3).standard_normal(50)
+    windows = Windows(50, 1)
+    evidence = WindowEvidence(windows, 1)
+    for level, first, _ in windows.add(np.zeros((seen, 1))):
+        evidence.add(level, logs[first][:, None] / (level + 1))
+    levels = [
+        [
+            np.exp(logs[first] / (level + 1)) if first + 2**level <= seen else float(first >= seen)
+            for level, first in windows_of(50)
+            if level == each
+        ]
+        for each in range(6)
+    ]
+    assert np.exp(evidence.logarithms()[0]) == pytest.approx(np.mean([np.mean(values) for values in levels]))
+    alone = float(evidence.logarithms()[0])
+    twice = WindowEvidence(Windows(50, 1), 1)  # of a run that has not begun: 1
+    twice.merge(evidence)
+    twice.merge(evidence)
+    assert twice.logarithms()[0] == pytest.approx(2.0 * alone)
+
+
+def chain(transition: list[list[float]], steps: int, seed: int) -> np.ndarray:
+    random, up_to = np.random.default_rng(seed).random(steps), np.cumsum(transition, axis=1)
+    path = [0]
+    for chance in random[1:].tolist():
+        path.append(int(np.searchsorted(up_to[path[-1], :-1], chance, side="right")))
+    return np.array(path)
+
+
+THREE = [[0.8, 0.1, 0.1], [0.3, 0.5, 0.2], [0.2, 0.2, 0.6]]
+SLOW = [[0.95, 0.05], [0.05, 0.95]]
+
+
+def sojourns(transition: list[list[float]], steps: int) -> Sojourns:
+    """Sums of the law of an experiment in discrete time."""
+    graphs = {"a": {"path": [1, 2, 3]}, "b": {"complete": True}, "c": {"star": {"center": 1}}}
+    law = ValidExperiment.parse(
+        {
+            "name": "chain",
+            "time": "discrete",
+            "agents": 3,
+            "graphs": {name: graphs[name] for name in list(graphs)[: len(transition)]},
+            "switching": {"transition": transition},
+            "noise": {"process": 1.0},
+            "run": {"duration": steps},
+        }
+    )
+    prediction = predict(law)
+    noisy = np.ones(3, dtype=np.bool_)
+    return Sojourns(Law(prediction.step, steps, 1, noisy, True, np.empty((0, 2), np.int64), True))
+
+
+def test_sojourns_are_counted_as_by_a_loop() -> None:
+    path = chain(SLOW, 900, 2)
+    sums = sojourns(SLOW, 900)
+    for first in range(0, 900, 50):
+        sums.count(path[first : first + 51])
+    steps, left, age = np.zeros((2, PARTS)), np.zeros((2, PARTS)), 0
+    for now, following in zip(path[:-1].tolist(), path[1:].tolist(), strict=True):
+        # Part p has the ages by which at least p, and fewer than p + 1, eighths of the sojourns have ended.
+        part = int(np.floor(PARTS * (1.0 - 0.95**age) + 1e-9))
+        steps[now, part] += 1
+        left[now, part] += now != following
+        age = 0 if now != following else age + 1
+    assert (sums.steps == steps).all()
+    assert (sums.left == left).all()
+
+
+def test_the_statistic_of_sojourns_is_that_of_a_table() -> None:
+    path = chain(SLOW, 20_000, 4)
+    sums = sojourns(SLOW, 20_000)
+    sums.count(path)
+    finding = sums.finding()
+    assert finding is not None
+    total = sum(
+        stats.chi2_contingency(np.vstack([sums.left[g], sums.steps[g] - sums.left[g]]), lambda_="log-likelihood")[0]
+        for g in range(2)
+    )
+    assert np.exp(finding.log_p) == pytest.approx(stats.chi2.sf(total, 14), rel=1e-6)
+
+
+@pytest.mark.parametrize(("transition", "steps"), [(SLOW, 1500), (SLOW, 4000), (THREE, 400)])
+def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], steps: int) -> None:
+    """Of 200 chains each; Kolmogorov-Smirnov at 1e-3."""
+    p = []
+    for seed in range(200):
+        sums = sojourns(transition, steps)
+        sums.count(chain(transition, steps, seed))
+        finding = sums.finding()
+        assert finding is not None
+        p.append(np.exp(finding.log_p))
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+def test_few_sojourns_are_not_tested() -> None:
+    sums = sojourns(SLOW, 300)
+    sums.count(chain(SLOW, 300, 1))
+    assert sums.finding() is None
+
+
+def test_noise_by_graph() -> None:
+    observation = observed()
+    sums, white = summed(observation, NoiseByGraph), whitened(observation)
+    p = []
+    for g in range(2):
+        squares = (white[observation.modes == g] ** 2).sum(axis=(0, 2))
+        number = 2 * int((observation.modes == g).sum())
+        assert sums.squares[g] == pytest.approx(squares)
+        assert (sums.samples[g] == number).all()
+        for total, samples in [*((s, number) for s in squares), (squares.sum(), 5 * number)]:
+            p.append(2.0 * min(stats.chi2.sf(total, samples), stats.chi2.cdf(total, samples)))
+    finding = sums.finding()
+    assert finding is not None
+    assert np.exp(finding.log_p) == pytest.approx(min(1.0, 12 * min(p)))
+    words = [text.format(*("ab"[g] for g in graphs)) for text, graphs in sums.questions()]
+    assert words[0] == "noise of agent 1 in graph a"
+    assert words[11] == "noise of all agents in graph b"
+    assert len(sums.evidence()) == 12
+
+
+def test_noise_over_time() -> None:
+    """A burst in four steps; the p is the least of a loop over all windows, and the evidence their mean."""
+    observation = observed(duration=5.0)
+    observation.states[31:35, 2] += 1.0
+    sums, white = summed(observation, NoiseOverTime), whitened(observation)
+    squares = (white**2).sum(axis=2)
+    squares = np.column_stack([squares, squares.sum(axis=1)])
+    numbers = np.array([2, 2, 2, 2, 2, 10])
+    every = windows_of(100)
+    counts = [sum(level == each for level, _ in every) for each in range(7)]
+    least, evidence = [], np.zeros(6)
+    for level, first in every:
+        total, samples = squares[first : first + 2**level].sum(axis=0), numbers * 2**level
+        tails = np.minimum(stats.chi2.sf(total, samples), stats.chi2.cdf(total, samples))
+        least.append((float(tails.min()) * 2 * 7 * counts[level] * 6, level, first, int(tails.argmin())))
+        evidence += np.exp(variance_evidence(samples, total)).mean(axis=1) / (7 * counts[level])
+    finding = sums.finding()
+    assert finding is not None
+    assert finding.place is not None
+    p, level, first, agent = min(least)
+    assert np.exp(finding.log_p) == pytest.approx(p, rel=1e-6)
+    assert (finding.place.first, finding.place.last) == (first + 1, first + 2**level)
+    assert finding.agent == agent
+    assert np.exp(sums.evidence()[:, 0]) == pytest.approx(evidence)
+
+
+def test_standing_still() -> None:
+    observation = observed()
+    for k in (*range(30, 45), 70, 80):
+        observation.states[k + 1, 3] = observation.states[k, 3]
+    sums = summed(observation, StandingStill)
+    finding = sums.finding()
+    assert finding is not None
+    assert finding.place is not None
+    assert (finding.agent, finding.place.first, finding.place.last) == (3, 31, 45)
+    q = [
+        np.prod(4.0 * (np.spacing(np.abs(observation.states[k]).max(axis=0)) / np.sqrt(0.05) + 2.0**-52))
+        for k in (*range(30, 45), 70, 80)
+    ]
+    expected = np.log(0.5 * (1.0 + np.sum(1.0 / np.array(q)) / (5 * 400)))
+    assert sums.evidence()[0, 0] == pytest.approx(expected)
+    assert finding.log_p == pytest.approx(-expected)
+    assert summed(observed(), StandingStill).finding().log_p == 0.0  # type: ignore[union-attr]
+
+
+def test_the_largest_innovation() -> None:
+    observation = observed()
+    observation.states[120, 1, 1] += 8.0 * np.sqrt(0.05)
+    sums, white = summed(observation, LargestInnovation), whitened(observation)
+    finding = sums.finding()
+    assert finding is not None
+    assert finding.place is not None
+    at = np.unravel_index(np.argmax(np.abs(white)), white.shape)
+    assert (finding.place.first - 1, finding.agent) == at[:2]
+    assert np.exp(finding.log_p) == pytest.approx(4000 * 2 * stats.norm.sf(np.abs(white).max()))
+    large = white[np.abs(white) > 4.0] ** 2
+    mean = np.exp(variance_evidence(np.ones(len(large)), large)[:, 0]).sum() / 4000
+    assert np.exp(sums.evidence()[0, 0]) == pytest.approx(0.5 * (1.0 + mean))
+
+
+def test_long_lags() -> None:
+    observation = observed()
+    sums, white = summed(observation, LongLags), whitened(observation)
+    p = []
+    for lag in range(1, 101):
+        late, early = white[lag:], white[:-lag]
+        score, information = (late * early).sum(axis=(0, 2)), (early**2).sum(axis=(0, 2))
+        assert sums.score[lag - 1] == pytest.approx(score, abs=1e-9)
+        assert sums.information[lag - 1] == pytest.approx(information)
+        p += (1000 * 2 * stats.norm.sf(np.abs(score / np.sqrt(information)))).tolist()
+        p.append(200 * 2 * stats.norm.sf(abs(score.sum() / np.sqrt(information.sum()))))
+    finding = sums.finding()
+    assert finding is not None
+    assert np.exp(finding.log_p) == pytest.approx(min(1.0, *p))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"noise": AIR}, {"noise": {"process": 1.0, "delay": 2}}, {"run": {"pace": "realtime"}}],
+    ids=["plain", "on the air", "delay", "real time"],
+)
+def test_stale_values(changes: dict[str, Any]) -> None:
+    observation = observed(duration=10.0, **changes)
+    sums, step = summed(observation, StaleValues), observation.step
+    states, noise = observation.states, observation.prediction.experiment.noise
+    heard = states if observation.published is None else observation.published
+    score, information = np.zeros((5, 5)), np.zeros((5, 5))
+    for k, g in enumerate(observation.modes.tolist()):
+        for i in range(5):
+            own = int(observation.timers.graphs[k, i]) if observation.timers else g
+            used = {}
+            for d, j in enumerate(step.neighbours(own, i).tolist()):
+                if observation.timers:
+                    used[j] = int(observation.timers.used[k, i, d])
+                elif observation.lost is None or not observation.lost[k, i, d]:
+                    used[j] = max(k - noise.delay, 0)
+            parts = {j: step.nominal[own, i, j] * (heard[s, j] - states[k, i]) for j, s in used.items()}
+            e = states[k + 1, i] - states[k, i] - np.sum([*parts.values(), np.zeros(2)], axis=0)
+            variance = 0.05 + noise.link**2 * sum(step.nominal[own, i, j] ** 2 for j in used)
+            for j, s in used.items():
+                older = step.nominal[own, i, j] * (heard[max(s - 1, 0), j] - heard[s, j])
+                score[i, j] += older @ e / variance
+                information[i, j] += older @ older / variance
+    assert sums.score == pytest.approx(score, abs=1e-9)
+    assert sums.information == pytest.approx(information)
+    links = information > 0.0
+    p = 2 * stats.norm.sf(np.abs(score[links] / np.sqrt(information[links]))) * 2 * links.sum()
+    common = 2 * stats.norm.sf(abs(score.sum()) / np.sqrt(information.sum())) * 2
+    finding = sums.finding()
+    assert finding is not None
+    assert np.exp(finding.log_p) == pytest.approx(min(1.0, common, *p))
+
+
+def test_swapped_graphs() -> None:
+    observation = observed(duration=5.0)
+    sums, step = summed(observation, SwappedGraphs), observation.step
+    now, after = observation.states[:-1], observation.states[1:]
+    density = np.array(
+        [stats.norm.logpdf(after, step.weights[g] @ now, np.sqrt(0.05)).sum(axis=(1, 2)) for g in range(2)]
+    )
+    every = np.arange(100)
+    ratios = density[1 - observation.modes, every] - density[observation.modes, every]
+    counts = [sum(level == each for level, _ in windows_of(100)) for each in range(7)]
+    mean = sum(np.exp(ratios[f : f + 2**level].sum()) / (7 * counts[level]) for level, f in windows_of(100))
+    assert np.exp(sums.evidence()[0, 0]) == pytest.approx(mean)
+    finding = sums.finding()
+    assert finding is not None
+    assert np.exp(finding.log_p) == pytest.approx(min(1.0, 1.0 / mean))
+    with_losses = summed(observed(noise=AIR), SwappedGraphs)
+    assert with_losses.finding() is None
+    assert not with_losses.evidence().size
+
+
+def test_runs_are_merged() -> None:
+    """The evidence of runs is multiplied where windows are looked at, sums are added up; places say in which run."""
+    first, second = observed(1, 10.0), observed(2, 20.0)
+    second.states[121, 1, 1] += 2.5
+    pairs = [
+        (summed(first, kind), summed(second, kind))
+        for kind in (NoiseOverTime, StandingStill, LargestInnovation, SwappedGraphs)
+    ]
+    for one, other in pairs:
+        expected = one.evidence() + other.evidence()
+        one.merge(other)  # type: ignore[arg-type]
+        assert one.evidence() == pytest.approx(expected)
+    largest = pairs[2][0].finding()
+    assert largest is not None
+    assert largest.place is not None
+    assert (largest.place.run, largest.place.first) == (2, 121)
+    lags = [summed(each, LongLags) for each in (first, second)]
+    products = lags[0].score + lags[1].score
+    lags[0].merge(lags[1])
+    assert (lags[0].score == products).all()
