@@ -1,6 +1,6 @@
 """What is found of faults that sums over a whole run hide: standing still, noise over time, sojourns, stale values.
 
-Simulates line/ring (``calibration.line_ring``: 400 units, dt = 0.1, 16 replicas) step by step with one thing wrong,
+Simulates line/ring (``calibration_laws.line_ring``: 400 units, dt = 0.1, 16 replicas) step by step with one thing wrong,
 and compares each run with the prediction without it. Runs without a fault say how often "disagrees" is a false alarm.
 """
 
@@ -15,7 +15,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
 import numpy as np
-from calibration import TRUE, line_ring
+from calibration_laws import TRUE, line_ring
 
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.inference.verdict.comparison import Comparison

@@ -139,7 +139,8 @@ def any_time_evidence(
     for kind, logarithms in sums.families().items():
         each = log_mean(logarithms, axis=1)
         best = int(np.argmax(each))
-        words = (sums.departures.question(kind, best, graphs) if sums.departures else None) or question_words(sums.question(kind, best), graphs)
+        words = sums.departures.question(kind, best, graphs) if sums.departures else None
+        words = words or question_words(sums.question(kind, best), graphs)
         questions.append((words, float(each[best])))
     half_width = None
     if variance and steps and planned and sums.error is not None:
