@@ -33,7 +33,7 @@ import scipy.linalg
 
 from msg_analysis.inference.hypothesis_tests.gain_regression import MAX_REGRESSORS, regressors
 from msg_analysis.inference.observed.heard_values import NO_NOISE
-from msg_analysis.inference.sequential.evidence_sums import MAIN, MAIN_WEIGHT, EvidenceSums
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, kind_weights
 from msg_analysis.inference.statistics.distributions import (
     chi2_quantile,
     needed_noncentrality,
@@ -111,7 +111,7 @@ class FaultPower:
         for a prior of the size of the fault.
         """
         information = max(test.noncentrality for test in self.tests)
-        if not information > 0.0:
+        if not information > 0.0 or math.isinf(self.log_price):
             return math.inf
         low, high = 0.0, 4.0 * self.log_price + 100.0
         for _ in range(60):
@@ -139,7 +139,7 @@ def fault_powers(
     """
     step, sums = prediction.step, EvidenceSums(prediction, replicas)
     questions = {kind: logs.size for kind, logs in sums.families().items()}
-    weights = sum(MAIN_WEIGHT if kind in MAIN else 1.0 for kind in questions)
+    weights = dict(zip(questions, kind_weights(list(questions)).tolist(), strict=True))
     share = level / _family(prediction)
     found = []
     for fault in faults:
@@ -156,8 +156,8 @@ def fault_powers(
         (agent, sender), tests = min(
             informations.items(), key=lambda entry: max(test.noncentrality for test in entry[1])
         )
-        weight = (MAIN_WEIGHT if fault.kind in MAIN else 1.0) / weights
-        price = math.log(questions.get(fault.kind, 1) / (weight * level))
+        asked = fault.kind in questions
+        price = math.log(questions[fault.kind] / (weights[fault.kind] * level)) if asked else math.inf
         found.append(FaultPower(fault, agent, sender, tests, share, price))
     return found
 
