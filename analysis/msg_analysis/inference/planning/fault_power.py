@@ -140,7 +140,7 @@ def fault_powers(
     step, sums = prediction.step, EvidenceSums(prediction, replicas)
     questions = {kind: logs.size for kind, logs in sums.families().items()}
     weights = dict(zip(questions, kind_weights(list(questions)).tolist(), strict=True))
-    share = level / _family(prediction)
+    share = level / _family(prediction, replicas)
     found = []
     for fault in faults:
         informations = {
@@ -165,10 +165,12 @@ def fault_powers(
 _Informations = dict[tuple[int | None, int | None], list[StepInformation]]
 
 
-def _family(prediction: Prediction) -> int:
-    """Number of tests of a run: errors and covariance, innovations, and those of what the experiment has."""
+def _family(prediction: Prediction, replicas: int) -> int:
+    """Number of tests of a run: errors and covariance, innovations, departures, and those of what the experiment has."""
     step = prediction.step
-    return 1 + step.agents + 1 + 4 + (step.modes > 1) + (step.loss > 0.0) + (step.broadcast > 0.0)
+    departures = EvidenceSums(prediction, replicas, in_detail=True).departures
+    more = len(departures.families()) if departures else 0
+    return 1 + step.agents + 1 + 4 + more + (step.modes > 1) + (step.loss > 0.0) + (step.broadcast > 0.0)
 
 
 def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
