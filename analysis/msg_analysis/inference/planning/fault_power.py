@@ -166,7 +166,7 @@ _Informations = dict[tuple[int | None, int | None], list[StepInformation]]
 
 
 def _family(prediction: Prediction, replicas: int) -> int:
-    """Number of tests of a run: errors and covariance, innovations, departures, and those of what the experiment has."""
+    """Number of tests of a run: errors and covariance, innovations, departures, and what else the experiment has."""
     step = prediction.step
     departures = EvidenceSums(prediction, replicas, in_detail=True).departures
     more = len(departures.families()) if departures else 0
