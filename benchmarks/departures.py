@@ -1,7 +1,8 @@
-"""What is found of faults that sums over a run hide: standing still, noise over time, sojourns, stale values.
+"""What is found of faults that sums over a whole run hide: standing still, noise over time, sojourns, stale values.
 
-Simulates line/ring (``calibration_laws.line_ring``: 400 units, dt = 0.1, 16 replicas) step by step with a fault,
-and compares each run with the prediction without it. Runs without a fault say how often "disagrees" is a false alarm.
+Simulates line/ring (``calibration_laws.line_ring``: 400 units, dt = 0.1, 16 replicas) step by step with one thing
+wrong, and compares each run with the prediction without it. Runs without a fault say how often "disagrees" is a false
+alarm.
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ def test_the_level_holds_where_a_few_sojourns_decide(case):
     assert sum(result.verdict == "disagrees" for result in results) <= stats.binom.isf(1e-4, 60, 0.01)
     noisy = case in ("far", "rare")
     assert all(("system error" in p_values(result)) == noisy for result in results)
-    assert all(len(result.tests) == (11 if noisy else 1 if case == "without noise" else 4) for result in results)
+    assert all(len(result.tests) == (18 if noisy else 1 if case == "without noise" else 10) for result in results)
 
 
 @pytest.mark.usefixtures("predicted_once")
@@ -167,12 +167,12 @@ def simulate_air(experiment, seed):
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 @pytest.mark.usefixtures("predicted_once")
 def test_calibration_with_noise_that_depends_on_the_graph(loss):
-    """40 runs; levels as in test_calibration, 18 or 19 tests."""
+    """40 runs; levels as in test_calibration, 17 or 18 tests."""
     noise = {"process": 0.2, "broadcast": 0.3, "link": 0.2, "loss": loss}
     air = changed(golden("air", duration=50, replicas=3, start="zero"), noise=noise)
     results = [compare(simulate_air(air, seed)) for seed in SEEDS]
     collected = [p_values(result) for result in results]
-    assert len(collected[0]) == (18 if loss == 0.0 else 19)
+    assert len(collected[0]) == (17 if loss == 0.0 else 18)
     for name in collected[0]:
         assert kolmogorov_smirnov(name, [p[name] for p in collected]) > 2e-4, name
     assert sum(r.verdict == "disagrees" for r in results) <= stats.binom.isf(1e-4, len(results), 0.01)
@@ -258,7 +258,7 @@ def test_document(short_run):
     assert np.sum(document["switching"]["counts"]) == 499
     assert document["continuous"]["system_error"] == pytest.approx(1.3594132029339856, rel=1e-8)
     assert len(document["batch_means"]["interval"]) == 2
-    assert [test["rejected"] for test in document["tests"]] == [False] * 20
+    assert [test["rejected"] for test in document["tests"]] == [False] * 19  # too few sojourns for a test of these
 
 
 def test_many_agents_get_no_joint_test_but_all_numbers(short_run, monkeypatch):

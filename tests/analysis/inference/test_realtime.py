@@ -168,6 +168,12 @@ def test_regression_frees_innovations_of_those_made_before(late_timers):
     np.testing.assert_allclose(regression.statistic()[1], covariance, atol=1e-9)
 
 
+IN_DETAIL = [
+    f"innovations: {what}"
+    for what in ("noise by graph", "noise over time", "standing still", "largest", "lags to 100", "stale values")
+]
+
+
 @pytest.mark.parametrize("case", ["consensus", "noise by graph"])
 def test_calibration(late_timers, case):
     """p-values of 30 late runs of 400 steps are even, intervals cover, verdicts agree.
@@ -181,7 +187,7 @@ def test_calibration(late_timers, case):
     collected = [{test.name: test.p for test in result.tests} for result in results]
     names = ["system error", *(f"error of agent {i}" for i in (1, 2, 3)), "covariance"]
     names += [f"innovations: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]
-    assert list(collected[0]) == [*names, "switching"]
+    assert list(collected[0]) == [*names, "switching", *IN_DETAIL]
     for name in collected[0]:
         assert kolmogorov_smirnov(name, [p[name] for p in collected]) > 2e-4, name
     covered = sum(r.system_error.interval[0] <= r.system_error.predicted <= r.system_error.interval[1] for r in results)
@@ -270,7 +276,7 @@ def test_clocks_that_disagree_leave_the_innovations(late_timers):
     assert result.verdict == "agrees"
     tests = [test.name for test in result.tests]
     names = [f"innovations: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]
-    assert tests == [*names, "switching"]
+    assert tests == [*names, "switching", *IN_DETAIL]
     document = result.to_json()
     assert document["law"] == "sequential"
     assert document["laws"]["pattern"]["supported"] is None
