@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.observed.observation import Observation, spaced_steps
 from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, kind_weights
 from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence, any_time_evidence
 from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.inference.verdict.evidence import LOOKS, Evidence
 from msg_analysis.inference.verdict.pool import compare_pooled
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
@@ -213,3 +214,25 @@ def test_questions_of_single_parts_keep_their_share() -> None:
     )
     assert kind_weights(["loss"]) == pytest.approx([1.0])
     assert kind_weights(["gains", "pair"]) == pytest.approx([0.5, 0.5])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"noise": {"loss": 0.3, "link": 0.2, "broadcast": 0.1}},
+        {"noise": {"loss": 0.3, "on_loss": "hold", "link": 0.2}},
+        {"noise": {"process": [[1.0, 0.5, 0, 0, 0]] * 5, "loss": 0.3, "on_loss": "hold", "link": 0.2}},
+        {"run": {"pace": "realtime"}},
+    ],
+    ids=["plain", "on the air", "messages used again", "not followed", "real time"],
+)
+def test_one_pass_for_the_tests_and_the_evidence(changes: dict[str, Any]) -> None:
+    """In the pass of the innovations the evidence is the same as in a pass of its own."""
+    observation = observed(experiment(duration=40.0, **changes))
+    looks = spaced_steps(observation.steps, LOOKS)
+    shared, own = Evidence.of(observation, 0.01).watched, WatchedEvidence.of(observation, looks)
+    assert shared.steps is not None
+    assert own.steps is not None
+    np.testing.assert_array_equal(shared.steps, own.steps)
+    np.testing.assert_allclose(shared.logarithms, own.logarithms, rtol=1e-9, atol=1e-9)

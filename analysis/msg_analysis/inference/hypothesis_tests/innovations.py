@@ -22,6 +22,7 @@ values that the agents heard (see ``heard_values``), for any timing. See docs/st
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -66,13 +67,26 @@ class _Directions:
     quiet: FloatArray  # (m, m - r) orthonormal basis of the directions without noise
 
 
+class Follower(Protocol):
+    """What else is computed from the innovations of a run, in the same pass."""
+
+    @property
+    def numbers_per_step(self) -> int:
+        """Of temporary arrays."""
+
+    def add(self, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None = None) -> None:
+        """The steps first..last-1, in order, with what was heard and the innovations; None: not computed yet."""
+
+
 class InnovationSums:
     """Sums over the innovations of runs of one experiment: enough for the tests and for the diagnosis (``blame``).
 
-    In real time, ``position`` is that of ``event_order.EventOrder``, (N, m).
+    In real time, ``position`` is that of ``event_order.EventOrder``, (N, m). ``follower`` is given every step, too.
     """
 
-    def __init__(self, observation: Observation, position: IntArray | None = None) -> None:
+    def __init__(
+        self, observation: Observation, position: IntArray | None = None, follower: Follower | None = None
+    ) -> None:
         step, noise = observation.step, observation.prediction.experiment.noise
         n, m = step.modes, step.agents
         # (n, m, m) nominal covariances
@@ -98,7 +112,10 @@ class InnovationSums:
             else StateRegression(observation, MAX_REGRESSORS)
         )
         if self.independent:
-            self._add(observation, regression)
+            self._add(observation, regression, follower)
+        elif follower:
+            for first, last in observation.blocks(follower.numbers_per_step, "evidence"):
+                follower.add(first, last)
         self.terms = regression.terms
         self.score, self.covariance = regression.statistic()  # (K,), (K, K)
         self.gram = regression.gram()  # (K, K), see ``StateRegression.gram``; None where it is not available
@@ -157,16 +174,21 @@ class InnovationSums:
         weights = np.divide(weights, size, out=np.zeros_like(weights), where=size > NO_NOISE * size.max(initial=0.0))
         return direction_p(weights, self.score, self.covariance)
 
-    def _add(self, observation: Observation, regression: StateRegression | HeardRegression) -> None:
+    def _add(
+        self, observation: Observation, regression: StateRegression | HeardRegression, follower: Follower | None
+    ) -> None:
         """One pass over the run."""
         m = observation.step.agents
-        for first, last in observation.blocks(
-            max(observation.states[0].size, regression.numbers_per_step), "innovations"
-        ):
+        numbers = max(observation.states[0].size, regression.numbers_per_step)
+        if follower:
+            numbers = max(numbers, follower.numbers_per_step)
+        for first, last in observation.blocks(numbers, "innovations"):
             modes = observation.modes[first:last]
             if isinstance(regression, HeardRegression):
                 reception = HeardValues.of(observation, first, last)
                 e = innovations(observation, first, last, reception)
+                if follower:
+                    follower.add(first, last, (reception, e))
                 if self._repeated:
                     e, link_variance = self._repeated.free(e, reception)
                     reception = replace(reception, link_variance=link_variance)
@@ -176,6 +198,8 @@ class InnovationSums:
                     self.quiet = max(self.quiet, self._equalizer.quiet)
             else:
                 e = innovations(observation, first, last)
+                if follower:
+                    follower.add(first, last, (HeardValues.of(observation, first, last), e))
                 regression.add(modes, observation.states[first:last], e)
             states = observation.states[first : last + 1]
             self.largest = max(self.largest, float(np.abs(states[:-1]).max()))

@@ -23,7 +23,7 @@ part of what was used; they are tested, or reported, separately.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -86,6 +86,21 @@ class HeardValues:
             weights=weights,
             own=step.nominal.sum(axis=2)[graphs, agents] - weights.sum(axis=2),
             link_variance=observation.prediction.experiment.noise.link**2 * (weights**2).sum(axis=2),
+        )
+
+    def part(self, first: int, last: int) -> HeardValues:
+        """Of the steps first..last-1 of the block."""
+        cut = slice(first, last)
+        return replace(
+            self,
+            modes=self.modes[cut],
+            graphs=self.graphs[cut],
+            states=self.states[cut],
+            used=self.used[cut],
+            senders=self.senders[cut],
+            weights=self.weights[cut],
+            own=self.own[cut],
+            link_variance=self.link_variance[cut],
         )
 
     def heard(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:

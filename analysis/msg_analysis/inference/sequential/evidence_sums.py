@@ -107,12 +107,17 @@ class EvidenceSums:
             law = Law(step, experiment.steps, replicas, self.noisy, self._common, heard, self.plain)
             self.departures = Departures(law)
 
-    def add(self, observation: Observation, first: int, last: int) -> None:
-        """Add the steps first..last-1 of a run, which follow those that were added before."""
+    def add(
+        self, observation: Observation, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None = None
+    ) -> None:
+        """Add the steps first..last-1 of a run, which follow those that were added before.
+
+        ``heard``: what was heard in them, and their innovations (b, m, R), where these are known.
+        """
         if self._quadratic:
             self._add_quadratic(observation, first, last)
         if self.departures or not self._quadratic:
-            block = self._block(observation, first, last)
+            block = self._block(observation, first, last, heard)
             if not self._quadratic:
                 self._add_heard(observation, block)
             if self.departures:
@@ -169,10 +174,12 @@ class EvidenceSums:
                 self.common_score += float((common * seen[:, :m]).sum())
                 self.common_information += float(((common @ now_now) * common).sum())
 
-    def _block(self, observation: Observation, first: int, last: int) -> Block:
+    def _block(
+        self, observation: Observation, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None
+    ) -> Block:
         """The steps, with their innovations over the standard deviations, by what was heard."""
-        reception = HeardValues.of(observation, first, last)
-        e = innovations(observation, first, last, reception)
+        reception = heard[0] if heard else HeardValues.of(observation, first, last)
+        e = heard[1] if heard else innovations(observation, first, last, reception)
         agents = np.arange(self._step.agents)
         variances = np.diagonal(self._process, axis1=1, axis2=2)[reception.graphs, agents] + reception.link_variance
         still = variances <= self._floor

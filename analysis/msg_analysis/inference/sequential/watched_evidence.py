@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.inference.departures.departure import Finding
+from msg_analysis.inference.observed.heard_values import HeardValues
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, Question
 from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
@@ -45,23 +46,10 @@ class WatchedEvidence:
     @classmethod
     def of(cls, observation: Observation, looks: IntArray) -> WatchedEvidence:
         """Of a run, at the numbers of steps ``looks`` (T,), ascending, the last of which is all steps."""
-        prediction, step = observation.prediction, observation.step
-        sums = EvidenceSums(prediction, observation.replicas, in_detail=True)
-        numbers = (4 + step.most_neighbours) * observation.states[0].size + step.agents**2
-        if sums.error is not None:
-            numbers = max(numbers, sums.error.numbers * (1 + len(sums.error.rates)))
-        logarithms = np.empty(len(looks))
-        ends = iter(enumerate(looks.tolist()))
-        number, end = next(ends)
-        for first, last in observation.blocks(numbers, "evidence"):
-            while first < last:
-                until = min(end, last)
-                sums.add(observation, first, until)
-                first = until
-                if until == end:
-                    logarithms[number] = sums.evidence()
-                    number, end = next(ends, (number, observation.steps + 1))
-        return cls(sums, step.dt, looks, logarithms)
+        watch = Watch(observation, looks)
+        for first, last in observation.blocks(watch.numbers_per_step, "evidence"):
+            watch.add(first, last)
+        return watch.result()
 
     def findings(self) -> list[Finding]:
         """The clearest departure of each kind that is tested."""
@@ -71,6 +59,39 @@ class WatchedEvidence:
         """Of these and other runs of the same experiment; the sums of ``self`` are changed in place."""
         self.sums.merge(other.sums)
         return WatchedEvidence(self.sums, self.dt, None, None)
+
+
+class Watch:
+    """Adds the steps of a run in order, and looks at the evidence after the numbers of steps ``looks`` (T,)."""
+
+    def __init__(self, observation: Observation, looks: IntArray) -> None:
+        self._observation, self._looks = observation, looks
+        self._sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
+        self._logarithms = np.empty(len(looks))
+        self._looked = 0
+
+    @property
+    def numbers_per_step(self) -> int:
+        """Of temporary arrays."""
+        step, error = self._observation.step, self._sums.error
+        numbers = (4 + step.most_neighbours) * self._observation.states[0].size + step.agents**2
+        return int(numbers if error is None else max(numbers, error.numbers * (1 + len(error.rates))))
+
+    def add(self, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None = None) -> None:
+        """Add the steps first..last-1; ``heard`` as of ``EvidenceSums.add``."""
+        begin = first
+        while first < last:
+            until = min(int(self._looks[self._looked]), last)
+            known = heard and (heard[0].part(first - begin, until - begin), heard[1][first - begin : until - begin])
+            self._sums.add(self._observation, first, until, known)
+            if until == self._looks[self._looked]:
+                self._logarithms[self._looked] = self._sums.evidence()
+                self._looked += 1
+            first = until
+
+    def result(self) -> WatchedEvidence:
+        """After all steps."""
+        return WatchedEvidence(self._sums, self._observation.step.dt, self._looks, self._logarithms)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,7 +32,7 @@ from msg_analysis.inference.realtime.event_order import order_events
 from msg_analysis.inference.realtime.laws import Laws, measure_laws
 from msg_analysis.inference.realtime.logged_pattern import means_in_lockstep
 from msg_analysis.inference.realtime.timing import Timing, measure_timing
-from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence
+from msg_analysis.inference.sequential.watched_evidence import Watch, WatchedEvidence
 
 LOOKS = 80  # at most, at the evidence over time
 DECIDED_LOOKS = 400  # where the evidence has decided when the run ended, and so decides the verdict
@@ -80,16 +80,18 @@ class Evidence:
             means = time_means(observation)
             kept = observation.prediction.system.readout is not None
             given = means_in_lockstep(observation) if kept else means_given_path(observation)
+        watch = Watch(observation, spaced_steps(observation.steps, looks))
+        innovations = InnovationSums(observation, position, watch)
         return cls(
             steps=observation.steps,
             means=means,
             decisive=laws is None or laws.measured_against == "pattern",
             given=given,
-            innovations=InnovationSums(observation, position),
+            innovations=innovations,
             transitions=Transitions.of(observation.modes, observation.step.modes),
             loss=LossTally.of(observation),
             broadcast=BroadcastSums.of(observation),
-            watched=WatchedEvidence.of(observation, spaced_steps(observation.steps, looks)),
+            watched=watch.result(),
             timing=timing,
             laws=laws,
         )
