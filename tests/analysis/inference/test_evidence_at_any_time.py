@@ -196,7 +196,7 @@ def test_runs_together_are_one_game() -> None:
     sums = []
     for run in truth:
         observation = Observation.of(run, predict(run.record.experiment))
-        one = EvidenceSums(observation.prediction, 1)
+        one = EvidenceSums(observation.prediction, 1, in_detail=True)
         one.add(observation, 0, observation.steps)
         sums.append(one)
     sums[0].merge(sums[1])
