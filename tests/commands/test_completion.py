@@ -55,7 +55,7 @@ def complete(line: str, shell: str = "bash") -> list[str]:
 @pytest.mark.parametrize(
     ("line", "values"),
     [
-        ("msg-analysis p", ["predict"]),
+        ("msg-analysis p", ["plan", "predict"]),
         ("msg-agents re", ["recorder"]),
         ("msg-analysis predict ", ["empty/", "line.yaml", "result.json", "ring.yml", "run.json", "runs/", *names()]),
         ("msg-analysis predict li", ["line.yaml", "line_ring", "line_ring_realtime"]),

@@ -28,6 +28,8 @@ OVERVIEWS = [(program, option) for program in ("msg-analysis", "msg-agents") for
 NEW = "NEW"  # a name that is not there yet
 WORDS = {  # what each of the others is given
     ("msg-analysis", "predict"): ["EXPERIMENT"],
+    ("msg-analysis", "plan"): ["EXPERIMENT"],
+    ("msg-analysis", "spectrum"): ["BAG"],
     ("msg-analysis", "simulate"): ["EXPERIMENT", "--duration", "5", "--out", NEW],
     ("msg-analysis", "diff"): ["BAG", "BAG"],
     ("msg-analysis", "runs"): ["FOLDER"],

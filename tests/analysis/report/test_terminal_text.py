@@ -116,6 +116,7 @@ def test_prediction() -> None:
         "continuous": law,
         "emulated": law,
         "static": None,
+        "fourth_moment": {"finite": True, "radius": 0.9, "lower": 0.9, "upper": 0.9},
     }
     output = shown(theory_text.print_prediction, document)
     assert "[red]" in output

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
@@ -19,9 +20,7 @@ def job(directory: Path, script: str, *, keep: bool = False) -> Job:
     program.write_text(f"#!/bin/sh\n{script}\n")
     program.chmod(0o755)
     made = Job.of("network", DOCUMENT)
-    return Job(
-        made.id, made.kind, made.document, made.level, NetworkOptions(str(program), str(directory / "runs"), keep)
-    )
+    return dataclasses.replace(made, network=NetworkOptions(str(program), str(directory / "runs"), keep))
 
 
 def never() -> bool:
