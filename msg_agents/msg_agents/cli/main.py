@@ -20,7 +20,6 @@ input, 3 incomplete data. Modules that take long to import are imported by the c
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,9 +33,8 @@ from msg_agents.cli.web_options import WebCommand, announce, page, web_options
 from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
 from msg_agents.processes.fork_server import early_server
 from msg_agents.terminal.interruption import Interruption
-from msg_analysis.cli.console import CommandGroup, examples, print_json, print_text
+from msg_analysis.cli.console import CommandGroup, examples
 from msg_analysis.cli.options import (
-    BAG,
     PATH,
     RUN_RECORD,
     YAML,
@@ -49,7 +47,6 @@ from msg_analysis.cli.options import (
 )
 from msg_analysis.cli.runs import runs
 from msg_analysis.cli.storage_options import storage, storage_options
-from msg_analysis.common.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from msg_agents.running.run_result import ReportWhen
@@ -259,40 +256,6 @@ def run(
         finish(result, as_json, say, interruption=interruption, analyse=analyse, report=write_report)
 
 
-@main.command(epilog=examples("msg-agents check runs/line_ring_20250101_120000", "msg-agents check"))
-@click.argument("bag", type=BAG, required=False)
-@json_option
-def check(bag: Path | None, *, as_json: bool) -> None:
-    """Recompute the run in BAG with the offline twin; report the first agent and step that differ.
-
-    Without BAG, the newest bag below ./runs is checked.
-    """
-    from msg_analysis.bags.reader import read_bag
-    from msg_analysis.common.text.agent_names import with_names
-    from msg_analysis.twin.check import check as check_trajectory
-
-    path = bag or _newest_bag(Path("runs"))
-    run = read_bag(path)
-    outcome = check_trajectory(run)
-    if as_json:
-        document = {"bag": str(path), "equal": outcome.difference is None, "compared": outcome.compared}
-        print_json(document | {"missing": outcome.missing, "difference": outcome.difference})
-    elif outcome.difference:
-        first = with_names(outcome.difference, run.record.experiment.names)
-        print_text(f"{path}: differs from the twin, first: {first}")
-    else:
-        missing = f", {outcome.missing} missing" if outcome.missing else ""
-        print_text(f"{path}: equal to the twin to the last bit: {outcome.compared} states{missing}")
-    sys.exit(ExitCode.DISAGREES if outcome.difference else ExitCode.INCOMPLETE if outcome.missing else ExitCode.FINE)
-
-
-def _newest_bag(directory: Path) -> Path:
-    bags = sorted(directory.glob("*/metadata.yaml"), key=lambda file: file.stat().st_mtime)
-    if not bags:
-        raise click.UsageError(f"no bag below {directory.absolute()}: give one")
-    return bags[-1].parent
-
-
 @main.command(
     epilog=examples(
         "msg-agents prepare line_ring > run.json   # once; copy it to all hosts",
@@ -406,6 +369,7 @@ for _command in (
     begin.schema,
     runs,
     doctor,
+    replay.check,
     nodes.prepare,
     nodes.agent,
     nodes.switcher,

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The command ``play`` of ``msg-agents``: a recorded network again."""
+"""The commands ``play`` and ``check`` of ``msg-agents``: a recorded network again, by a player or by the twin."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ import click
 from click.shell_completion import CompletionItem
 
 from msg_agents.cli.ros_command import RosCommand, domain_option, enter
-from msg_analysis.cli.console import examples, print_json
+from msg_analysis.cli.console import examples, print_json, print_text
 from msg_analysis.cli.options import BAG, PositiveFloat, json_option
+from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.text.notes import print_note
 
 if TYPE_CHECKING:
@@ -250,3 +251,37 @@ class PlayBar:
     def note(self, line: str) -> None:
         """Print a note, above the bar."""
         print_note(line, self._console)
+
+
+@click.command(epilog=examples("msg-agents check runs/line_ring_20250101_120000", "msg-agents check"))
+@click.argument("bag", type=BAG, required=False)
+@json_option
+def check(bag: Path | None, *, as_json: bool) -> None:
+    """Recompute the run in BAG with the offline twin; report the first agent and step that differ.
+
+    Without BAG, the newest bag below ./runs is checked.
+    """
+    from msg_analysis.bags.reader import read_bag
+    from msg_analysis.common.text.agent_names import with_names
+    from msg_analysis.twin.check import check as check_trajectory
+
+    path = bag or _newest_bag(Path("runs"))
+    run = read_bag(path)
+    outcome = check_trajectory(run)
+    if as_json:
+        document = {"bag": str(path), "equal": outcome.difference is None, "compared": outcome.compared}
+        print_json(document | {"missing": outcome.missing, "difference": outcome.difference})
+    elif outcome.difference:
+        first = with_names(outcome.difference, run.record.experiment.names)
+        print_text(f"{path}: differs from the twin, first: {first}")
+    else:
+        missing = f", {outcome.missing} missing" if outcome.missing else ""
+        print_text(f"{path}: equal to the twin to the last bit: {outcome.compared} states{missing}")
+    sys.exit(ExitCode.DISAGREES if outcome.difference else ExitCode.INCOMPLETE if outcome.missing else ExitCode.FINE)
+
+
+def _newest_bag(directory: Path) -> Path:
+    bags = sorted(directory.glob("*/metadata.yaml"), key=lambda file: file.stat().st_mtime)
+    if not bags:
+        raise click.UsageError(f"no bag below {directory.absolute()}: give one")
+    return bags[-1].parent
