@@ -52,14 +52,14 @@ class RunObserver:
         self.note: str | None = None
         self.reached: str | None = None
         self._record, self._reader = record, CheckpointReader(record, checkpoints)
-        self._reached = -1
+        self._newest = -1
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="observer", daemon=True)
         self._thread.start()
 
     def look(self, reached: int) -> None:
         """Set the newest step that all agents have published (-1: none)."""
-        self._reached = reached
+        self._newest = reached
 
     def end(self) -> None:
         """Process what is there by now, for about ``FAREWELL`` s at most, and stop; the last report stays."""
@@ -88,7 +88,7 @@ class RunObserver:
         if not self._reader.ready():
             return
         while time.monotonic() < deadline and not (deadline == math.inf and self._over.is_set()):
-            found = self._reader.take(self._reached)
+            found = self._reader.take(self._newest)
             if not len(found[0]):
                 break
             estimate.add_whole(*found)

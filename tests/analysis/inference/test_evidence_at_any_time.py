@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.line_and_ring import experiment
 
 from msg_analysis.inference.observed.observation import Observation, spaced_steps
 from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
@@ -18,21 +19,6 @@ from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.twin.simulate import simulate
-
-
-def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:
-    run = {"dt": 0.05, "duration": duration, "replicas": 1, "seed": seed} | changes.pop("run", {})
-    return ValidExperiment.parse(
-        {
-            "name": "net",
-            "problem": "consensus",
-            "time": "continuous",
-            "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
-            "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
-            "run": run,
-            **changes,
-        }
-    )
 
 
 def observed(truth: ValidExperiment, law: ValidExperiment | None = None) -> Observation:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support import line_and_ring
 
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.observed.observation import Observation
@@ -26,18 +27,8 @@ from msg_analysis.twin.simulate import simulate
 
 
 def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:
-    run = {"dt": 0.05, "duration": duration, "replicas": 2, "seed": seed} | changes.pop("run", {})
-    return ValidExperiment.parse(
-        {
-            "name": "net",
-            "problem": "consensus",
-            "time": "continuous",
-            "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
-            "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
-            "run": run,
-            **changes,
-        }
-    )
+    """Of two replicas."""
+    return line_and_ring.experiment(seed, duration, run={"replicas": 2} | changes.pop("run", {}), **changes)
 
 
 @pytest.mark.parametrize("pieces", [1, 7, 300])

@@ -23,7 +23,8 @@ import numpy as np
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Place, Question
 from msg_analysis.inference.statistics.distributions import log_normal_tail
-from msg_analysis.inference.statistics.mixture_evidence import log_sum, variance_evidence
+from msg_analysis.inference.statistics.event_evidence import EventEvidence
+from msg_analysis.inference.statistics.mixture_evidence import variance_evidence
 from msg_analysis.types import FloatArray
 
 LARGE = 4.0  # standard deviations; smaller innovations have the evidence 0
@@ -41,9 +42,8 @@ class LargestInnovation(Departure):
 
     def __init__(self, law: Law) -> None:
         self._agents = np.flatnonzero(law.noisy)
-        self._planned = law.planned * law.replicas * len(self._agents)
-        self._samples, self._before = 0, 0  # of this run; of those that were merged
-        self._ended, self._others = -np.inf, 0.0
+        self._evidence = EventEvidence(law.planned * law.replicas * len(self._agents))
+        self._samples = 0
         self._largest, self._agent, self._place, self._runs = 0.0, 0, Place(0, 0), 1
 
     def add(self, block: Block) -> None:
@@ -54,9 +54,7 @@ class LargestInnovation(Departure):
         self._samples += white.size
         sizes = np.abs(white)
         large = sizes[sizes > LARGE]
-        if len(large):
-            logarithms = variance_evidence(np.ones(len(large)), large**2)[:, 0]
-            self._ended = float(np.logaddexp(self._ended, log_sum(logarithms, 0) - math.log(self._planned)))
+        self._evidence.add(white.size, variance_evidence(np.ones(len(large)), large**2)[:, 0])
         at = int(np.argmax(sizes))
         if not sizes.flat[at] <= abs(self._largest):  # also a NaN
             step, place, _ = np.unravel_index(at, white.shape)
@@ -65,32 +63,25 @@ class LargestInnovation(Departure):
 
     def merge(self, other: Self) -> None:
         """The larger one."""
-        self._others += other._logarithm()
-        self._before += other._samples + other._before
+        self._evidence.merge(other._evidence)
+        self._samples += other._samples
         if abs(other._largest) > abs(self._largest):
             self._largest, self._agent, self._place = other._largest, other._agent, other._place.later(self._runs)
         self._runs += other._runs
 
     def finding(self) -> Finding | None:
         """The largest."""
-        samples = self._samples + self._before
-        if not samples:
+        if not self._samples:
             return None
-        log_p = math.log(2.0 * samples) + float(log_normal_tail(abs(self._largest)))
+        log_p = math.log(2.0 * self._samples) + float(log_normal_tail(abs(self._largest)))
         return Finding(
             self.test, min(0.0, log_p), agent=self._agent, place=self._place, estimate=self._largest, expected=0.0
         )
 
     def evidence(self) -> FloatArray:
         """(1, 1)."""
-        return np.array([[self._logarithm()]]) if self._planned else np.empty((0, 1))
+        return np.array([[self._evidence.logarithm()]]) if self._evidence.planned else np.empty((0, 1))
 
     def questions(self) -> list[Question]:
         """One, about all agents."""
         return [("largest innovation", ())]
-
-    def _logarithm(self) -> float:
-        rest = max(0.0, 1.0 - self._samples / self._planned)
-        with np.errstate(divide="ignore"):
-            mean = np.logaddexp(self._ended, np.log(rest))
-        return float(self._others + np.logaddexp(0.0, mean) - math.log(2.0))

@@ -16,13 +16,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Self
 
 import numpy as np
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Place, Question
-from msg_analysis.inference.statistics.mixture_evidence import log_sum
+from msg_analysis.inference.statistics.event_evidence import EventEvidence
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 ROUNDINGS = 4.0  # of the largest state, in the computation of a state, at most
@@ -42,8 +41,7 @@ class StandingStill(Departure):
 
     def __init__(self, law: Law) -> None:
         self._agents = np.flatnonzero(law.noisy)
-        self._planned, self._steps = law.planned, 0
-        self._ended, self._others = -np.inf, 0.0
+        self._evidence = EventEvidence(law.planned * len(self._agents))
         self._since = np.full(len(self._agents), -1)  # first step of what may go on, from 0; -1: moved
         self._longest: tuple[int, int, Place] | None = None  # steps, agent, place
         self._runs = 1
@@ -52,14 +50,10 @@ class StandingStill(Departure):
         """Look at the steps of a block."""
         before, after = block.reception.states, block.after
         still: BoolArray = (after[:, self._agents] == before[:, self._agents]).all(axis=2)
-        self._steps += len(still)
         at, which = np.nonzero(still)
-        if len(at):
-            size = np.spacing(np.abs(before[at]).max(axis=1))  # (s, R)
-            chance = ROUNDINGS * (size / block.scale[at, self._agents[which]][:, None] + EPSILON)
-            rare = -np.log(np.minimum(chance, 1.0)).sum(axis=1)
-            share = np.log(float(self._planned * len(self._agents)))
-            self._ended = float(np.logaddexp(self._ended, log_sum(rare, 0) - share))
+        size = np.spacing(np.abs(before[at]).max(axis=1))  # (s, R)
+        chance = ROUNDINGS * (size / block.scale[at, self._agents[which]][:, None] + EPSILON)
+        self._evidence.add(still.size, -np.log(np.minimum(chance, 1.0)).sum(axis=1))
         for place in np.unique(which).tolist():
             self._stretches(place, block.first, block.first + at[which == place])
         moved = ~still[-1]
@@ -80,7 +74,7 @@ class StandingStill(Departure):
 
     def merge(self, other: Self) -> None:
         """Nothing goes on from one run to another."""
-        self._others += other._logarithm()
+        self._evidence.merge(other._evidence)
         if other._longest and (self._longest is None or other._longest[0] > self._longest[0]):
             length, agent, place = other._longest
             self._longest = (length, agent, place.later(self._runs))
@@ -90,7 +84,7 @@ class StandingStill(Departure):
         """The longest stretch."""
         if not len(self._agents):
             return None
-        log_p = min(0.0, -self._logarithm())
+        log_p = min(0.0, -self._evidence.logarithm())
         if self._longest is None:
             return Finding(self.test, log_p)
         length, agent, place = self._longest
@@ -98,14 +92,8 @@ class StandingStill(Departure):
 
     def evidence(self) -> FloatArray:
         """(1, 1)."""
-        return np.array([[self._logarithm()]]) if len(self._agents) else np.empty((0, 1))
+        return np.array([[self._evidence.logarithm()]]) if len(self._agents) else np.empty((0, 1))
 
     def questions(self) -> list[Question]:
         """One, about all agents."""
         return [("agents that stand still", ())]
-
-    def _logarithm(self) -> float:
-        rest = max(0.0, 1.0 - self._steps / self._planned)
-        with np.errstate(divide="ignore"):
-            mean = np.logaddexp(self._ended, np.log(rest))
-        return float(self._others + np.logaddexp(0.0, mean) - math.log(2.0))

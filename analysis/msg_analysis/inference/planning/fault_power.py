@@ -137,10 +137,12 @@ def fault_powers(
     faults
         each is one row of the result
     """
-    step, sums = prediction.step, EvidenceSums(prediction, replicas)
-    questions = {kind: logs.size for kind, logs in sums.families().items()}
+    step, sums = prediction.step, EvidenceSums(prediction, replicas, in_detail=True)
+    departures = sums.departures.families() if sums.departures else {}
+    # While a run goes on, departures are not looked for.
+    questions = {kind: logs.size for kind, logs in sums.families().items() if kind not in departures}
     weights = dict(zip(questions, kind_weights(list(questions)).tolist(), strict=True))
-    share = level / _family(prediction, replicas)
+    share = level / (_family(prediction) + len(departures))
     found = []
     for fault in faults:
         informations = {
@@ -165,12 +167,10 @@ def fault_powers(
 _Informations = dict[tuple[int | None, int | None], list[StepInformation]]
 
 
-def _family(prediction: Prediction, replicas: int) -> int:
-    """Number of tests of a run: errors and covariance, innovations, departures, and what else the experiment has."""
+def _family(prediction: Prediction) -> int:
+    """Number of tests without departures: errors and covariance, innovations, and those of what the experiment has."""
     step = prediction.step
-    departures = EvidenceSums(prediction, replicas, in_detail=True).departures
-    more = len(departures.families()) if departures else 0
-    return 1 + step.agents + 1 + 4 + more + (step.modes > 1) + (step.loss > 0.0) + (step.broadcast > 0.0)
+    return 1 + step.agents + 1 + 4 + (step.modes > 1) + (step.loss > 0.0) + (step.broadcast > 0.0)
 
 
 def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
