@@ -195,4 +195,5 @@ def transient_mean(
             break
         total += away
         away, law_away = system.advance(away, law_away)
+        law_away -= law_away.sum() * system.stationary  # the rounding of its sum, 0, would stay for ever
     return np.asarray(steady.sum(axis=0) + total.sum(axis=0) / steps)

@@ -20,6 +20,7 @@ import math
 from typing import Self
 
 import numpy as np
+import scipy.fft
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Question
 from msg_analysis.inference.statistics.distributions import log_normal_tail
@@ -51,13 +52,18 @@ class LongLags(Departure):
         white = block.white[:, self._agents]
         joined = np.concatenate([self._tail, white])
         old, end = len(self._tail), len(joined)
-        squares = (joined**2).sum(axis=2)
-        for lag in range(1, min(LAGS, end - 1) + 1):
-            begin = max(old, lag)
-            late, early = joined[begin:], joined[begin - lag : end - lag]
-            self.score[lag - 1] += np.einsum("bmr,bmr->m", late, early)
-            self.information[lag - 1] += squares[begin - lag : end - lag].sum(axis=0)
-            self.products[lag - 1] += late.shape[0] * late.shape[2]
+        lags = np.arange(1, min(LAGS, end - 1) + 1)
+        # Products of all lags at once, by Fourier transforms so long that no two of them overlap.
+        length = scipy.fft.next_fast_len(len(white) + LAGS, real=True)
+        late = np.zeros((*white.shape[1:], length))
+        late[:, :, old:end] = np.moveaxis(white, 0, 2)
+        every = scipy.fft.rfft(np.moveaxis(joined, 0, 2), length)
+        spectrum = np.einsum("mrf,mrf->mf", scipy.fft.rfft(late), every.conj())
+        self.score[: len(lags)] += scipy.fft.irfft(spectrum, length)[:, lags].T
+        begin = np.maximum(old, lags)
+        sums = np.vstack([np.zeros(len(self._agents)), (joined**2).sum(axis=2).cumsum(axis=0)])
+        self.information[: len(lags)] += sums[end - lags] - sums[begin - lags]
+        self.products[: len(lags)] += (end - begin) * white.shape[2]
         self._tail = joined[-LAGS:].copy()
 
     def merge(self, other: Self) -> None:
