@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -204,7 +205,7 @@ def test_noise_by_graph() -> None:
     assert len(sums.evidence()) == 12
 
 
-def test_noise_over_time() -> None:
+def test_noise_over_time_by_windows() -> None:
     """A burst in four steps; the p is the least of a loop over all windows, and the evidence their mean."""
     observation = observed(duration=5.0)
     observation.states[31:35, 2] += 1.0
@@ -224,10 +225,46 @@ def test_noise_over_time() -> None:
     assert finding is not None
     assert finding.place is not None
     p, level, first, agent = min(least)
-    assert np.exp(finding.log_p) == pytest.approx(p, rel=1e-6)
+    assert np.exp(finding.log_p) == pytest.approx(p, rel=1e-6)  # of 100 steps no lag has enough products
     assert (finding.place.first, finding.place.last) == (first + 1, first + 2**level)
     assert finding.agent == agent
-    assert np.exp(sums.evidence()[:, 0]) == pytest.approx(evidence)
+    assert np.exp(sums.evidence()[:6, 0]) == pytest.approx(evidence)
+
+
+@pytest.mark.parametrize("agent", [2, None])
+def test_noise_over_time_by_lags(agent: int | None) -> None:
+    """A variance that swings with a period of 10 steps, of one agent or of all; against a loop over the lags."""
+    observation = observed(duration=60.0)
+    white, size = whitened(observation), 0.3 if agent is None else 0.8
+    which = slice(None) if agent is None else slice(agent, agent + 1)
+    white[:, which] *= np.sqrt(1.0 + size * np.sin(2.0 * np.pi * np.arange(1200) / 10.0))[:, None, None]
+    sums = NoiseOverTime(Law(observation.step, 1200, 2, np.ones(5, dtype=bool), True, np.empty((0, 2), int), True))
+    for first in range(0, 1200, 37):
+        part = SimpleNamespace(first=first, white=white[first : first + 37])
+        sums.add(part)  # type: ignore[arg-type]
+    squares = (white**2).sum(axis=2)
+    squares = np.column_stack([squares, squares.sum(axis=1)])
+    scores = stats.norm.ppf(stats.chi2.cdf(squares, [2, 2, 2, 2, 2, 10]))
+    p: dict[float, tuple[int, int]] = {}
+    evidence = np.zeros((100, 6))
+    for lag in range(1, 101):
+        score, information = (scores[lag:] * scores[:-lag]).sum(axis=0), (scores[:-lag] ** 2).sum(axis=0)
+        for column, z in enumerate(score / np.sqrt(information)):
+            p[2 * 600 * 2 * stats.norm.sf(abs(z))] = lag, column
+        for tau in (0.05, 0.3):
+            spread = 1.0 + tau**2 * information
+            evidence[lag - 1] += np.exp(tau**2 * score**2 / (2.0 * spread)) / np.sqrt(spread) / 200.0
+    finding = sums.finding()
+    assert finding is not None
+    lag, column = p[min(p)]
+    assert lag % 10 in (0, 5)
+    assert np.exp(finding.log_p) == pytest.approx(min(p))
+    assert (finding.agent, finding.span) == (agent, (lag, lag))
+    assert column == (5 if agent is None else agent)
+    assert np.exp(sums.evidence()[6:, 0]) == pytest.approx(evidence.sum(axis=0))
+    words = [text for text, _ in sums.questions()]
+    assert words[8] == "size of the noise of agent 3 and of its own earlier noise"
+    assert len(words) == len(sums.evidence())
 
 
 def test_standing_still() -> None:
@@ -271,8 +308,8 @@ def test_long_lags() -> None:
     for lag in range(1, 101):
         late, early = white[lag:], white[:-lag]
         score, information = (late * early).sum(axis=(0, 2)), (early**2).sum(axis=(0, 2))
-        assert sums.score[lag - 1] == pytest.approx(score, abs=1e-9)
-        assert sums.information[lag - 1] == pytest.approx(information)
+        assert sums.sums.score[lag - 1] == pytest.approx(score, abs=1e-9)
+        assert sums.sums.information[lag - 1] == pytest.approx(information)
         p += (1000 * 2 * stats.norm.sf(np.abs(score / np.sqrt(information)))).tolist()
         p.append(200 * 2 * stats.norm.sf(abs(score.sum() / np.sqrt(information.sum()))))
     finding = sums.finding()
@@ -346,14 +383,15 @@ def test_runs_are_merged() -> None:
         for kind in (NoiseOverTime, StandingStill, LargestInnovation, SwappedGraphs)
     ]
     for one, other in pairs:
-        expected = one.evidence() + other.evidence()
+        windows = 6 if isinstance(one, NoiseOverTime) else None  # the others are lags
+        expected = (one.evidence() + other.evidence())[:windows]
         one.merge(other)  # type: ignore[arg-type]
-        assert one.evidence() == pytest.approx(expected)
+        assert one.evidence()[:windows] == pytest.approx(expected)
     largest = pairs[2][0].finding()
     assert largest is not None
     assert largest.place is not None
     assert (largest.place.run, largest.place.first) == (2, 121)
     lags = [summed(each, LongLags) for each in (first, second)]
-    products = lags[0].score + lags[1].score
+    products = lags[0].sums.score + lags[1].sums.score
     lags[0].merge(lags[1])
-    assert (lags[0].score == products).all()
+    assert (lags[0].sums.score == products).all()

@@ -87,6 +87,12 @@ def _cause(one: Finding, names: Sequence[str], p: float) -> Cause:
             f"not {expected:.3g}"
         )
         return Cause("sojourns", words, None, None, graph, value, interval, expected, p)
+    if one.test == NoiseOverTime.test and one.span:
+        words = (
+            f"the size of the noise of {whose} has correlation {said} with its own {one.span[0]} steps before, not 0: "
+            "its variance changes in time"
+        )
+        return Cause("noise", words, agent, None, None, value, interval, expected, p)
     if one.test in (NoiseByGraph.test, NoiseOverTime.test):
         when = f"in graph {graph}" if one.place is None else _steps(one.place)
         words = f"the noise variance of {whose} is {said} times what the file says {when}"

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -31,39 +32,45 @@ LAGS = 100
 MIN_SAMPLES = 100  # fewest products for the normal law of their sum
 
 
-class LongLags(Departure):
-    """Regression of every innovation on that of the same agent 1 to 100 steps before; expected coefficient 0.
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """The clearest dependence on earlier numbers."""
+
+    log_p: float  # of all lags and columns together
+    column: int
+    steps: int
+    coefficient: float
+    standard_error: float
+
+
+class LagSums:
+    """Regression of N(0, 1) numbers on those of the same column 1 to 100 steps before; expected coefficient 0.
 
     Given the past, the sum of the products is a martingale whose variance is the sum of the squares of the earlier
-    ones. The test takes the clearest lag: of an agent, or of all together where they are independent, with half of the
-    level each and the number of coefficients as a factor (Bonferroni).
+    numbers.
     """
 
-    test = "innovations: lags to 100"
-
-    def __init__(self, law: Law) -> None:
-        self._agents, self._together = np.flatnonzero(law.noisy), bool(law.apart and law.noisy.sum() > 1)
-        self._tail = np.empty((0, len(self._agents), law.replicas))
-        shape = (LAGS, len(self._agents))
+    def __init__(self, columns: int, samples: int) -> None:
+        self._tail = np.empty((0, columns, samples))
+        shape = (LAGS, columns)
         self.score, self.information, self.products = np.zeros(shape), np.zeros(shape), np.zeros(LAGS, np.int64)
 
-    def add(self, block: Block) -> None:
-        """Add the products with the earlier innovations."""
-        white = block.white[:, self._agents]
-        joined = np.concatenate([self._tail, white])
+    def add(self, numbers: FloatArray) -> None:
+        """Add the products of numbers (b, columns, samples) with themselves and the earlier ones."""
+        joined = np.concatenate([self._tail, numbers])
         old, end = len(self._tail), len(joined)
         lags = np.arange(1, min(LAGS, end - 1) + 1)
         # Products of all lags at once, by Fourier transforms so long that no two of them overlap.
-        length = scipy.fft.next_fast_len(len(white) + LAGS, real=True)
-        late = np.zeros((*white.shape[1:], length))
-        late[:, :, old:end] = np.moveaxis(white, 0, 2)
+        length = scipy.fft.next_fast_len(len(numbers) + LAGS, real=True)
+        late = np.zeros((*numbers.shape[1:], length))
+        late[:, :, old:end] = np.moveaxis(numbers, 0, 2)
         every = scipy.fft.rfft(np.moveaxis(joined, 0, 2), length)
         spectrum = np.einsum("mrf,mrf->mf", scipy.fft.rfft(late), every.conj())
         self.score[: len(lags)] += scipy.fft.irfft(spectrum, length)[:, lags].T
         begin = np.maximum(old, lags)
-        sums = np.vstack([np.zeros(len(self._agents)), (joined**2).sum(axis=2).cumsum(axis=0)])
+        sums = np.vstack([np.zeros(joined.shape[1]), (joined**2).sum(axis=2).cumsum(axis=0)])
         self.information[: len(lags)] += sums[end - lags] - sums[begin - lags]
-        self.products[: len(lags)] += (end - begin) * white.shape[2]
+        self.products[: len(lags)] += (end - begin) * numbers.shape[2]
         self._tail = joined[-LAGS:].copy()
 
     def merge(self, other: Self) -> None:
@@ -72,41 +79,75 @@ class LongLags(Departure):
         self.information += other.information
         self.products += other.products
 
+    def pooled(self) -> LagSums:
+        """Of all columns together, where these are independent of each other."""
+        whole = LagSums(1, 0)
+        whole.score, whole.information = (each.sum(axis=1, keepdims=True) for each in (self.score, self.information))
+        whole.products = self.products
+        return whole
+
+    def clearest(self) -> Lag | None:
+        """Of all lags and columns (Bonferroni); None where there are too few numbers."""
+        lags = np.flatnonzero(self.products >= MIN_SAMPLES)
+        score, information = self.score[lags], self.information[lags]
+        if not score.size:
+            return None
+        z = score / np.sqrt(np.maximum(information, np.finfo(float).tiny))
+        row, column = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
+        log_p = math.log(2.0 * z.size) + float(log_normal_tail(abs(z[row, column])))
+        coefficient = float(score[row, column] / information[row, column])
+        return Lag(
+            log_p, int(column), int(lags[row]) + 1, coefficient, 1.0 / math.sqrt(float(information[row, column]))
+        )
+
+    def evidence(self) -> FloatArray:
+        """(columns, 100, K) logarithms."""
+        return coefficient_evidence(self.score.T, self.information.T)
+
+
+class LongLags(Departure):
+    """Regression of every innovation on that of the same agent 1 to 100 steps before.
+
+    The test takes the clearest lag: of an agent, or of all together where they are independent, with half of the
+    level each.
+    """
+
+    test = "innovations: lags to 100"
+
+    def __init__(self, law: Law) -> None:
+        self._agents, self._together = np.flatnonzero(law.noisy), bool(law.apart and law.noisy.sum() > 1)
+        self.sums = LagSums(len(self._agents), law.replicas)
+
+    def add(self, block: Block) -> None:
+        """Add the innovations of a block."""
+        self.sums.add(block.white[:, self._agents])
+
+    def merge(self, other: Self) -> None:
+        """Add the sums of other runs."""
+        self.sums.merge(other.sums)
+
     def finding(self) -> Finding | None:
         """The clearest lag."""
-        lags = np.flatnonzero(self.products >= MIN_SAMPLES)
-        if not len(lags) or not len(self._agents):
+        each, whole = self.sums.clearest(), self.sums.pooled().clearest() if self._together else None
+        if each is None:
             return None
-        groups = [(self.score[lags], self.information[lags])]
-        if self._together:
-            score, information = groups[0]
-            groups.append((score.sum(axis=1, keepdims=True), information.sum(axis=1, keepdims=True)))
-        candidates = []
-        for group, (score, information) in enumerate(groups):
-            z = score / np.sqrt(np.maximum(information, np.finfo(float).tiny))
-            row, column = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
-            log_p = math.log(2.0 * z.size * len(groups)) + float(log_normal_tail(abs(z[row, column])))
-            coefficient = float(score[row, column] / information[row, column])
-            error = 1.0 / math.sqrt(information[row, column])
-            agent = int(self._agents[column]) if group == 0 else None
-            candidates.append((log_p, agent, int(lags[row]) + 1, coefficient, error))
-        log_p, agent, lag, coefficient, error = min(candidates, key=lambda candidate: candidate[0])
+        best = min((lag for lag in (each, whole) if lag), key=lambda lag: lag.log_p)
         return Finding(
             self.test,
-            min(0.0, log_p),
-            agent=agent,
-            span=(lag, lag),
-            estimate=coefficient,
-            standard_error=error,
+            min(0.0, best.log_p + math.log(1.0 + self._together)),
+            agent=None if best is whole else int(self._agents[best.column]),
+            span=(best.steps, best.steps),
+            estimate=best.coefficient,
+            standard_error=best.standard_error,
             expected=0.0,
         )
 
     def evidence(self) -> FloatArray:
         """(100 (agents + 1), K): lags of each agent, and of all together."""
-        score, information = self.score.T, self.information.T
+        found = self.sums.evidence()
         if self._together:
-            score, information = (np.vstack([each, each.sum(axis=0)]) for each in (score, information))
-        return coefficient_evidence(score.ravel(), information.ravel())
+            found = np.concatenate([found, self.sums.pooled().evidence()])
+        return found.reshape(-1, found.shape[-1])
 
     def questions(self) -> list[Question]:
         """A lag of an agent, or of all."""

@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 from scipy import special
 
 
@@ -57,6 +58,12 @@ def log_chi2_below(x: float, dof: float) -> float:
     # The power series of the incomplete gamma function, bounded by a geometric one.
     first = half * math.log(x / 2.0) - x / 2.0 - float(special.gammaln(half + 1.0))
     return first - math.log1p(-x / (dof + 2.0))
+
+
+def normal_score(x: Any, dof: Any) -> Any:
+    """Phi^-1(P(X <= x)) of a chi-square variable X, which is N(0, 1) if x is one; between -8 and 8."""
+    tail = np.nan_to_num(special.chdtrc(dof, x), nan=0.0)
+    return -special.ndtri(np.clip(tail, 1e-15, 1.0 - 1e-15))
 
 
 def chi2_below(x: Any, dof: Any) -> Any:
