@@ -29,6 +29,8 @@ from msg_analysis.inference.statistics.mixture_evidence import log_mean, varianc
 from msg_analysis.inference.statistics.windows import WindowEvidence, Windows
 from msg_analysis.types import FloatArray, IntArray
 
+SHARE = 0.1  # of the logarithm of the p-value
+
 
 class NoiseOverTime(Departure):
     """Squares of standardised innovations in windows of 1, 2, 4, ... steps, by agent and of all where independent.
@@ -116,12 +118,17 @@ class NoiseOverTime(Departure):
         return np.append(seen, np.zeros(levels - len(seen), np.int64))
 
     def finding(self) -> Finding | None:
-        """The window or the lag, and the agent or all agents, whose noise is the least likely."""
-        found = [one for one in (self._window(), self._lag()) if one]
+        """The window or the lag, and the agent or all agents, whose noise is the least likely.
+
+        A window is named, since it says where, even if a lag is clearer, but not where it says next to nothing.
+        """
+        window, lag = self._window(), self._lag()
+        found = [one for one in (window, lag) if one]
         if not found:
             return None
         best = min(found, key=lambda one: one.log_p)
-        return replace(best, log_p=min(0.0, best.log_p + math.log(len(found))))
+        named = window if window and window.log_p <= SHARE * best.log_p else best
+        return replace(named, log_p=min(0.0, best.log_p + math.log(len(found))))
 
     def _agent(self, column: int) -> int | None:
         return int(self._agents[column]) if column < len(self._agents) else None
