@@ -55,13 +55,22 @@ def test_lag_0_is_the_system_error_given_the_path() -> None:
     assert result.covariance[0, 0] == pytest.approx(variance, rel=5e-3)
 
 
-@pytest.mark.parametrize("noise", [{"process": 1.0}, {"process": 1.0, "loss": 0.3, "link": 0.5}])
+@pytest.mark.parametrize(
+    "noise",
+    [
+        {"process": 1.0},
+        {"process": 1.0, "loss": 0.3, "link": 0.5},
+        {"process": 1.0, "delay": 2},
+        {"process": 1.0, "delay": 3, "link": 0.5, "broadcast": 0.3},
+    ],
+)
 def test_many_states_of_one_path(noise: dict[str, Any]) -> None:
     """3000 replicas of one path: mean and covariance of the sums are the stated ones, 4.5 standard errors allowed."""
     run = observed(line_ring(run={"duration": 10, "replicas": 3000, "start": [1, 0, -2, 0, 3]}, noise=noise))
     result = found(run, LAGS)
     assert np.abs((result.measured - result.expected) / result.standard_errors).max() < 4.5
-    errors = run.states - run.states.mean(axis=1, keepdims=True)
+    states = run.states[: result.steps + 1]
+    errors = states - states.mean(axis=1, keepdims=True)
     means = np.array([(errors[lag:] * errors[: len(errors) - lag]).sum(axis=1).mean(axis=0) for lag in LAGS.tolist()])
     scatter = np.cov(means) / run.replicas
     assert result.covariance == pytest.approx(scatter, rel=0.15)
@@ -79,7 +88,10 @@ def test_windows_are_products() -> None:
             assert window == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
-@pytest.mark.parametrize("noise", [{"process": 1.0}, {"process": 1.0, "loss": 0.2, "broadcast": 0.3}])
+@pytest.mark.parametrize(
+    "noise",
+    [{"process": 1.0}, {"process": 1.0, "loss": 0.2, "broadcast": 0.3}, {"process": 1.0, "delay": 2, "link": 0.3}],
+)
 def test_p_values_of_correct_runs_are_uniform(noise: dict[str, Any]) -> None:
     """60 runs; Kolmogorov and Smirnov at 0.1 %: so often it fails with another seed."""
     experiment = line_ring(noise=noise)
@@ -110,7 +122,10 @@ def test_what_is_not_tested() -> None:
     assert why_not_tested(observed(line_ring())) is None
     assert "too few" in str(why_not_tested(observed(line_ring(run={"duration": 4}))))
     assert "real time" in str(why_not_tested(observed(line_ring(run={"pace": "realtime"}))))
-    assert "older" in str(why_not_tested(observed(line_ring(noise={"process": 1.0, "delay": 1}))))
+    assert why_not_tested(observed(line_ring(noise={"process": 1.0, "delay": 1}))) is None
+    both, held = {"delay": 1, "loss": 0.1}, {"loss": 0.1, "on_loss": "hold"}
+    assert "come later" in str(why_not_tested(observed(line_ring(noise={"process": 1.0, **both}))))
+    assert "keep values" in str(why_not_tested(observed(line_ring(noise={"process": 1.0, **held}))))
 
 
 def test_without_noise_there_is_no_p() -> None:

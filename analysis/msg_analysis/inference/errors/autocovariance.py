@@ -15,10 +15,10 @@
 
 """Autocovariance of the errors of a run next to its law given the path of the graphs and the lost messages.
 
-Given the path, y(k + 1) = W_k y(k) + w_k with independent w_k ~ N(0, N_k) (``given_path``). For lag l let
-Phi_k = W_k+l-1 ... W_k, so that sum_k y(k)^T y(k + l) has the expectation sum_k tr(H_k M(k)), H_k the symmetric part of
-Phi_k. With Y(j) = H_j + W_j^T Y(j + 1) W_j and a_j = sum over j - l < k <= j of (W_k+l-1 ... W_j+1)^T y(k), the sum
-minus its expectation is the sum of martingale differences
+Given the path, y(k + 1) = W_k y(k) + w_k with independent w_k ~ N(0, N_k) (``given_path``), and the errors are e = C y
+(C^T C = I without a delay). For lag l let Phi_k = W_k+l-1 ... W_k, so that sum_k e(k)^T e(k + l) has the expectation
+sum_k tr(H_k M(k)), H_k the symmetric part of C^T C Phi_k. With Y(j) = H_j + W_j^T Y(j + 1) W_j and a_j = sum over
+j - l < k <= j of (W_k+l-1 ... W_j+1)^T C^T C y(k), the sum minus its expectation is the sum of martingale differences
 
     D_j = w_j^T Y(j + 1) w_j - tr(Y(j + 1) N_j) + b_j^T w_j,    b_j = 2 Y(j + 1) W_j y(j) + a_j
 
@@ -119,8 +119,10 @@ def why_not_tested(observation: Observation) -> str | None:
     """Why the law given the path does not cover a run; None where it does."""
     if observation.prediction.experiment.run.pace == "realtime":
         return "in real time agents use values of different steps"
-    if observation.prediction.system.readout is not None:
-        return "agents use values that are older than a step"
+    if observation.prediction.system.messages is not None:
+        return "agents keep values from step to step"
+    if observation.step.delay and observation.step.loss:
+        return "messages are lost and come later"
     if observation.steps < LEAST_STEPS:
         return f"{observation.steps} steps are too few: at least {LEAST_STEPS} are needed"
     return None
@@ -152,19 +154,20 @@ def logged_autocovariance(observation: Observation, lags: IntArray | None = None
     steps = min(observation.steps, int(MOST_NUMBERS / max(1, len(chosen) * d * max(d, replicas))))
     chosen = chosen[chosen < steps]
     which, matrices, noise = kinds[0][:steps], kinds[1], kinds[2]
-    deviations = observation.states[: steps + 1] - observation.step.reference
-    y = without_rounding(np.einsum("kmr,md->krd", deviations, system.frame), system, observation.largest)
+    y, product = _coordinates(observation, steps)
+    seen = y if product is None else y @ product
     along = matrices[which]  # (N, d, d) W_k
     windows = [_windows(along, lag) for lag in chosen.tolist()]
     forms = np.zeros((len(chosen), steps + 1, d, d))
     measured, expected, counts = np.empty(len(chosen)), np.empty(len(chosen)), steps + 1 - chosen
     for place, (lag, window) in enumerate(zip(chosen.tolist(), windows, strict=True)):
-        forms[place, : len(window)] = (window + window.transpose(0, 2, 1)) / 2.0
-        measured[place] = (y[: len(window)] * y[lag:]).sum() / replicas
+        form = window if product is None else product @ window
+        forms[place, : len(window)] = (form + form.transpose(0, 2, 1)) / 2.0
+        measured[place] = (seen[: len(window)] * y[lag:]).sum() / replicas
     moments = _moments(which, matrices, noise, y[0].T @ y[0] / replicas)
     for place, form in enumerate(forms):
         expected[place] = np.einsum("kab,kab->", form, moments)
-    covariance = _covariance(which, matrices, noise, forms, y, chosen)
+    covariance = _covariance(which, matrices, noise, forms, (y, seen), chosen)
     chi2, dof = quadratic_form(measured - expected, covariance)
     found: Spectrum = spectrum(observation.prediction, chosen, np.empty(0))
     return LoggedAutocovariance(
@@ -176,6 +179,17 @@ def logged_autocovariance(observation: Observation, lags: IntArray | None = None
         covariance=covariance / np.outer(counts, counts),
         p=float(chi2_tail(chi2, dof)) if dof else None,
     )
+
+
+def _coordinates(observation: Observation, steps: int) -> tuple[FloatArray, FloatArray | None]:
+    """(N + 1, R, d) y, and (d, d) C^T C of the errors e = C y; None where that is the identity."""
+    system, delay = observation.prediction.system, observation.step.delay
+    deviations = observation.states[: steps + 1] - observation.step.reference
+    times = np.arange(steps + 1)[:, None] - np.arange(delay + 1)
+    stacked = deviations[np.maximum(times, 0)]  # (N + 1, delay + 1, m, R): what was before the start is as the start
+    y = np.einsum("ksr,sd->krd", stacked.reshape(steps + 1, -1, observation.replicas), system.lift)
+    product = None if system.readout is None else system.readout.T @ system.readout
+    return without_rounding(y, system, observation.largest), product
 
 
 def _chosen_lags(observation: Observation) -> IntArray:
@@ -215,16 +229,22 @@ def _moments(which: IntArray, matrices: FloatArray, noise: FloatArray, start: Fl
 
 
 def _covariance(
-    which: IntArray, matrices: FloatArray, noise: FloatArray, forms: FloatArray, y: FloatArray, lags: IntArray
+    which: IntArray,
+    matrices: FloatArray,
+    noise: FloatArray,
+    forms: FloatArray,
+    coordinates: tuple[FloatArray, FloatArray],
+    lags: IntArray,
 ) -> FloatArray:
-    """(L, L): sum of Cov(D_j | past), backwards over the steps; forms (L, N + 1, d, d) H, y (N + 1, R, d)."""
+    """(L, L): sum of Cov(D_j | past), backwards over the steps; forms (L, N + 1, d, d) H, y, C^T C y (N + 1, R, d)."""
+    y, seen = coordinates
     steps, replicas, number = len(which), y.shape[1], len(lags)
     along = matrices[which]
-    left = np.zeros((number, steps + 1, *y.shape[1:]))  # (W_k+l-1 ... W_k+1)^T y(k), what leaves a_j with k
+    left = np.zeros((number, steps + 1, *y.shape[1:]))  # (W_k+l-1 ... W_k+1)^T C^T C y(k), what leaves a_j with k
     for place, lag in enumerate(lags.tolist()):
         if lag:
             window = _windows(along[1:], lag - 1)  # from k + 1 on
-            left[place, : len(window)] = y[: len(window)] @ window
+            left[place, : len(window)] = seen[: len(window)] @ window
     total = np.zeros((number, number))
     dual = forms[:, -1].copy()  # Y(j + 1)
     felt = np.zeros((number, *y.shape[1:]))  # a_j + 1, without what leaves it
@@ -233,9 +253,9 @@ def _covariance(
         felt = felt @ matrices[which[j + 1]] if j + 1 < steps else felt
         for place, lag in enumerate(lags.tolist()):
             if lag and j - lag + 1 >= 0:
-                felt[place] += y[j - lag + 1]
-        seen = dual @ noise[kind]
-        total += 2.0 / replicas * (seen.reshape(number, -1) @ seen.transpose(0, 2, 1).reshape(number, -1).T)
+                felt[place] += seen[j - lag + 1]
+        added = dual @ noise[kind]
+        total += 2.0 / replicas * (added.reshape(number, -1) @ added.transpose(0, 2, 1).reshape(number, -1).T)
         slope = (2.0 * (y[j] @ transposed[kind]) @ dual + felt).reshape(number * replicas, -1)
         weighted = (slope @ noise[kind]).reshape(number, -1)
         total += weighted @ slope.reshape(number, -1).T / replicas**2
