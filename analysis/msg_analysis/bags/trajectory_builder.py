@@ -31,7 +31,7 @@ from msg_analysis.errors import BagError
 from msg_analysis.model.experiment.memory import amount, available_memory
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.step.air import LOST
-from msg_analysis.model.step.step_model import Wiring
+from msg_analysis.model.step.logged_inputs import LoggedInputs
 from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.wire.refusals import Refusal
 
@@ -193,9 +193,9 @@ class Collected:
         self._contradicted.append(np.unique(cell[again[differs]]))
 
     @cached_property
-    def _links(self) -> _Links:
+    def _links(self) -> LoggedInputs:
         """Made when the first ``heard`` has to be interpreted: most runs have none."""
-        return _Links(self._record.model, self._experiment.steps, self._delay)
+        return LoggedInputs(self._record.model, self._experiment)
 
     def _good(self, states: States) -> tuple[States, FloatArray]:
         """Those that can be states of this run, and their values; the others are counted by reason."""
@@ -219,7 +219,8 @@ class Collected:
         if not good.all():
             states, values = states[good], values[good]
         if self._lossy or states.heard_count.any():
-            fits = self._links.fit(states, realtime=self._realtime, lossy=self._lossy, holds=self._holds)
+            heard, count = states.heard(self._links.most), states.heard_count
+            fits = self._links.fit(states.step, states.mode, states.agent - 1, heard, count)
             self.refused[Refusal.BAD_HEARD] += int((~fits).sum())
             states, values = states[fits], values[fits]
         return states, values
@@ -256,7 +257,7 @@ class Collected:
             used = self._used[cell]
             heard = np.where(used > 0, used.astype(np.uint64) - np.uint64(1), LOST)
         else:
-            heard = np.where(self._lost[cell], LOST, _newest(step, self._delay).astype(np.uint64)[:, None])
+            heard = np.where(self._lost[cell], LOST, self._links.newest(step).astype(np.uint64)[:, None])
         return np.where(np.arange(self._links.most) < count[:, None], heard, np.uint64(0))
 
     def cut(self, steps: int) -> None:
@@ -305,7 +306,7 @@ class Collected:
     def _complete(self, piece: slice) -> None:
         """Put in the steps of values that the log leaves out, because no message was lost; and which were lost."""
         step, agent = np.divmod(np.arange(piece.start, min(piece.stop, len(self._position))), self._shape[1])
-        newest = _newest(step, self._delay)[:, None]
+        newest = self._links.newest(step)[:, None]
         there = np.arange(self._links.most) < self._links.neighbours(self._modes[piece] + 1, agent)[:, None]
         if self._holds:
             used = np.where(self._listed[piece, None], self._used[piece], newest)
@@ -313,11 +314,6 @@ class Collected:
         else:
             used = np.where(self._lost[piece], -1, newest) if self._lossy else newest
         self._used[piece] = np.where(there, used, -1)
-
-
-def _newest(step: IntArray, delay: int) -> IntArray:
-    """In lockstep: steps of the newest messages that are used in the steps to states of these steps."""
-    return np.maximum(0, step - 1 - delay)
 
 
 def _out_of_order(position: IntArray) -> int:
@@ -328,36 +324,3 @@ def _out_of_order(position: IntArray) -> int:
         first_of_later = np.minimum.accumulate(came[::-1])[::-1]
         late += int((first_of_later[1:] < column[:-1]).sum())
     return late
-
-
-class _Links:
-    """What ``heard`` can be; ``most`` is the largest number of neighbours of any agent."""
-
-    def __init__(self, model: Wiring, steps: int, delay: int) -> None:
-        self._last = np.uint64(steps)
-        self._delay = delay
-        self.most = model.most_neighbours
-        self._neighbours = np.zeros((model.modes + 1, model.agents), dtype=np.int64)  # row 0: no graph led to step 0
-        for mode in range(model.modes):
-            self._neighbours[mode + 1] = [len(model.neighbours(mode, i)) for i in range(model.agents)]
-
-    def neighbours(self, mode: IntArray, agent: IntArray) -> IntArray:
-        """How many neighbours these agents (from 0) have in these graphs (from 1; 0: none, at step 0)."""
-        return np.asarray(self._neighbours[mode, agent])
-
-    def fit(self, states: States, *, realtime: bool, lossy: bool, holds: bool) -> BoolArray:
-        """Whether ``heard`` is possible: one entry per neighbour in their graph, each a step that can be.
-
-        In lockstep that is the newest one, and an empty ``heard`` says so of all; where the last value heard takes the
-        place of a lost one (``holds``) an earlier one, too; else ``LOST``, if ``lossy``.
-        """
-        heard, count = states.heard(self.most), states.heard_count
-        newest = _newest(states.step, self._delay).astype(np.uint64)[:, None]
-        possible = heard == newest
-        if realtime or holds:
-            possible = heard <= (self._last if realtime else newest)
-        if lossy and not holds:
-            possible |= heard == LOST
-        known = possible | (np.arange(self.most) >= count[:, None])
-        fits = (count == self.neighbours(states.mode, states.agent - 1)) & known.all(axis=1)
-        return np.asarray(fits if realtime else fits | (count == 0))
