@@ -11,11 +11,10 @@ from typing import Any
 from msg_agents.cli.nodes import load_record
 from msg_agents.doctor.networks.fault_plan import plan_faults
 from msg_agents.doctor.networks.random_networks import random_document
-from msg_agents.recovery.checkpoint import Checkpoint
+from msg_agents.recovery.checkpoint import Checkpoint, entry_size
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.check import check
-from msg_analysis.wire.receiving import state_frame
 
 SMALL = 3468, 3469  # in each, the process of an agent is killed before the first step
 UNDISTURBED = 225  # six agents in two processes, 3,474 steps, no noise on the air
@@ -40,7 +39,7 @@ def undisturbed_process(network: Any) -> Any:
     assert plan_faults(UNDISTURBED, experiment.agents, experiment.steps).faults == ()
     assert not experiment.noise.on_air
     process = network.wait_for(lambda: network.processes("agent"), 60, "an agent")[0]
-    size = state_frame(load_record(network.run_file()), whole=True).size
+    size = entry_size(load_record(network.run_file()))
 
     def checkpoint() -> Checkpoint | None:
         maps = Path(f"/proc/{process.pid}/maps").read_text()

@@ -27,25 +27,37 @@ from pathlib import Path
 
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.errors import InputError
+from msg_analysis.model.run.record import RunRecord
+from msg_analysis.wire.receiving import state_frame
 
 MOST_KEPT, LEAST_KEPT, ROOM = RESEND_LIMIT, 256, 1 << 24
 """States kept of each agent: as many as fit into ROOM bytes, from LEAST_KEPT to MOST_KEPT. Where possible, more than
 the 5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
 
-# Length of the message and step + 1; 0 from before the message is written until it is whole.
+# Length of the entry and step + 1; 0 from before the entry is written until it is whole.
 MARK = struct.Struct("<QQ")
 
 
+def published_size(record: RunRecord) -> int:
+    """Bytes of what agents publish of a state, where that is not the state itself; else 0: it is not kept."""
+    return 8 * record.experiment.run.replicas if record.experiment.truth else 0
+
+
+def entry_size(record: RunRecord) -> int:
+    """Bytes of the longest entry of a run: a message with the whole state, and behind it what is published of it."""
+    return state_frame(record, whole=True).size + published_size(record)
+
+
 def room_for(size: int) -> int:
-    """Size of the checkpoint file of an agent whose longest message has ``size`` bytes."""
+    """Size of the checkpoint file of an agent whose longest entry has ``size`` bytes."""
     slot = size + MARK.size
     return slot * max(LEAST_KEPT, min(MOST_KEPT, ROOM // slot))
 
 
 class Checkpoint:
-    """A ring of messages in a memory-mapped file, which survives its process, but not its machine.
+    """A ring of entries in a memory-mapped file, which survives its process, but not its machine.
 
-    ``found``: the file was there, so another process has run this agent before. ``size`` is that of the longest message
+    ``found``: the file was there, so another process has run this agent before. ``size`` is that of the longest entry
     in bytes. Without a path it is in memory, for this process only. InputError: a file of another size, or no room.
     """
 
@@ -54,7 +66,7 @@ class Checkpoint:
         self._size = size
         self._slot = size + MARK.size
         total = room_for(size)
-        self.capacity = total // self._slot  # messages
+        self.capacity = total // self._slot  # entries
         if path is None:
             self._map = mmap.mmap(-1, total)
             return
@@ -78,15 +90,15 @@ class Checkpoint:
         finally:
             os.close(descriptor)
 
-    def write(self, step: int, message: bytes) -> None:
-        """Keep the message (CDR) of a step; steps must be consecutive."""
+    def write(self, step: int, entry: bytes) -> None:
+        """Keep the entry of a step; steps must be consecutive."""
         start = step % self.capacity * self._slot
         MARK.pack_into(self._map, start + self._size, 0, 0)  # who reads meanwhile must not take it for the old one
-        self._map[start : start + len(message)] = message
-        MARK.pack_into(self._map, start + self._size, len(message), step + 1)
+        self._map[start : start + len(entry)] = entry
+        MARK.pack_into(self._map, start + self._size, len(entry), step + 1)
 
     def read(self, first: int = 0) -> list[tuple[int, bytes]]:
-        """(step, message) of the newest consecutive steps, ascending, from step ``first`` on.
+        """(step, entry) of the newest consecutive steps, ascending, from step ``first`` on.
 
         The slot after the newest is left out: it may be torn.
         """

@@ -37,7 +37,7 @@ from msg_agents.processes.process_plan import (
     partners,
     plan_network,
 )
-from msg_agents.recovery.checkpoint import room_for
+from msg_agents.recovery.checkpoint import entry_size, room_for
 from msg_agents.running.event_log import EventLog
 from msg_agents.running.run_channel import run_channel
 from msg_agents.running.run_folder import make_bag_directory, workshop
@@ -59,7 +59,6 @@ from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.until import Until
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.receiving import state_frame
 
 POLL = 0.05  # s
 
@@ -170,10 +169,9 @@ def run_network(
                 record = replace(record or new_record(experiment), until=until)
                 run_file = folder / "run.json"
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
-                longest = state_frame(record, whole=True).size
                 kept.keep()
                 with (
-                    workshop(experiment.agents * room_for(longest))
+                    workshop(experiment.agents * room_for(entry_size(record)))
                     if restarts or until
                     else nullcontext() as checkpoints,
                     Supervisor(

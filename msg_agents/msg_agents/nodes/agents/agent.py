@@ -31,7 +31,7 @@ from rclpy.subscription import Subscription
 from msg_agents.nodes.network_node import NetworkNode
 from msg_agents.nodes.ros.timers import after
 from msg_agents.processes.process_plan import RECORDER
-from msg_agents.recovery.checkpoint import Checkpoint
+from msg_agents.recovery.checkpoint import Checkpoint, entry_size, published_size
 from msg_agents.stepping.stall_detection import StallDetector
 from msg_agents.stepping.turn_queue import TurnQueue
 from msg_analysis.errors import InputError
@@ -116,7 +116,8 @@ class Agent(NetworkNode):
         self._codec = StateCodec(self.run, agent + 1, experiment.width, experiment.step_length)
         self._frame = state_frame(record, whole=False)
         self._whole = state_frame(record, whole=True)
-        self._published = Checkpoint(checkpoints and checkpoints / f"{agent_name(agent)}.states", self._whole.size)
+        self._beside = published_size(record)
+        self._published = Checkpoint(checkpoints and checkpoints / f"{agent_name(agent)}.states", entry_size(record))
         self._resumed = self._take_over()
         self._group = group
         self._inputs = [self._law.neighbours(mode) for mode in range(model.modes)]
@@ -223,7 +224,7 @@ class Agent(NetworkNode):
         """Resume from the last state that an earlier process published; its message, or None without one."""
         published = self._published.read()
         if published:
-            step, message = published[-1]
+            step, message = published[-1][0], self._parts(published[-1][1])[0]
             frame = self._whole.unwrap(message)
             if frame is None or frame[:2] != (self._law.agent + 1, step):
                 raise InputError(
@@ -236,12 +237,22 @@ class Agent(NetworkNode):
 
     def _publish_state(self, mode: int) -> None:
         law = self._law
-        message = self._codec.wrap(law.step, mode, law.state, law.heard)
-        self._published.write(law.step, message)
-        self._send(law.step, mode, law.state, message)
+        self._keep_and_send(mode, self._codec.wrap(law.step, mode, law.state, law.heard))
 
-    def _send(self, step: int, mode: int, state: bytes, message: bytes, *, heard: bool = True) -> None:
-        """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it.
+    def _keep_and_send(self, mode: int, message: bytes) -> None:
+        """Publish the newest state, when it is in the checkpoint."""
+        law = self._law
+        value = law.published(law.step, law.state) if self._truth is not None else b""
+        self._published.write(law.step, message + value)
+        self._send(law.step, mode, law.state, message, value)
+
+    def _parts(self, entry: bytes) -> tuple[bytes, bytes]:
+        """An entry of the checkpoint: the message, and what is published of its state if that is not the state."""
+        length = len(entry) - self._beside
+        return entry[:length], entry[length:]
+
+    def _send(self, step: int, mode: int, state: bytes, message: bytes, value: bytes, *, heard: bool = True) -> None:
+        """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it, ``value``.
 
         Without ``heard``, to the recorder only.
         """
@@ -249,8 +260,7 @@ class Agent(NetworkNode):
             if heard:
                 self.publish(self._truth, message)
             self._group.record_truth(message)
-            whole, state = state, self._law.published(step, state)
-            message = with_state(message, state, len(whole))
+            message, state = with_state(message, value, len(state)), value
         if heard:
             self.publish(self._states, message)
         self._group.record_state(message)
@@ -290,14 +300,15 @@ class Agent(NetworkNode):
         self._repeat(since)
 
     def _repeat(self, since: int, heard_since: int = 0) -> None:
-        """Repeat the kept states from step ``since`` on; what others hear is derived from the exact states.
+        """Repeat the kept states from step ``since`` on, as they were published.
 
         Those before ``heard_since`` go to the recorder only.
         """
-        for step, message in self._published.read(since):
+        for step, entry in self._published.read(since):
+            message, value = self._parts(entry)
             frame = self._whole.unwrap(message)
             assert frame is not None, "written by this software"
-            self._send(step, frame[2], frame[3], message, heard=step >= heard_since)
+            self._send(step, frame[2], frame[3], message, value, heard=step >= heard_since)
         self._group.send_batches()
 
     def _ask_again(self, agents: Sequence[int]) -> None:

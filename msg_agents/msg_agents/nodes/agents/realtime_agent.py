@@ -151,9 +151,7 @@ class RealtimeAgent(Agent):
         self._made = max(now, self._made + 1, min(newest, now + self._margin) + 1)
         law.advance(mode, [value[0] if value else b"" for _, value in inputs], [step for step, _ in inputs])
         steps = [LOST if step == NOTHING else step for step, _ in inputs]
-        message = self._codec.wrap(law.step, mode + 1, law.state, steps, self._made)
-        self._published.write(law.step, message)
-        self._send(law.step, mode + 1, law.state, message)
+        self._keep_and_send(mode + 1, self._codec.wrap(law.step, mode + 1, law.state, steps, self._made))
 
     def _missed_since(self) -> int:
         """See Agent. Only the newest value is of use."""
