@@ -54,6 +54,7 @@ class EarlyEnd:
         if not self._asked or self._decided or (step := self._files.decided()) is None:
             return False
         self._decided, self.last_step = True, step
+        self.observer.ends_at(step)
         return True
 
     def to_json(self) -> dict[str, Any]:

@@ -20,6 +20,7 @@ import math
 import os
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,7 +28,9 @@ from typing import TYPE_CHECKING
 from msg_agents.watching.checkpoint_reader import CheckpointReader
 from msg_analysis.common.blas_threads import one_blas_thread
 from msg_analysis.errors import InputError
+from msg_analysis.model.run.graph_path import Sojourn, sojourns
 from msg_analysis.model.run.record import RunRecord
+from msg_analysis.model.step.step_model import first_graph
 from msg_analysis.types import IntArray
 
 if TYPE_CHECKING:
@@ -53,6 +56,11 @@ class RunObserver:
         self.reached: str | None = None
         self._record, self._reader = record, CheckpointReader(record, checkpoints)
         self._newest = -1
+        self._last: int | None = None  # last step, where the run ends early
+        self._path: Iterator[Sojourn] | None = None
+        if record.experiment.run.pace == "realtime":
+            self._path = sojourns(record.experiment, first_graph(record.experiment))
+        self._sojourns_until = 0
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="observer", daemon=True)
         self._thread.start()
@@ -60,6 +68,10 @@ class RunObserver:
     def look(self, reached: int) -> None:
         """Set the newest step that all agents have published (-1: none)."""
         self._newest = reached
+
+    def ends_at(self, step: int) -> None:
+        """The run ends at this step, before its planned end."""
+        self._last = step
 
     def end(self) -> None:
         """Process what is there by now, for about ``FAREWELL`` s at most, and stop; the last report stays."""
@@ -76,6 +88,8 @@ class RunObserver:
         try:
             with one_blas_thread():
                 estimate = LiveEstimate(self._record, nodes=self._record.experiment.agents <= MOST_NODES)
+                if estimate.log is not None:
+                    self._reader.keep(estimate.log)
                 while not self._over.wait(PERIOD):
                     self._follow(estimate, math.inf)
                 self._follow(estimate, time.monotonic() + FAREWELL)
@@ -88,17 +102,32 @@ class RunObserver:
         if not self._reader.ready():
             return
         while time.monotonic() < deadline and not (deadline == math.inf and self._over.is_set()):
-            found = self._reader.take(self._newest)
+            found = self._reader.take(self._newest if self._last is None else min(self._newest, self._last))
+            logged = self._reader.logged()
+            if logged is not None:
+                self._add_sojourns(estimate, int(logged.steps.max(initial=0)))
+                estimate.add_logged(logged)
             if not len(found[0]):
                 break
             estimate.add_whole(*found)
             if self._record.experiment.run.pace == "realtime":
                 self._add_stamps(estimate, found[0])
+        if self._last is not None:
+            estimate.end_at(self._last)
         self.report = report = estimate.report()
         if self._record.until and self.reached is None:
             from msg_analysis.inference.online.stopping import reached
 
             self.reached = reached(self._record.until, report)
+
+    def _add_sojourns(self, estimate: LiveEstimate, newest: int) -> None:
+        """In real time: the graph of the network up to a step, as the nodes know it; they refuse any other."""
+        while self._path is not None and newest >= self._sojourns_until:
+            sojourn = next(self._path, None)
+            if sojourn is None:
+                break
+            estimate.add_sojourn(sojourn.first_step, sojourn.last_step, sojourn.mode)
+            self._sojourns_until = sojourn.last_step + 1
 
     def _add_stamps(self, estimate: LiveEstimate, steps: IntArray) -> None:
         from msg_analysis.inference.online.recent_steps import WINDOW

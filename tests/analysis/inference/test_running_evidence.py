@@ -11,7 +11,8 @@ from tests.support import line_and_ring
 
 from msg_analysis.inference.errors.estimates import Estimate
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.online import running_errors
+from msg_analysis.inference.online import running_errors, running_evidence
+from msg_analysis.inference.online.heard_evidence import HeardEvidence
 from msg_analysis.inference.online.running_errors import LiveEstimate, LiveReport
 from msg_analysis.inference.online.running_evidence import AnyTime, RunningEvidence, supports
 from msg_analysis.inference.online.stopping import precision_words, reached
@@ -44,11 +45,12 @@ def test_is_the_sum_over_the_whole_run(pieces: int, missing: bool) -> None:
     observation, expected = Observation.of(run, prediction), EvidenceSums(prediction, 2)
     # The arrays without the places 0, 700, 701 and 1500 of the steps from 1 on.
     stretches = [(2, 701), (703, 1501), (1502, 2000)] if missing else [(2, 2000)]
+    # The graph after a step is needed, but not after the last step of the run.
     for first, end in stretches:
         part = Observation(
             prediction, observation.states[first : end + 1], observation.modes[first:end], observation.states[first]
         )
-        expected.add(part, 0, end - first - 1)
+        expected.add(part, 0, end - first - (end < 2000))
     assert seen.sums.counts.tolist() == expected.counts.tolist()
     assert seen.look(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
 
@@ -56,9 +58,39 @@ def test_is_the_sum_over_the_whole_run(pieces: int, missing: bool) -> None:
 def test_what_the_states_alone_do_not_give() -> None:
     for changes in ({"noise": {"loss": 0.1}}, {"noise": {"delay": 1}}, {"run": {"pace": "realtime"}}):
         prediction = predict(experiment(**changes))
-        assert not supports(prediction)
+        assert supports(prediction)
         with pytest.raises(ValueError, match="do not give the evidence"):
             RunningEvidence(prediction, 2)
+    with pytest.raises(ValueError, match="the states alone give the evidence"):
+        HeardEvidence(predict(experiment()), 2)
+
+
+@pytest.mark.parametrize("changes", [{}, {"noise": {"loss": 0.1}}], ids=["plain", "loss"])
+def test_too_many_agents(changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """They have their errors, and no evidence."""
+    monkeypatch.setattr(running_evidence, "MOST_BYTES", 100)
+    law = experiment(duration=10, **changes)
+    assert not supports(predict(law))
+    live = LiveEstimate(record_of(law, None)[0])
+    assert live.evidence is None
+    assert live.log is None
+    assert live.report().any_time.log_evidence is None
+
+
+def test_the_last_step_of_a_run_that_ends_early() -> None:
+    """As in the comparison of the shorter run."""
+    run, prediction = simulate(experiment()), predict(experiment())
+    seen, expected = RunningEvidence(prediction, 2), EvidenceSums(prediction, 2)
+    for steps in np.array_split(np.arange(1500), 7):
+        seen.add(steps, run.modes[steps], run.states[steps], run.states[steps + 1])
+    seen.end_at(1500)
+    observation = Observation.of(run, prediction)
+    expected.add(Observation(prediction, observation.states[:1501], run.modes[:1500], run.states[0]), 0, 1500)
+    assert seen.count == 1500
+    assert seen.look(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
+    later = np.arange(1500, 1600)
+    seen.add(later, run.modes[later], run.states[later], run.states[later + 1])
+    assert seen.count == 1500
 
 
 def test_a_fault_is_found_and_named() -> None:

@@ -240,12 +240,17 @@ def innovations(observation: Observation, first: int, last: int, reception: Hear
     step, now = observation.step, observation.states[first:last]
     after = observation.states[first + 1 : last + 1].copy()
     if reception is not None:
-        offsets = step.offsets[reception.graphs, np.arange(step.agents)]
-        return np.asarray(after - reception.mean() - offsets[:, :, None])
+        return heard_innovations(step, reception, after)
     for mode in range(step.modes):
         at = np.flatnonzero(observation.modes[first:last] == mode)
         after[at] -= step.weights[mode] @ now[at] + step.offsets[mode][:, None]
     return after
+
+
+def heard_innovations(step: StepModel, reception: HeardValues, after: FloatArray) -> FloatArray:
+    """(b, m, R): innovations of steps, given what was heard in them, and the states after them (b, m, R)."""
+    offsets = step.offsets[reception.graphs, np.arange(step.agents)]
+    return np.asarray(after - reception.mean() - offsets[:, :, None])
 
 
 def _correlated(step: StepModel) -> bool:

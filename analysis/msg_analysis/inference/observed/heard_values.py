@@ -63,7 +63,6 @@ class HeardValues:
     def of(cls, observation: Observation, first: int, last: int) -> HeardValues:
         """Reception of the steps first..last-1."""
         step, modes, timers = observation.step, observation.modes[first:last], observation.timers
-        tables, agents = neighbour_tables(step), np.arange(step.agents)
         if timers is None:
             graphs = np.repeat(modes[:, None], step.agents, axis=1)
             used = np.broadcast_to(np.arange(first, last)[:, None, None], (*graphs.shape, step.most_neighbours))
@@ -73,19 +72,33 @@ class HeardValues:
                 used = np.where(observation.lost[first:last], -1, used)
         else:
             graphs, used = timers.graphs[first:last], timers.used[first:last]
+        published = observation.states if observation.published is None else observation.published
+        return cls.by(step, modes, graphs, used, observation.states[first:last], published)
+
+    @classmethod
+    def by(
+        cls,
+        step: StepModel,
+        modes: IntArray,
+        graphs: IntArray,
+        used: IntArray,
+        states: FloatArray,
+        published: FloatArray,
+    ) -> HeardValues:
+        """Reception by what was used (b, m, D), at places in ``published``, -1: the own value; the rest as above."""
+        tables, agents = neighbour_tables(step), np.arange(step.agents)
         weights = neighbour_weights(step)[graphs, agents]
         weights = np.where(used >= 0, weights, 0.0)
-        published = observation.states if observation.published is None else observation.published
         return cls(
             modes=modes,
             graphs=graphs,
-            states=observation.states[first:last],
+            states=states,
             published=published,
             used=used,
             senders=tables.senders[graphs, agents],
             weights=weights,
             own=step.nominal.sum(axis=2)[graphs, agents] - weights.sum(axis=2),
-            link_variance=observation.prediction.experiment.noise.link**2 * (weights**2).sum(axis=2),
+            link_variance=step.link**2 * (weights**2).sum(axis=2),
         )
 
     def part(self, first: int, last: int) -> HeardValues:

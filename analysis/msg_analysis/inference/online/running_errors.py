@@ -31,17 +31,18 @@ from msg_analysis.common.large_arrays import BLOCK_NUMBERS
 from msg_analysis.inference.errors.estimates import Estimate, beside
 from msg_analysis.inference.errors.time_means import Value, forms_of, packed_moments, values_of
 from msg_analysis.inference.observed.observation import bounded
+from msg_analysis.inference.online.heard_evidence import HeardEvidence
+from msg_analysis.inference.online.logged_states import LoggedStates, StateLog
 from msg_analysis.inference.online.recent_steps import Lateness, Recent, RecentSteps
-from msg_analysis.inference.online.running_evidence import AnyTime, RunningEvidence, supports
+from msg_analysis.inference.online.running_evidence import AnyTime, RunningEvidence, needs_log, supports
+from msg_analysis.inference.online.running_interval import RunningInterval
 from msg_analysis.inference.online.step_collector import StepCollector
-from msg_analysis.inference.statistics.batch_means import RunningBatches
-from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width, steps_to_half_width
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.wire.refusals import Refusal
 
-TUNING_STEPS = 500  # before the interval that holds at all times is given: their variances say how it is tuned
 EVERY_STEP = 20  # agents up to which every step is used for the standard errors of the nodes; beyond, one in m / 20
 MOST_BYTES = 256 * 2**20  # memory for the standard errors of the nodes; where that is too little, they are left out
 
@@ -80,14 +81,27 @@ class LiveEstimate:
         experiment = record.experiment
         lockstep = experiment.run.pace == "lockstep"
         self.record = record
-        self.steps = StepCollector(experiment.agents, len(experiment.graph_list), experiment.steps, lockstep=lockstep)
         reason = experiment.unpredictable()
         prediction = None if reason else predict(experiment, record.step_model)
         self._errors = RunningErrors(record, prediction, nodes=nodes)
-        self._evidence: RunningEvidence | None = None
+        self._plain: RunningEvidence | None = None
+        self._heard: HeardEvidence | None = None
         if prediction is not None and supports(prediction):
-            self._evidence = RunningEvidence(prediction, experiment.run.replicas)
-        self._interval = RunningInterval(record, prediction, self._evidence.variance if self._evidence else None)
+            if needs_log(experiment):
+                self._heard = HeardEvidence(prediction, experiment.run.replicas)
+            else:
+                self._plain = RunningEvidence(prediction, experiment.run.replicas)
+        self.evidence = self._heard or self._plain
+        self.log = StateLog(record) if self._heard else None  # None: the messages are not needed
+        self.steps = StepCollector(
+            experiment.agents,
+            len(experiment.graph_list),
+            experiment.steps,
+            lockstep=lockstep,
+            logged=self.log is not None,
+            truth=self.needs_published,
+        )
+        self._interval = RunningInterval(record, prediction, self.evidence.variance if self.evidence else None)
         self._recent = RecentSteps()
         self._lateness = None if lockstep else Lateness(experiment)
         self._newest = -1
@@ -101,17 +115,39 @@ class LiveEstimate:
         elif prediction is not None and not self._errors.nodes_judged:
             self._note = "too many agents for intervals of the agent errors"
 
-    def add(self, agent: int, step: int, mode: int, payload: bytes) -> None:
-        """Add x(step) of an agent (from 0), see ``StepCollector.add``; ``mode`` is from 1, 0 at step 0."""
-        self.steps.add(agent, step, mode, payload)
+    @property
+    def needs_published(self) -> bool:
+        """Whether what the agents publish is needed, too, because it is not their states."""
+        return self.log is not None and self.log.truth
+
+    def end_at(self, step: int) -> None:
+        """The run ends at this step, or has ended there: what was done after it is not a part of it."""
+        self.steps.end_at(step)
+        if self.evidence is not None:
+            self.evidence.end_at(step)
+
+    def add(
+        self, agent: int, step: int, mode: int, payload: bytes, message: bytes = b"", *, published: bool = False
+    ) -> None:
+        """Add x(step) of an agent (from 0), see ``StepCollector.add``; its message is needed with a ``log``."""
+        self.steps.add(agent, step, mode, payload, message, published=published)
+
+    def add_logged(self, logged: LoggedStates) -> None:
+        """Add whole states with their logs, besides ``add_whole``; nothing where there is no ``log``."""
+        if self._heard is not None:
+            self._heard.add(logged)
+
+    def add_sojourn(self, first: int, last: int, graph: int) -> bool:
+        """In real time: take a sojourn of the network's graph, from 0, from step to step; False: it contradicts one."""
+        return self._heard is None or self._heard.add_sojourn(first, last, graph)
 
     def add_whole(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
         """Add whole steps k (b,), each only once: graphs of k -> k+1 from 0 (b,), x(k) and x(k+1) (b, m, width)."""
         if not len(steps):
             return
         self._interval.add(self._errors.add(steps, modes, states, after))
-        if self._evidence is not None:
-            self._evidence.add(steps, modes, states, after)
+        if self._plain is not None:
+            self._plain.add(steps, modes, states, after)
         self._newest = max(self._newest, int(steps.max()))
         self._recent.add(steps, modes, states)
 
@@ -124,6 +160,9 @@ class LiveEstimate:
     def report(self) -> LiveReport:
         """The numbers so far."""
         self.add_whole(*self.steps.take())
+        if self.log is not None and (found := self.steps.take_log()):
+            self.add_logged(self.log.of_messages(*zip(*found, strict=True)))
+            self.steps.refused[Refusal.BAD_HEARD] = self.log.impossible
         errors = self._errors
         system, nodes = errors.estimates()
         half_width = self._interval.half_width(system, errors.count)
@@ -135,43 +174,11 @@ class LiveEstimate:
             system=system,
             nodes=nodes,
             note=self._note,
-            any_time=self._evidence.look(half_width) if self._evidence else AnyTime(half_width),
+            any_time=self.evidence.look(half_width) if self.evidence else AnyTime(half_width),
             refused={reason: count for reason, count in sorted(self.steps.refused.items()) if count},
             recent=self._recent.newest(),
             lateness=self._lateness.medians() if self._lateness else None,
         )
-
-
-class RunningInterval:
-    """Half-width of the 95 % interval of the system error that holds at all times at once.
-
-    By the martingale where there is a standard error; else by batch means of the measured errors, as in real time.
-    """
-
-    def __init__(self, record: RunRecord, prediction: Prediction | None, variance: float | None) -> None:
-        self._until, self._planned = record.until, record.planned_steps
-        self._predicted = prediction.emulated.system_error if prediction is not None else None
-        self._variance = variance  # of a step, as far as it is known before the run
-        self._batches = RunningBatches()
-        self._target: float | None = None  # sum of variances for which the interval is narrowest: set early, and kept
-
-    def add(self, series: FloatArray) -> None:
-        """Add the system errors of steps (b,)."""
-        self._batches.add(series)
-
-    def half_width(self, system: Estimate, steps: int) -> float | None:
-        """Of the mean over so many steps, with this estimate; None: not known yet."""
-        if steps < TUNING_STEPS:
-            return None
-        error = system.standard_error
-        variance = self._batches.variance() if error is None else (error * steps) ** 2
-        if not variance or not system.measured:
-            return None
-        if self._target is None:
-            each, size = self._variance or variance / steps, self._predicted or system.measured
-            wanted = self._planned if self._until is None else steps_to_half_width(each, self._until.precision * size)
-            self._target = each * min(self._planned, wanted)
-        return float(simultaneous_half_width(variance, self._target)) / steps
 
 
 class RunningErrors:

@@ -32,6 +32,7 @@ from msg_analysis.inference.observed.observation import Observation, bounded
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
 from msg_analysis.inference.sequential.watched_evidence import LARGEST_LOGARITHM, question_words
 from msg_analysis.inference.statistics.mixture_evidence import log_mean
+from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.types import FloatArray, IntArray
@@ -63,40 +64,80 @@ class AnyTime:
         }
 
 
+def needs_log(experiment: ValidExperiment) -> bool:
+    """Whether the evidence needs what the messages log, and not only the states."""
+    noise = experiment.noise
+    return bool(noise.on_air or noise.delay or experiment.run.pace == "realtime")
+
+
 def supports(prediction: Prediction) -> bool:
-    """Whether the states alone give the evidence: in lockstep, with nothing on the air, of not too many agents."""
-    noise, run, system = prediction.experiment.noise, prediction.experiment.run, prediction.system
-    numbers = 16 * system.modes**2 * (packed_symmetric.size(system.dimension) + 1)
-    return not (noise.on_air or noise.delay or run.pace == "realtime") and 8 * numbers <= MOST_BYTES
+    """Whether there is evidence: of not too many agents."""
+    step, system = prediction.step, prediction.system
+    if needs_log(prediction.experiment):
+        numbers = (8 + step.modes) * step.agents**2
+    else:
+        numbers = 16 * system.modes**2 * (packed_symmetric.size(system.dimension) + 1)
+    return 8 * numbers <= MOST_BYTES
 
 
-class RunningEvidence:
-    """The evidence of a run from its whole steps, as they come; ValueError where ``supports`` says no."""
+class EvidenceWatch:
+    """Sums of a run that goes on, and what they say when they are looked at; ValueError where ``supports`` says no."""
 
     def __init__(self, prediction: Prediction, replicas: int) -> None:
         if not supports(prediction):
+            raise ValueError("too many agents for the evidence of this run")
+        self.sums = EvidenceSums(prediction, replicas)
+        self.count = 0  # steps that have been added
+        self._names = [graph.name for graph in prediction.experiment.graph_list]
+        self._crossed: int | None = None
+
+    @property
+    def variance(self) -> float | None:
+        """Of the martingale difference of the system error in a step, by which its interval is tuned."""
+        return self.sums.error.variance if self.sums.error is not None else None
+
+    def look(self, half_width: float | None) -> AnyTime:
+        """The evidence now; ``half_width``: of the interval of the system error, which is passed on."""
+        evidence = self.sums.evidence()
+        if math.isnan(evidence):  # numbers too large to compute with: the law never gives one
+            evidence = math.inf
+        threshold = 1.0 / LEVEL
+        if self._crossed is None and evidence >= math.log(threshold):
+            self._crossed = self.count
+        strongest = None
+        if self._crossed is not None:
+            best = {kind: log_mean(logs, axis=1) for kind, logs in self.sums.families().items()}
+            kind = max(best, key=lambda kind: float(best[kind].max()))
+            strongest = question_words(self.sums.question(kind, int(best[kind].argmax())), self._names)
+        return AnyTime(half_width, evidence, threshold, self._crossed, strongest)
+
+
+class RunningEvidence(EvidenceWatch):
+    """The evidence of a run in which all agents hear the states themselves, from its whole steps, as they come."""
+
+    def __init__(self, prediction: Prediction, replicas: int) -> None:
+        super().__init__(prediction, replicas)
+        if self.sums.error is None:
             raise ValueError("the states alone do not give the evidence of this run")
         self._prediction, self._replicas = prediction, replicas
-        self.sums = EvidenceSums(prediction, replicas)
-        assert self.sums.error is not None
         step = prediction.step
         numbers = (4 + step.most_neighbours) * step.agents * replicas
         numbers = max(numbers + step.agents**2, self.sums.error.numbers * (1 + len(self.sums.error.rates)))
         self._length = max(1, BLOCK_NUMBERS // numbers)
-        self._names = [graph.name for graph in prediction.experiment.graph_list]
-        self._count = 0
-        self._crossed: int | None = None
-        # The newest step, which counts when the graph after it is known: its number, graph, states before it.
+        self._end = prediction.experiment.steps
+        # The newest step, which counts when the graph after it is known: its number, graph, states before it and after.
         self._kept: tuple[int, IntArray, FloatArray] | None = None
 
-    @property
-    def variance(self) -> float:
-        """Of the martingale difference of the system error in a step, by which its interval is tuned."""
-        assert self.sums.error is not None
-        return self.sums.error.variance
+    def end_at(self, step: int) -> None:
+        """The run ends at this step: what was done after it is not a part of it, and the last step counts now."""
+        self._end = min(step, self._end)
+        self._add_last()
 
     def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
         """Add whole steps, each only once; arrays as in ``LiveEstimate.add_whole``."""
+        if len(steps) and int(steps.max()) >= self._end:
+            within = steps < self._end
+            steps, modes, states, after = steps[within], modes[within], states[within], after[within]
         if not len(steps):
             return
         if (np.diff(steps) < 0).any():
@@ -110,7 +151,7 @@ class RunningEvidence:
         """Add steps in a row from ``first`` on; ``end``: the states after the last one."""
         parts = [states[:, :, : self._replicas], end[None, :, : self._replicas]]
         if self._kept is not None and self._kept[0] == first - 1:
-            modes, parts = np.concatenate([self._kept[1], modes]), [self._kept[2], *parts]
+            modes, parts = np.concatenate([self._kept[1], modes]), [self._kept[2][:1], *parts]
             first -= 1
         whole = bounded(np.concatenate(parts))
         last = len(modes) - 1  # its next graph is not known yet
@@ -118,20 +159,13 @@ class RunningEvidence:
             stop = min(start + self._length, last)
             part = whole[start : stop + 2]
             self.sums.add(Observation(self._prediction, part, modes[start : stop + 1], part[0]), 0, stop - start)
-        self._count += last
-        self._kept = first + last, modes[last:], whole[last : last + 1]
+        self.count += last
+        self._kept = first + last, modes[last:], whole[last:]
+        self._add_last()
 
-    def look(self, half_width: float | None) -> AnyTime:
-        """The evidence now; ``half_width``: of the interval of the system error, which is passed on."""
-        evidence = self.sums.evidence()
-        if math.isnan(evidence):  # numbers too large to compute with: the law never gives one
-            evidence = math.inf
-        threshold = 1.0 / LEVEL
-        if self._crossed is None and evidence >= math.log(threshold):
-            self._crossed = self._count
-        strongest = None
-        if self._crossed is not None:
-            best = {kind: log_mean(logs, axis=1) for kind, logs in self.sums.families().items()}
-            kind = max(best, key=lambda kind: float(best[kind].max()))
-            strongest = question_words(self.sums.question(kind, int(best[kind].argmax())), self._names)
-        return AnyTime(half_width, evidence, threshold, self._crossed, strongest)
+    def _add_last(self) -> None:
+        """Add the last step of the run, after which there is no graph."""
+        if self._kept is not None and self._kept[0] == self._end - 1:
+            _, modes, states = self._kept
+            self.sums.add(Observation(self._prediction, states, modes, states[0]), 0, 1)
+            self.count, self._kept = self.count + 1, None

@@ -33,9 +33,10 @@ MOST_WAITING = 20_000  # incomplete steps kept, at most
 class _Row:
     """What has arrived of one step."""
 
-    payloads: list[bytes | None]
-    left: int  # agents whose state is missing
+    payloads: list[bytes | None]  # of the states, and with a log of what was published of them
+    left: int  # payloads that are missing
     mode: int  # graph that led to the step, from 1
+    messages: list[bytes]  # of the states, where the log is kept; else empty
     usable: bool = True  # False after a contradiction
     used: bool = False
     states: bytes | None = None
@@ -45,40 +46,62 @@ class StepCollector:
     """Collects the states of m agents, in any order, into whole steps.
 
     In lockstep a step is ready only with its successor, which says which graph was used; else graphs are ignored.
+    ``logged``: keep the messages, too. ``truth``: a step is whole when what was published of its states is there, too.
     """
 
-    def __init__(self, agents: int, modes: int, last: int, *, lockstep: bool) -> None:
+    def __init__(
+        self, agents: int, modes: int, last: int, *, lockstep: bool, logged: bool = False, truth: bool = False
+    ) -> None:
         self._agents, self._modes, self._last, self._lockstep = agents, modes, last, lockstep
+        self._logged, self._expected = logged, agents * (2 if truth else 1)
         self._window = min(SPREAD * (agents + 1) + WRITER_HISTORY, MOST_WAITING)
         self._rows: dict[int, _Row] = {}
         self._low = 0  # earlier steps are no longer kept
         self._ready: list[tuple[int, int, bytes, bytes]] = []  # step, mode, states, those after it
+        self._log: list[tuple[int, list[bytes], list[bytes]]] = []  # step, messages, what was published
+        self._over: int | None = None  # last step of a run that ends early
         self.refused: Counter[str] = Counter()  # states or steps that do not count, by reason
         self.newest = self.whole = -1  # largest step with any state, and with all states; -1: none
 
-    def add(self, agent: int, step: int, mode: int, payload: bytes) -> None:
-        """Take x(step) of an agent (from 0) as little-endian float64.
+    def end_at(self, step: int) -> None:
+        """The run ends at this step: what comes after it is not a part of it."""
+        self._over = step
+        self._rows = {k: row for k, row in self._rows.items() if k <= step}
 
-        ``mode`` is the graph of the step that led to it, from 1; 0 at step 0.
+    def add(
+        self, agent: int, step: int, mode: int, payload: bytes, message: bytes = b"", *, published: bool = False
+    ) -> None:
+        """Take x(step) of an agent (from 0) as little-endian float64, and where the log is kept its message.
+
+        ``mode`` is the graph of the step that led to it, from 1; 0 at step 0. ``published``: the payload is not the
+        state, but what was published of it.
         """
+        if published:
+            agent += self._agents
         row = self._rows.get(step)
         if row is None:
+            if self._over is not None and step > self._over:
+                return
             if not self._low <= step <= self._last:
                 self.refused[Refusal.TOO_LATE if step < self._low else Refusal.OUT_OF_RANGE] += 1
                 return
             if step > self.newest:
                 self.newest = step
                 self._forget(step - self._window)
-            row = self._rows[step] = _Row([None] * self._agents, self._agents, mode)
+            messages = [b""] * self._agents if self._logged else []
+            row = self._rows[step] = _Row([None] * self._expected, self._expected, mode, messages)
         before = row.payloads[agent]
         if before is not None:
             self.refused[Refusal.REPEATED] += 1
             differs = before != payload or (self._lockstep and mode != row.mode)
+            differs |= self._logged and not published and row.messages[agent] != message
             if differs and row.usable:
                 row.usable = False  # which copy is genuine is unknown
                 self.refused[Refusal.CONTRADICTION] += 1
             return
         row.payloads[agent] = payload
+        if self._logged and not published:
+            row.messages[agent] = message
         row.left -= 1
         if mode != row.mode and self._lockstep and row.usable:
             row.usable = False
@@ -102,8 +125,16 @@ class StepCollector:
         self.refused[Refusal.NOT_FINITE] += int((~good).sum())
         return steps[good], modes[good], states[good], after[good]
 
+    def take_log(self) -> list[tuple[int, list[bytes], list[bytes]]]:
+        """Whole steps since the last call: k, the messages of its states, and what was published of them."""
+        log, self._log = self._log, []
+        return log
+
     def _complete(self, step: int, row: _Row) -> None:
-        row.states = b"".join(payload for payload in row.payloads if payload is not None)
+        payloads = [payload for payload in row.payloads if payload is not None]
+        row.states = b"".join(payloads[: self._agents])
+        if self._logged and row.usable:
+            self._log.append((step, row.messages, payloads[self._agents :]))
         self.whole = max(self.whole, step)
         if self._lockstep:
             self._pair(step - 1)

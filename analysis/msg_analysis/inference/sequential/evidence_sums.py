@@ -123,20 +123,38 @@ class EvidenceSums:
         if self.departures or not quadratic:
             block = self._block(observation, first, last, heard)
             if not quadratic:
-                self._add_heard(observation, block)
+                lost = None if observation.lost is None else observation.lost[first:last]
+                self._add_heard(block.reception, block.white, block.scale, lost)
             if self.departures:
                 self.departures.add(block)
         graphs = observation.modes[first : last + 1]
-        np.add.at(self.counts, (graphs[:-1], graphs[1:]), 1)
-        if observation.published is not None and self._noise.broadcast:
-            added = observation.published[first:last] - observation.states[first:last]
-            self.broadcast_samples += added.shape[0] * added.shape[2]
-            self.broadcast_squares += (added**2).sum(axis=(0, 2)) / self._noise.broadcast**2
+        self.add_transitions(graphs[:-1], graphs[1:])
+        if observation.published is not None:
+            self.add_broadcast(observation.published[first:last] - observation.states[first:last])
         if self.error is not None and len(graphs) > 1:
             steps = len(graphs) - 1
             a = np.ones((steps + 1, self.error.numbers))
             a[:, :-1] = moments(observation, first, first + steps + 1, observation.states)
             self.error.add(graphs[:-1], graphs[1:], a[:-1], a[1:])
+
+    def add_transitions(self, graphs: IntArray, following: IntArray) -> None:
+        """Add steps of the switching: graphs (k,) and those of the next step (k,)."""
+        modes = self._step.modes
+        self.counts += np.bincount(graphs * modes + following, minlength=modes**2).reshape(modes, modes)
+
+    def add_broadcast(self, added: FloatArray) -> None:
+        """Add what was published minus the states (b, m, R)."""
+        if self._noise.broadcast:
+            self.broadcast_samples += added.shape[0] * added.shape[2]
+            self.broadcast_squares += (added**2).sum(axis=(0, 2)) / self._noise.broadcast**2
+
+    def add_heard(self, reception: HeardValues, e: FloatArray, lost: BoolArray | None, largest: float) -> None:
+        """Add steps by what was heard, in any order: their innovations (b, m, R), the lost messages (b, m, D), if any.
+
+        Of a step with an infinite ``link_variance``, the agent is left out. ``largest``: size of the largest state.
+        """
+        scale = self._scales(reception, e, largest)
+        self._add_heard(reception, e / scale[:, :, None], scale, lost)
 
     def _near(self, states: FloatArray) -> bool:
         """Whether states are so near to each other, or to the reference, that squares lose nothing that counts."""
@@ -190,24 +208,24 @@ class EvidenceSums:
         """The steps, with their innovations over the standard deviations, by what was heard."""
         reception = heard[0] if heard else HeardValues.of(observation, first, last)
         e = heard[1] if heard else innovations(observation, first, last, reception)
-        agents = np.arange(self._step.agents)
-        variances = np.diagonal(self._process, axis1=1, axis2=2)[reception.graphs, agents] + reception.link_variance
-        still = variances <= self._floor
-        if self._independent and still.any() and np.abs(e[still]).max() > QUIET_ROUNDING * observation.largest:
-            self.impossible = True
-        scale = np.sqrt(np.where(still, np.inf, variances))
+        scale = self._scales(reception, e, observation.largest)
         graphs, after = observation.modes[first : last + 1], observation.states[first + 1 : last + 1]
         return Block(first, graphs, e / scale[:, :, None], scale, after, reception)
 
-    def _add_heard(self, observation: Observation, block: Block) -> None:
-        """The same by what was heard, and losses."""
-        white, first = block.white, block.first
-        self.samples += np.where(np.isinf(block.scale), 0, observation.replicas).sum(axis=0)
+    def _scales(self, reception: HeardValues, e: FloatArray, largest: float) -> FloatArray:
+        """(b, m): standard deviations of innovations; infinite without noise, where nothing may move."""
+        agents = np.arange(self._step.agents)
+        variances = np.diagonal(self._process, axis1=1, axis2=2)[reception.graphs, agents] + reception.link_variance
+        still = variances <= self._floor
+        if self._independent and still.any() and np.abs(e[still]).max() > QUIET_ROUNDING * largest:
+            self.impossible = True
+        return np.asarray(np.sqrt(np.where(still, np.inf, variances)))
+
+    def _add_heard(self, reception: HeardValues, white: FloatArray, scale: FloatArray, lost: BoolArray | None) -> None:
+        """Noise, gains, pairs and losses by what was heard."""
+        self.samples += np.where(np.isinf(scale), 0, white.shape[2]).sum(axis=0)
         self.squares += (white**2).sum(axis=(0, 2))
-        lost = None
-        if len(self.lossy) and observation.lost is not None:
-            lost = observation.lost[first : first + len(white)]
-        self._add_links(block.reception, white, block.scale[:, :, None], lost)
+        self._add_links(reception, white, scale[:, :, None], lost if len(self.lossy) else None)
         if len(self.pairs):
             flat = white.transpose(1, 0, 2).reshape(len(white[0]), -1)
             products = flat @ flat.T
@@ -223,19 +241,19 @@ class EvidenceSums:
         common = pull[:, :, None] * (reception.states - step.reference) / scale
         self.link_score[agents, agents] += (common * white).sum(axis=(0, 2))
         self.link_information[agents, agents] += (common**2).sum(axis=(0, 2))
-        receivers = np.broadcast_to(agents, count.shape)
+        m = step.agents
         for d in range(step.most_neighbours):
             there = count > d
             weights = reception.weights[:, :, d]
-            difference = reception.heard(every, agents, np.full(step.agents, d)) - reception.states
+            difference = reception.heard(every, agents, np.full(m, d)) - reception.states
             part = np.where(weights != 0.0, weights, 0.0)[:, :, None] * difference / scale
             common += part
-            place = receivers[there], reception.senders[:, :, d][there]
-            np.add.at(self.link_score, place, (part * white).sum(axis=2)[there])
-            np.add.at(self.link_information, place, (part**2).sum(axis=2)[there])
+            place = (agents * m + reception.senders[:, :, d])[there]  # in one dimension: many times as fast
+            np.add.at(self.link_score.reshape(-1), place, (part * white).sum(axis=2)[there])
+            np.add.at(self.link_information.reshape(-1), place, (part**2).sum(axis=2)[there])
             if lost is not None:
-                np.add.at(self.messages, place, 1)
-                np.add.at(self.lost, place, lost[:, :, d][there])
+                np.add.at(self.messages.reshape(-1), place, 1)
+                np.add.at(self.lost.reshape(-1), place, lost[:, :, d][there])
         if self._common:
             self.common_score += float((common * white).sum())
             self.common_information += float((common**2).sum())

@@ -32,7 +32,9 @@ from msg_analysis.inference.online.running_errors import LiveEstimate, LiveRepor
 from msg_analysis.model.arithmetic.step_clock import SECOND, StepClock
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.wire import topics
-from msg_analysis.wire.messages import stamp_ns
+from msg_analysis.wire.messages import ActiveGraph, stamp_ns
+from msg_analysis.wire.receiving import decode_of_run
+from msg_analysis.wire.refusals import Refusal
 
 ESTIMATE_PERIOD = 1.0  # s between two estimates
 MOST_SILENT = 5  # estimates without any state, after which a run that has ended or has no publishers is over
@@ -68,6 +70,7 @@ class Live(Watcher):
         self._on_report = on_report
         self._estimate: LiveEstimate | None = None
         self._reached: list[int] = []  # see ``Watched.steps``
+        self._logged = False  # whether the messages are needed, and not only the states
         self._before = (-1, time.monotonic())  # newest step of the last estimate, and its time
         self._silent = 0  # estimates in a row without a newer state
 
@@ -77,10 +80,17 @@ class Live(Watcher):
         record, experiment = self.record, self.record.experiment
         # Before the prediction, which takes some time: states that arrive meanwhile wait in the middleware.
         self._subscribe_to_states(topics.TRUTH if experiment.truth else topics.STATE, self._qos, whole=True)
+        if experiment.truth:
+            self._subscribe_to_states(topics.STATE, self._qos, whole=False, take=self._take_published)
         self._reached = [-1] * experiment.agents
         self._realtime = experiment.run.pace == "realtime"
         self._clock_of_steps = StepClock(experiment.step_length)
         self._estimate = LiveEstimate(record)
+        if self._realtime and self._estimate.log:
+            self.subscribe(topics.GRAPH, self._receive_graph)
+        self._logged = self._estimate.log is not None
+        if self._end is not None:
+            self._estimate.end_at(self.last_step)
         every(self, ESTIMATE_PERIOD, self._report)
 
     def watched(self) -> Watched | None:
@@ -95,10 +105,32 @@ class Live(Watcher):
 
     def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:
         if self._estimate is not None:
-            self._estimate.add(agent, step, mode, state)
+            self._estimate.add(agent, step, mode, state, message if self._logged else b"")
             self._reached[agent] = max(self._reached[agent], step)
             if self._realtime:
                 self._estimate.add_stamps(agent, (step,), (stamp_ns(message),))
+
+    def _take_published(self, agent: int, step: int, mode: int, value: bytes, message: bytes) -> None:  # noqa: ARG002
+        """Take what an agent has published of its state. Hot path."""
+        if self._estimate is not None and self._estimate.needs_published:
+            self._estimate.add(agent, step, mode, value, published=True)
+
+    def _receive_graph(self, data: bytes) -> None:
+        """Take a sojourn of the network's graph, as the reader of bags does."""
+        assert self.record is not None
+        assert self._estimate is not None
+        found, experiment = decode_of_run(ActiveGraph, data, self.record.run.bytes), self.record.experiment
+        if isinstance(found, str):
+            self._refuse(found)
+        elif not (1 <= found.mode <= len(experiment.graph_list) and found.first_step <= found.last_step):
+            self._refuse(Refusal.GRAPH_OUT_OF_RANGE)
+        elif not self._estimate.add_sojourn(found.first_step, found.last_step, found.mode - 1):
+            self._refuse(Refusal.CONTRADICTION)
+
+    def _ends(self) -> None:
+        """See Watcher."""
+        if self._estimate is not None:
+            self._estimate.end_at(self.last_step)
 
     def _report(self) -> None:
         assert self._estimate is not None

@@ -45,6 +45,8 @@ from msg_analysis.wire.receiving import decode_of_run, state_frame, state_receiv
 from msg_analysis.wire.refusals import Refusal
 from msg_analysis.wire.topics import Qos, Topic
 
+Take = Callable[[int, int, int, bytes, bytes], None]  # of agent from 0, step, mode, state, message
+
 NOTE_DELAY = 1.0  # s after which a note says that there is no network
 
 
@@ -77,13 +79,13 @@ class Watcher(LeanNode):
         """Read the states of the run that has been found; InputError: not possible with this run."""
         raise NotImplementedError
 
-    def _subscribe_to_states(self, topic: Topic, qos: Qos, *, whole: bool) -> None:
-        """Pass the states of the run to ``_take``; messages that are not of the run are counted."""
+    def _subscribe_to_states(self, topic: Topic, qos: Qos, *, whole: bool, take: Take | None = None) -> None:
+        """Pass the states of the run to ``_take``, or ``take``; messages that are not of the run are counted."""
         assert self.record is not None
         frame = state_frame(self.record, whole=whole)
         for agent in range(self.record.experiment.agents):
             self._topics.append(self.resolve_topic_name(topic.of(agent)))
-            receive = state_receiver(self.record, agent, frame, self._take, self._refuse)
+            receive = state_receiver(self.record, agent, frame, take or self._take, self._refuse)
             self.subscribe(topic, receive, agent=agent, qos=qos)
 
     def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:
@@ -141,9 +143,13 @@ class Watcher(LeanNode):
         found = decode_of_run(Progress, data, self.record.run.bytes)
         if not isinstance(found, Progress):
             return False
-        if self.record.until is not None:
+        if self.record.until is not None and found.step != self._end:
             self._end = found.step
+            self._ends()
         return True
+
+    def _ends(self) -> None:
+        """The run has said at which step it ends: ``last_step``."""
 
     def look(self) -> None:
         """Look whether the run whose record was given is there."""

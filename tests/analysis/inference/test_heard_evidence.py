@@ -1,0 +1,200 @@
+"""Evidence of a watcher, from what the messages log: that of the comparison of the whole run, for every law."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.support import line_and_ring
+from tests.support.watched_run import messages_of, watch, watched, whole_sums
+
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.inference.online import heard_evidence, running_errors
+from msg_analysis.inference.online.heard_evidence import NetworkPath
+from msg_analysis.inference.online.running_errors import LiveEstimate
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.theory.prediction import predict
+from msg_analysis.twin.simulate import simulate
+
+LAWS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "link": {"noise": {"link": 0.3}},
+    "broadcast": {"noise": {"broadcast": 0.3}},
+    "loss": {"noise": {"loss": 0.3}},
+    "loss of one link": {"noise": {"loss": {"arcs": [[1, 2, 0.5]]}}},
+    "everything": {"noise": {"loss": 0.3, "link": 0.2, "broadcast": 0.1, "delay": 1}},
+    "hold": {"noise": {"loss": 0.3, "on_loss": "hold"}},
+    "hold, link": {"noise": {"loss": 0.3, "on_loss": "hold", "link": 0.2, "broadcast": 0.2}},
+    "burst": {"noise": {"loss": {"arcs": [[1, 2, 0.2], [2, 1, 0.2]]}, "burst": 4}},
+    "burst, hold": {"noise": {"loss": {"arcs": [[1, 2, 0.2]]}, "burst": 4, "on_loss": "hold"}},
+    "delay": {"noise": {"delay": 3}},
+    "delay, hold": {"noise": {"delay": 2, "loss": 0.2, "on_loss": "hold"}},
+    "correlated": {"noise": {"process": [[1.0, 0.5, 0, 0, 0], *np.eye(5).tolist()[1:]], "loss": 0.3}},
+    "leaders": {
+        "problem": "tracking",
+        "leaders": {"agents": [2], "gain": 1.5, "reference": 3.0},
+        "noise": {"loss": 0.2},
+    },
+    "real time": {"run": {"pace": "realtime"}},
+    "real time, on the air": {"noise": {"loss": 0.3, "broadcast": 0.2}, "run": {"pace": "realtime"}},
+    "real time, hold": {"noise": {"loss": 0.3, "on_loss": "hold"}, "run": {"pace": "realtime"}},
+    "real time, link": {"noise": {"link": 0.3}, "run": {"pace": "realtime"}},
+    "real time, delay": {"noise": {"delay": 2}, "run": {"pace": "realtime"}},
+}
+
+
+def law(duration: float = 40.0, seed: int = 1, **changes: Any) -> ValidExperiment:
+    """Of two replicas."""
+    return line_and_ring.experiment(seed, duration, **{**changes, "run": {"replicas": 2} | changes.get("run", {})})
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_is_the_evidence_of_the_comparison(name: str, tmp_path: Path) -> None:
+    """Whatever the order of the states is, and however often one looks."""
+    run = simulate(law(**LAWS[name]))
+    disorder = 0.0 if name == "plain" else 30.0  # there, the next graph counts, which comes with the next step
+    live, wanted = watched(run, tmp_path, disorder=disorder), whole_sums(run, predict(run.record.experiment))
+    assert live.evidence is not None
+    found = live.report()
+    assert (found.refused, live.evidence.count) == ({}, 800)
+    for kind, logarithms in wanted.families().items():
+        assert live.evidence.sums.families()[kind] == pytest.approx(logarithms, rel=1e-8, abs=1e-8), kind
+    assert found.any_time.log_evidence == pytest.approx(wanted.evidence(), abs=1e-8)
+
+
+def test_late_agents(tmp_path: Path, late_timers: Any) -> None:
+    """Agents of a run in real time are far apart: values are used that are older, or newer, than the step."""
+    run = late_timers.run(law(**LAWS["real time"]), late=late_timers.busy(0.4, 2.5), slow=late_timers.busy(0.2, 3.0))
+    assert run.used is not None
+    assert (run.used > np.arange(800)[:, None, None]).any()
+    live, wanted = watched(run, tmp_path), whole_sums(run, predict(run.record.experiment))
+    assert live.report().any_time.log_evidence == pytest.approx(wanted.evidence(), abs=1e-8)
+
+
+@pytest.mark.parametrize("name", ["everything", "hold", "real time", "real time, on the air"])
+def test_steps_that_were_not_seen(name: str, tmp_path: Path) -> None:
+    """They are left out, and so are agents that used a value of theirs; the rest is exact."""
+    run = simulate(law(duration=400.0, **LAWS[name]))
+    write_trajectory(run, tmp_path / "bag")
+    live = LiveEstimate(run.record)
+    rng, hidden = np.random.default_rng(3), set(range(1000, 1400))
+    hidden.update(np.flatnonzero(rng.random(8000) < 0.05).tolist())
+
+    def add(*message: Any, **options: Any) -> None:
+        if message[1] not in hidden:
+            LiveEstimate.add(live, *message, **options)
+
+    object.__setattr__(live, "add", add)
+    watch(live, messages_of(tmp_path / "bag"))
+    assert live.evidence is not None
+    sums = live.evidence.sums
+    both = [k for k in range(8000) if k not in hidden and k + 1 not in hidden]
+    assert live.evidence.count == len(both)
+    assert 0.5 * len(both) * 2 < sums.samples.min() < sums.samples.max() < len(both) * 2
+    # What is there follows the law: chi-square, within five standard deviations of each agent.
+    assert (np.abs(sums.squares - sums.samples) < 5 * np.sqrt(2.0 * sums.samples)).all()
+    assert live.report().any_time.log_evidence < np.log(100.0)
+
+
+def test_values_older_than_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which agents are left out depends on losses only, so that the evidence stays fair, and losses all count."""
+    monkeypatch.setattr(heard_evidence, "LEAST_KEPT", 8)
+    monkeypatch.setattr(heard_evidence, "MOST_KEPT", 8)
+    run = simulate(law(duration=200.0, noise={"loss": 0.7, "on_loss": "hold"}))
+    live, wanted = watched(run, tmp_path), whole_sums(run, predict(run.record.experiment))
+    assert live.evidence is not None
+    sums = live.evidence.sums
+    assert (sums.samples < wanted.samples).all()
+    assert (sums.samples > 0.5 * wanted.samples).all()
+    assert sums.lost.tolist() == wanted.lost.tolist()
+    assert sums.messages.tolist() == wanted.messages.tolist()
+    assert (np.abs(sums.squares - sums.samples) < 5 * np.sqrt(2.0 * sums.samples)).all()
+
+
+def test_impossible_messages(tmp_path: Path) -> None:
+    """Steps with an entry of ``heard`` that cannot be are left out, and counted."""
+    run = simulate(law(**LAWS["hold"]))
+    assert run.used is not None
+    run.used[100, 2, 0] = 300  # of a later step
+    write_trajectory(run, tmp_path / "bag")
+    live = LiveEstimate(run.record)
+    watch(live, messages_of(tmp_path / "bag"))
+    report = live.report()
+    assert report.refused == {"impossible entry in heard": 1}
+    assert live.evidence is not None
+    assert live.evidence.count == 798
+
+
+@pytest.mark.parametrize("name", ["everything", "hold", "real time"])
+def test_a_run_that_ends_early(name: str, tmp_path: Path) -> None:
+    """What agents do after the end is not a part of the run."""
+    run = simulate(law(**LAWS[name]))
+    write_trajectory(run, tmp_path / "bag")
+    live = LiveEstimate(run.record)
+    live.end_at(500)
+    watch(live, messages_of(tmp_path / "bag"))
+    assert live.evidence is not None
+    assert live.evidence.count == 500
+    assert live.report().newest == 500
+
+
+def test_the_path_of_the_network() -> None:
+    """Against counts of the graph of every step, whatever is known when; a sojourn is missing, one comes twice."""
+    rng = np.random.default_rng(4)
+    lengths = rng.integers(1, 9, 300)
+    ends = np.cumsum(lengths)
+    graphs = rng.integers(0, 3, 300)
+    path, counts, last = NetworkPath(), np.zeros((3, 3), dtype=int), 0
+    missing = 100
+    for number, (end, length, graph) in enumerate(zip(ends.tolist(), lengths.tolist(), graphs.tolist(), strict=True)):
+        if number != missing:
+            assert path.add(end - length, end - 1, graph)
+            assert path.add(end - length, end - 1, graph)
+        if rng.random() < 0.3:
+            last = max(last, int(rng.integers(max(0, end - 40), end + 5)))
+            before, after, times = path.passed(last)
+            np.add.at(counts, (before, after), times)
+    before, after, times = path.passed(int(ends[-1]) - 1)
+    np.add.at(counts, (before, after), times)
+    every = np.repeat(graphs, lengths)
+    seen = np.ones(len(every), dtype=bool)
+    seen[ends[missing] - lengths[missing] : ends[missing]] = False
+    wanted = np.zeros((3, 3), dtype=int)
+    pairs = seen[:-1] & seen[1:]
+    np.add.at(wanted, (every[:-1][pairs], every[1:][pairs]), 1)
+    assert counts.tolist() == wanted.tolist()
+
+
+def test_a_contradiction_in_the_path() -> None:
+    path = NetworkPath()
+    assert path.add(0, 3, 1)
+    assert not path.add(0, 4, 1)
+
+
+def test_correct_runs_seldom_pass_at_any_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 40 watchers that miss steps, at level 10 %: more than 10 pass with probability 0.2 %."""
+    prediction = predict(law(duration=25.0, **LAWS["hold"]))
+    monkeypatch.setattr(running_errors, "predict", lambda *_: prediction)
+    passed = 0
+    for seed in range(40):
+        run = simulate(law(duration=25.0, seed=200 + seed, **LAWS["hold"]))
+        write_trajectory(run, tmp_path / str(seed))
+        live, rng = LiveEstimate(run.record), np.random.default_rng(seed)
+        hidden = set(np.flatnonzero(rng.random(501) < 0.1).tolist())
+        messages = [(topic, data) for topic, data in messages_of(tmp_path / str(seed))]
+        highest = -np.inf
+
+        def add(*message: Any, live: LiveEstimate = live, hidden: set[int] = hidden, **options: Any) -> None:
+            if message[1] not in hidden:
+                LiveEstimate.add(live, *message, **options)
+
+        object.__setattr__(live, "add", add)
+        for first in range(0, len(messages), 100):
+            watch(live, messages[first : first + 100])
+            evidence = live.report().any_time.log_evidence
+            assert evidence is not None
+            highest = max(highest, evidence)
+        passed += highest >= np.log(10.0)
+    assert passed <= 10

@@ -1,0 +1,65 @@
+"""A run given to a watcher message by message, as its topics would, from its bag."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference.online.running_errors import LiveEstimate
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.theory.prediction import Prediction
+from msg_analysis.wire.messages import ActiveGraph
+from msg_analysis.wire.receiving import state_frame
+
+
+def messages_of(bag: Path) -> list[tuple[str, bytes]]:
+    """(topic, message) of a bag in one file, in its order."""
+    (file,) = bag.glob("*.mcap")
+    with file.open("rb") as stream:
+        return [(channel.topic, message.data) for _, channel, message in make_reader(stream).iter_messages()]
+
+
+def watch(live: LiveEstimate, messages: list[tuple[str, bytes]], *, disorder: float = 0.0, every: int = 200) -> None:
+    """Give the messages to a watcher, which looks from time to time; ``disorder``: steps by which states are late."""
+    experiment, rng = live.record.experiment, random.Random(1)
+    whole, said = state_frame(live.record, whole=True), state_frame(live.record, whole=False)
+    states = []
+    for topic, data in messages:
+        kind = topic.rsplit("/", 1)[1]
+        if kind == "graph":
+            graph = ActiveGraph.decode(data)
+            live.add_sojourn(graph.first_step, graph.last_step, graph.mode - 1)
+        elif kind in ("state", "truth"):
+            published = kind == "state" and experiment.truth
+            found = (said if published else whole).unwrap(data)
+            assert found is not None
+            if not published or live.needs_published:
+                states.append((found[1] + disorder * rng.random(), found, data, published))
+    for number, (_, found, data, published) in enumerate(sorted(states, key=lambda state: state[0])):
+        agent, step, mode, payload = found
+        live.add(agent - 1, step, mode, payload, data, published=published)
+        if number % every == every - 1:
+            live.report()
+    live.report()
+
+
+def watched(trajectory: Trajectory, folder: Path, *, disorder: float = 0.0, every: int = 200) -> LiveEstimate:
+    """A watcher that has seen a whole run."""
+    write_trajectory(trajectory, folder / "bag")
+    live = LiveEstimate(trajectory.record)
+    watch(live, messages_of(folder / "bag"), disorder=disorder, every=every)
+    return live
+
+
+def whole_sums(trajectory: Trajectory, prediction: Prediction) -> EvidenceSums:
+    """The sums of a comparison, without departures."""
+    observation = Observation.of(trajectory, prediction)
+    sums = EvidenceSums(prediction, observation.replicas)
+    for first, last in observation.blocks(1000, "evidence"):
+        sums.add(observation, first, last)
+    return sums
