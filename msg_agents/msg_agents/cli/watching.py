@@ -160,9 +160,11 @@ class LiveView:
             self._display.begin(experiment)
             for line in self._notes:
                 self._source.happened(line)
+        if watched.last_step < experiment.steps:
+            self._source.ends_at(watched.last_step)
         self._display.draw(self._source.snapshot(watched.steps, report), experiment)
         if self._print_line is not None:
-            self._print_line(live_line(report, watched.record, rate))
+            self._print_line(live_line(report, watched.last_step, rate))
 
 
 @click.command(

@@ -106,6 +106,7 @@ class RunView(View):
     def ends_at(self, step: int) -> None:
         """See View."""
         self._last_step = step
+        self._source.ends_at(step)
 
     def _ended(self) -> set[int]:
         """Agents whose process has ended before its last step, or had to be replaced."""

@@ -147,11 +147,13 @@ class Snapshot:
     gone: frozenset[int] = frozenset()  # agents (from 0) without a process, or with one that has made no step yet
     path: list[Sojourn] = field(default_factory=list)  # sojourns from the oldest of ``report.recent`` on
     events: tuple[Event, ...] = ()  # the newest ``MOST_EVENTS``
+    last: int | None = None  # last step of a run that ends before its planned end; None: not known to do so
 
     @property
     def reached(self) -> int:
-        """The step that every agent has reached; -1: none."""
-        return min(self.steps, default=-1)
+        """The step that every agent has reached; -1: none. What is done after the end is not a part of the run."""
+        reached = min(self.steps, default=-1)
+        return reached if self.last is None else min(reached, self.last)
 
 
 class SnapshotSource:
@@ -159,10 +161,15 @@ class SnapshotSource:
 
     def __init__(self, experiment: ValidExperiment) -> None:
         self._steps = experiment.steps
+        self._last: int | None = None  # where the run ends early
         self._sojourns, self._rates, self._presence = SojournFinder(experiment), StepRates(), Presence(experiment.names)
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._refused: dict[str, int] = {}
         self._reached = -1
+
+    def ends_at(self, step: int) -> None:
+        """The run ends at this step, before its planned end."""
+        self._last = self._steps = step
 
     def happened(self, text: str) -> None:
         """Something happened, now."""
@@ -179,7 +186,7 @@ class SnapshotSource:
 
         ``ended``: agents (from 0) whose process has ended before its last step.
         """
-        now = Snapshot(list(steps), report=report, note=note or (report.note if report else None))
+        now = Snapshot(list(steps), report=report, note=note or (report.note if report else None), last=self._last)
         self._reached = max(self._reached, now.reached)
         for text in self._presence.add(steps, ended):
             self.happened(text)
@@ -238,6 +245,7 @@ def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = Non
     return {
         "steps": snapshot.steps if len(snapshot.steps) > 1 else [],
         "reached": snapshot.reached,
+        "last": snapshot.last,
         "rate": snapshot.rate or 0.0,
         "left": snapshot.left,
         "graph": None if sojourn is None else sojourn.mode,

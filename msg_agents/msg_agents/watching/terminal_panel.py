@@ -69,7 +69,7 @@ def panel_of(snapshot: Snapshot, experiment: ValidExperiment, *, width: int, hei
 
 def plain_line(snapshot: Snapshot, experiment: ValidExperiment) -> str:
     """The same as one line of text."""
-    parts = [f"step {snapshot.reached} of {experiment.steps}", *_speed(snapshot)]
+    parts = [f"step {snapshot.reached} of {snapshot.last or experiment.steps}", *_speed(snapshot)]
     if snapshot.sojourn is not None:
         parts.append(f"graph {experiment.graph_list[snapshot.sojourn.mode].name}")
     if snapshot.left is not None:
@@ -83,8 +83,9 @@ def _speed(snapshot: Snapshot) -> list[str]:
 
 
 def _progress(snapshot: Snapshot, experiment: ValidExperiment, width: int) -> RenderableType:
-    share = snapshot.reached / experiment.steps
-    parts = [f"step {snapshot.reached} of {experiment.steps}", f"{100 * share:.0f} %", *_speed(snapshot)]
+    last = snapshot.last or experiment.steps
+    share = snapshot.reached / last
+    parts = [f"step {snapshot.reached} of {last}", f"{100 * share:.0f} %", *_speed(snapshot)]
     if snapshot.left is not None:
         parts.append(f"{_duration(snapshot.left)} left")
     text = "  ".join(parts)
@@ -105,7 +106,7 @@ def _graph(snapshot: Snapshot, experiment: ValidExperiment) -> Text:
     text.append(graph.name, style=f"bold {COLOURS[sojourn.mode % len(COLOURS)]}")
     now, dt = snapshot.reached, experiment.step_length
     # The end of the run cuts the last sojourn short.
-    end = "the end" if sojourn.last_step == experiment.steps - 1 else f"{sojourn.last_step + 1}"
+    end = "the end" if sojourn.last_step >= (snapshot.last or experiment.steps) - 1 else f"{sojourn.last_step + 1}"
     held = (now - sojourn.first_step) * dt
     text.append(f"  for {held:.3g} units of time, steps {sojourn.first_step} to {end}, after {sojourn.sequence} jumps")
     return text

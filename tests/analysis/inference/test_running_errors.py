@@ -90,7 +90,7 @@ def test_the_same_numbers_as_a_comparison(case: str) -> None:
     trajectory = simulate(experiment(**CASES[case]))
     prediction = predict(trajectory.record.experiment)
     system, nodes = estimates(time_means(Observation.of(trajectory, prediction)), prediction.system)
-    live, rng = LiveEstimate(trajectory.record), random.Random(1)
+    live, rng = LiveEstimate(trajectory.record, evidence=False), random.Random(1)
     order = sorted(messages(trajectory), key=lambda message: message[1] + 20 * rng.random())
     for number, message in enumerate(order):
         live.add(*message)
@@ -184,7 +184,7 @@ def test_gaps_leave_the_standard_error_on_the_safe_side() -> None:
 
 def test_in_real_time_nothing_is_claimed() -> None:
     trajectory = simulate(experiment(run={"pace": "realtime", "speed": 1.0}))
-    live = LiveEstimate(trajectory.record)
+    live = LiveEstimate(trajectory.record, evidence=False)
     for message in messages(trajectory):
         live.add(*message)
     report = live.report()

@@ -74,10 +74,11 @@ class LiveEstimate:
 
     In real time agents are at different steps at the same moment, and the expected errors depend on their timing: then
     there is no standard error, and the prediction is that of agents that are never late. ``nodes`` asks for standard
-    errors of the nodes. InputError where there is no prediction (too large, unbounded).
+    errors of the nodes, ``evidence`` for the evidence, which may need the messages. InputError where there is no
+    prediction (too large, unbounded).
     """
 
-    def __init__(self, record: RunRecord, *, nodes: bool = True) -> None:
+    def __init__(self, record: RunRecord, *, nodes: bool = True, evidence: bool = True) -> None:
         experiment = record.experiment
         lockstep = experiment.run.pace == "lockstep"
         self.record = record
@@ -86,7 +87,7 @@ class LiveEstimate:
         self._errors = RunningErrors(record, prediction, nodes=nodes)
         self._plain: RunningEvidence | None = None
         self._heard: HeardEvidence | None = None
-        if prediction is not None and supports(prediction):
+        if evidence and prediction is not None and supports(prediction):
             if needs_log(experiment):
                 self._heard = HeardEvidence(prediction, experiment.run.replicas)
             else:

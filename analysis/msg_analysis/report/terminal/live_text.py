@@ -46,9 +46,9 @@ def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
     }
 
 
-def live_line(report: LiveReport, record: RunRecord, rate: float) -> str:
-    """Step, system error and missing steps in one line; ``rate`` in steps per second."""
-    parts = [f"step {max(report.newest, 0)} of {record.experiment.steps}", f"system error {error_text(report.system)}"]
+def live_line(report: LiveReport, last: int, rate: float) -> str:
+    """Step, of ``last`` ones, system error and missing steps in one line; ``rate`` in steps per second."""
+    parts = [f"step {min(max(report.newest, 0), last)} of {last}", f"system error {error_text(report.system)}"]
     if any_time := any_time_text(report):
         parts.append(any_time)
     return ", ".join(parts + (coverage(report) if report.steps else ["no complete step yet"]) + [f"{rate:.0f} steps/s"])

@@ -48,6 +48,7 @@ class Watched:
     report: LiveReport
     finished: bool  # followed to its last step
     steps: list[int]  # newest step of each agent that has arrived, by index; -1: none
+    last_step: int  # of the run, as far as it is known that it ends early
 
 
 class Live(Watcher):
@@ -101,7 +102,7 @@ class Live(Watcher):
         for reason, count in self._refused.items():
             report.refused[reason] = report.refused.get(reason, 0) + count
         last = self.last_step
-        return Watched(self.record, report, self._estimate.steps.newest >= last, list(self._reached))
+        return Watched(self.record, report, self._estimate.steps.newest >= last, list(self._reached), last)
 
     def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:
         if self._estimate is not None:

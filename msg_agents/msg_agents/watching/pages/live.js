@@ -107,8 +107,9 @@ function show(data) {
   if (!setting) return;
   if (!over) say("", data.reached < 0 ? "the network is starting" : "running");
   const reached = Math.max(data.reached, 0);
-  at("progress").value = reached / setting.steps;
-  at("step").textContent = `${reached} of ${setting.steps}`;
+  const last = data.last === null ? setting.steps : data.last;  // a run may end before its planned end
+  at("progress").value = reached / last;
+  at("step").textContent = `${reached} of ${last}`;
   at("time").textContent = number(reached * setting.dt);
   at("rate").textContent = data.rate.toFixed(0);
   at("left").textContent = lasting(data.left);
@@ -118,7 +119,7 @@ function show(data) {
     for (const { line, modes } of links.values()) line.classList.toggle("active", modes.has(data.graph));
   }
   at("sojourn").textContent = data.sojourn ? `for ${number((reached - data.sojourn[1]) * setting.dt, 3)} units of time, from step ${data.sojourn[1]} to ${data.sojourn[2] + 1}; ${data.sojourn[0] - 1} jumps so far` : "";
-  const gone = new Set(data.gone), finished = (agent) => data.steps.length && data.steps[agent] >= setting.steps;
+  const gone = new Set(data.gone), finished = (agent) => data.steps.length && data.steps[agent] >= last;
   const silent = (agent) => !over && !finished(agent) && data.ages.length > 0 && data.ages[agent] > setting.silent && data.reached >= 0;
   const away = (agent) => gone.has(agent) || silent(agent);
   if (data.values) {

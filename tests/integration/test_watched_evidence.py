@@ -1,0 +1,94 @@
+"""Evidence while a real network runs: that of the comparison, for all laws; a wrong network is ended and named."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.support.watched_run import whole_sums
+
+from msg_agents.watching import early_end, run_observer
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.run.until import Until
+from msg_analysis.theory.prediction import predict
+
+AIR = {"process": 1.0, "loss": 0.2, "link": 0.2, "broadcast": 0.2}
+LAWS: dict[str, dict[str, Any]] = {
+    "loss and noise": {"noise": AIR},
+    "hold, delay": {"noise": {"process": 1.0, "loss": 0.2, "on_loss": "hold", "delay": 1}},
+    "real time": {"run": {"pace": "realtime", "speed": 10}},
+    "real time, loss and noise": {"noise": AIR, "run": {"pace": "realtime", "speed": 10}},
+}
+
+# Agent 3 has 1.3 times its noise in every process of the run; the record does not know it.
+NOISY = """
+from msg_analysis.model.step import process_noise
+
+class Noisy(process_noise.ProcessNoise):
+    def block(self, agent, block):
+        return [noise * (1.3 if agent == 2 else 1.0) for noise in super().block(agent, block)]
+
+process_noise.ProcessNoise = Noisy
+"""
+
+
+def evidence_of(trajectory: Trajectory) -> float:
+    """Of the comparison, without departures."""
+    return whole_sums(trajectory, predict(trajectory.record.experiment, trajectory.record.step_model)).evidence()
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_watchers_have_the_evidence_of_the_comparison(
+    network: Any, domain: int, law: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The observer of the run by the checkpoints, and `live` by the topics of its replay."""
+    observers: list[run_observer.RunObserver] = []
+
+    def observer(record: Any, checkpoints: Path) -> run_observer.RunObserver:
+        observers.append(run_observer.RunObserver(record, checkpoints))
+        return observers[-1]
+
+    monkeypatch.setattr(early_end, "RunObserver", observer)
+    changes = LAWS[law]
+    experiment = network.experiment(**changes | {"run": {"duration": 60, "processes": 2} | changes.get("run", {})})
+    result = network.run(experiment, until=Until(0.001))
+    assert (result.failures, result.until["ended_early"]) == ([], False)
+    wanted = evidence_of(result.trajectory)
+    report = observers[0].report
+    assert report is not None
+    assert observers[0]._reader.missed == 0
+    assert report.any_time.log_evidence == pytest.approx(wanted, abs=1e-7)
+    live = network.start("live", "--reliable", "--json", "--timeout", "60")
+    play = network.start("play", result.bag, "--rate", "max", "--await", "live")
+    stdout, stderr = live.communicate(timeout=100)
+    assert (play.wait(60), live.returncode) == (0, 0), stderr
+    found = json.loads(stdout)
+    assert found["refused"] == {}
+    assert found["any_time"]["log_evidence"] == pytest.approx(wanted, abs=1e-7)
+
+
+@pytest.mark.parametrize("law", ["plain", "loss and noise", "real time"])
+def test_a_wrong_network_is_ended(network: Any, law: str) -> None:
+    """Its agents do not what the record says: the run ends early, disagrees, and says why."""
+    (network.directory / "sitecustomize.py").write_text(NOISY)
+    changes = LAWS.get(law, {})
+    file = network.file(**changes | {"run": {"duration": 4000, "replicas": 8, "processes": 2} | changes.get("run", {})})
+    path = os.pathsep.join([str(network.directory), *filter(None, [os.environ.get("PYTHONPATH")])])
+    options = ("--out", network.directory, "--json", "--until", "decided", "--write-report", "never")
+    run = network.start("run", file, *options, PYTHONPATH=path)
+    stdout, stderr = run.communicate(timeout=150)
+    assert run.returncode == 1, stderr + stdout
+    result = json.loads(stdout)
+    assert (result["verdict"], result["failures"]) == ("disagrees", [])
+    assert result["until"]["ended_early"]
+    assert result["until"]["reason"].startswith("evidence against the prediction passed 100 at step ")
+    assert result["any_time"]["disagrees"]
+    assert result["any_time"]["questions"][0]["about"] == "noise of agent 3"
+    assert result["blame"][0]["words"].startswith("agent 3's noise variance is 1.")
+    trajectory = read_bag(result["bag"])
+    assert trajectory.completeness.complete
+    assert trajectory.record.experiment.steps == result["until"]["step"] == result["steps"]
