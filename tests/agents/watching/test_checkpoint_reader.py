@@ -8,17 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_agents.recovery.checkpoint import Checkpoint
+from msg_agents.recovery.checkpoint import Checkpoint, entry_size
 from msg_agents.watching.checkpoint_reader import BLOCK, CheckpointReader
 from msg_agents.watching.run_observer import RunObserver
+from msg_analysis.inference.online.logged_states import StateLog
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.arithmetic.payload import to_payload
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.model.step.air import LOST
+from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.twin.simulate import simulate
 from msg_analysis.wire.messages import StateCodec
-from msg_analysis.wire.receiving import state_frame
 from msg_analysis.wire.topics import agent_name
 
 
@@ -38,9 +40,9 @@ class Writers:
     def __init__(self, trajectory: Trajectory, directory: Path) -> None:
         self.record: RunRecord = trajectory.record
         experiment, run = self.record.experiment, self.record.run.bytes
-        frame = state_frame(self.record, whole=True)
+        size = entry_size(self.record)
         self._trajectory, self._done = trajectory, -1
-        self._files = [Checkpoint(directory / f"{agent_name(i)}.states", frame.size) for i in range(experiment.agents)]
+        self._files = [Checkpoint(directory / f"{agent_name(i)}.states", size) for i in range(experiment.agents)]
         self._codecs = [
             StateCodec(run, i + 1, experiment.width, experiment.step_length) for i in range(experiment.agents)
         ]
@@ -50,16 +52,24 @@ class Writers:
         for step in range(self._done + 1, last + 1):
             mode = int(self._trajectory.modes[step - 1]) + 1 if step else 0
             for agent, (file, codec) in enumerate(zip(self._files, self._codecs, strict=True)):
-                heard = [step - 1] * (1 + (step + agent) % 2) if lossy and step else []  # of changing length
+                heard = []
+                if lossy and step:
+                    lost = self._trajectory.lost[step - 1, agent]
+                    count = len(self.record.model.neighbours(mode - 1, agent))
+                    heard = [LOST if each else step - 1 for each in lost[:count]] if lost.any() else []
                 payload = to_payload(np.ascontiguousarray(self._trajectory.states[step, agent]))
-                file.write(step, codec.wrap(step, mode, payload, heard))
+                published = self._trajectory.published
+                value = b"" if published is None else to_payload(np.ascontiguousarray(published[step, agent]))
+                file.write(step, codec.wrap(step, mode, payload, heard) + value)
         self._done = last
 
 
-@pytest.mark.parametrize("noise", [{}, {"loss": 0.1}])
+@pytest.mark.parametrize("noise", [{}, {"loss": 0.1}, {"broadcast": 0.2}, {"loss": 0.1, "broadcast": 0.2}])
 def test_gives_what_was_written(tmp_path: Path, noise: dict[str, float]) -> None:
     trajectory = simulate(_experiment(noise={"process": 1.0, **noise}))
     reader = CheckpointReader(trajectory.record, tmp_path)
+    if noise:
+        reader.keep(StateLog(trajectory.record))
     assert not reader.ready()
     writers = Writers(trajectory, tmp_path)
     assert reader.ready()
@@ -72,8 +82,25 @@ def test_gives_what_was_written(tmp_path: Path, noise: dict[str, float]) -> None
         assert np.array_equal(modes, trajectory.modes[steps])
         assert np.array_equal(states, trajectory.states[steps])
         assert np.array_equal(after, trajectory.states[steps + 1])
+        if noise and len(steps):
+            logged = reader.logged()
+            assert logged is not None
+            assert logged.steps.tolist() == [*steps.tolist(), steps[-1] + 1]
+            assert np.array_equal(logged.states, trajectory.states[logged.steps])
+            if trajectory.published is not None:
+                assert logged.published is not None
+                assert np.array_equal(logged.published, trajectory.published[logged.steps])
+            if trajectory.lost is not None:
+                lost = trajectory.lost[steps]
+                assert np.array_equal(logged.used[1:] < 0, lost | (neighbour_counts(trajectory)[steps] <= 0))
     assert seen == list(range(400))
     assert reader.missed == 0
+
+
+def neighbour_counts(trajectory: Trajectory) -> np.ndarray:
+    """(N, m, D): how many neighbours are left from the d-th on, in the graph of the step."""
+    tables = neighbour_tables(trajectory.record.model)
+    return tables.count[trajectory.modes][:, :, None] - np.arange(trajectory.record.model.most_neighbours)
 
 
 def test_what_was_written_over_is_missed(tmp_path: Path) -> None:
@@ -98,7 +125,7 @@ def test_half_written_states_do_not_count(tmp_path: Path) -> None:
     writers = Writers(trajectory, tmp_path)
     writers.write(50)
     path = tmp_path / "agent_2.states"
-    size = state_frame(trajectory.record, whole=True).size
+    size = entry_size(trajectory.record)
     data = bytearray(path.read_bytes())
     data[20 * (size + 16) + size + 8 : 20 * (size + 16) + size + 16] = bytes(8)  # the mark of step 20
     path.write_bytes(data)

@@ -171,3 +171,19 @@ def test_the_speed_of_agents_that_step_in_bursts(monkeypatch: pytest.MonkeyPatch
         rates.add([64 * (tick // 16), 64 * ((tick + 8) // 16)])
     assert rates.rates() == [pytest.approx(64 / 3.25), 0.0]
     assert rates.rate() == pytest.approx(64 / 3.25)
+
+
+def test_a_run_that_ends_before_its_planned_end() -> None:
+    """The steps are those that it has; what some agents did after its end does not count."""
+    experiment = _experiment()
+    snapshot = _snapshot(5, last=4000, sojourn=Sojourn(41, 1, 3990, 4010), left=0.0)
+    shown = _lines(snapshot, experiment, 120, 24)
+    assert "step 4000 of 4000  100 %" in shown[1]
+    assert "steps 3990 to the end" in shown[2]
+    assert plain_line(snapshot, experiment).startswith("step 4000 of 4000, ")
+    assert (snapshot_document(snapshot)["reached"], snapshot_document(snapshot)["last"]) == (4000, 4000)
+    source = SnapshotSource(experiment)
+    assert source.snapshot([4000] * 5).last is None
+    source.ends_at(4002)
+    found = source.snapshot([4003, 4002, 4002, 4004, 4002])
+    assert (found.reached, found.last) == (4002, 4002)
