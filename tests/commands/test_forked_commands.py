@@ -13,8 +13,8 @@ import pytest
 pytest.importorskip("rclpy")
 import forked_commands
 
-from msg_agents.discovery.profiles import INTRODUCED_PROFILE, LOOPBACK_PROFILE
-from msg_agents.processes.environment import PROFILE_VARIABLES, node_environment
+from msg_agents.discovery.profiles import INTRODUCED_PROFILE, LOOPBACK_PROFILE, PROFILE_VARIABLES
+from msg_agents.processes.environment import node_environment
 from msg_analysis.common.blas_threads import SINGLE_THREAD
 
 LIBRARIES = (*forked_commands.PREPARED, "dask", "distributed", "matplotlib.pyplot", "mcap_ros2", "threadpoolctl")

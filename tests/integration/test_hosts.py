@@ -20,7 +20,7 @@ import pytest
 import yaml
 from processors import another_processor
 
-from msg_agents.processes.environment import PROFILE_VARIABLES
+from msg_agents.discovery.profiles import PROFILE_VARIABLES
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 

@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,6 +31,7 @@ def has_fast_dds_3(distribution: str) -> bool:
 
 
 # Fast DDS 3 refuses a profile with an element that it has renamed, and Fast DDS 2 one with the new name.
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
 _PLACE = Path(__file__).parent / ("fast_dds_3" if has_fast_dds_3(ros_distribution()) else "")
 LOOPBACK_PROFILE = _PLACE / "loopback.xml"
 MOST_PARTICIPANTS = 100  # that find each other in a domain on one machine: maxInitialPeersRange of loopback.xml
@@ -44,6 +47,15 @@ longest time for which a host may be cut off."""
 
 ANNOUNCEMENT = 3.0  # s between two announcements of a participant to other hosts
 _NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
+
+
+def has_profile_for(topic: str) -> bool:
+    """Whether the profile of this process, if there is one, says something of a topic, by its resolved name."""
+    for variable in PROFILE_VARIABLES:
+        with contextlib.suppress(OSError, ET.ParseError):
+            tree = ET.parse(os.environ.get(variable, ""))
+            return tree.find(f".//{{*}}data_writer[@profile_name='{topic}']") is not None
+    return False
 
 
 def domains_for(participants: int) -> int:

@@ -19,10 +19,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from msg_agents.discovery.profiles import PROFILE_VARIABLES
 from msg_agents.doctor.check import Check, refusal, warn_if
 from msg_agents.processes.environment import (
     LOCALHOST_VARIABLE,
-    PROFILE_VARIABLES,
     RANGE_VARIABLE,
     SERVER_VARIABLE,
     TRANSPORTS_VARIABLE,

@@ -22,7 +22,7 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
-from msg_agents.discovery.profiles import LOOPBACK_PROFILE, UDP_PROFILE, has_fast_dds_3
+from msg_agents.discovery.profiles import LOOPBACK_PROFILE, PROFILE_VARIABLES, UDP_PROFILE, has_fast_dds_3
 from msg_analysis.common.blas_threads import SINGLE_THREAD
 from msg_analysis.common.version import ros_distribution
 from msg_analysis.errors import InputError
@@ -36,7 +36,6 @@ RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"  # older; 1 is still stronger, and adds shared memory as LOCALHOST does
 SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
 LOGS_VARIABLE = "ROS_LOG_DIR"
-PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
 
 
 def check_domain() -> None:

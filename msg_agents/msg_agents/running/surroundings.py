@@ -23,9 +23,9 @@ from pathlib import Path
 
 from msg_agents.discovery.introducer import Introducer
 from msg_agents.discovery.loopback import require_loopback
-from msg_agents.discovery.profiles import INTRODUCED_PROFILE, domains_for
+from msg_agents.discovery.profiles import INTRODUCED_PROFILE, PROFILE_VARIABLES, domains_for
 from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import PROFILE_VARIABLES, node_environment, other_logs, require_discovery
+from msg_agents.processes.environment import node_environment, other_logs, require_discovery
 from msg_agents.processes.middleware_check import require_middleware
 from msg_agents.processes.shared_memory import require_shared_memory
 

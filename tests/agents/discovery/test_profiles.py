@@ -10,9 +10,18 @@ from pathlib import Path
 import pytest
 
 from msg_agents.discovery import profiles
-from msg_agents.discovery.profiles import INTRODUCED_PROFILE, LOOPBACK_PROFILE, UDP_PROFILE, has_fast_dds_3
+from msg_agents.discovery.profiles import (
+    INTRODUCED_PROFILE,
+    LOOPBACK_PROFILE,
+    PROFILE_VARIABLES,
+    UDP_PROFILE,
+    has_fast_dds_3,
+    has_profile_for,
+    profile_for_hosts,
+)
 from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import PROFILE_VARIABLES, node_environment, profile_variables
+from msg_agents.processes.environment import node_environment, profile_variables
+from msg_analysis.wire.topics import STATES, TRUTHS
 
 OLD, NEW = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 FOLDER = Path(profiles.__file__).parent
@@ -55,6 +64,80 @@ def test_the_middleware_here_takes_it(profile: Path, monkeypatch: pytest.MonkeyP
             check=False,
         )
     assert (node.returncode, node.stdout, node.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("variable", PROFILE_VARIABLES)
+def test_only_our_profiles_bound_the_batches_of_states(
+    variable: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """So batches are large with these profiles only."""
+    for name in PROFILE_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    hosts, damaged = tmp_path / "hosts.xml", tmp_path / "damaged.xml"
+    hosts.write_text(profile_for_hosts(["10.0.0.1"]))
+    damaged.write_text("<dds>")
+    assert not has_profile_for("/states")
+    for path, bounded in (
+        (LOOPBACK_PROFILE, True),
+        (INTRODUCED_PROFILE, True),
+        (hosts, True),
+        (UDP_PROFILE, False),
+        (damaged, False),
+        (tmp_path / "missing.xml", False),
+    ):
+        monkeypatch.setenv(variable, str(path))
+        found = [has_profile_for(f"{root}{topic.name}") for topic in (STATES, TRUTHS) for root in ("/", "/network/")]
+        assert found == [bounded, False, bounded, False], path
+
+
+KEPT = """
+import sys, rclpy
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from msg_agents_interfaces.msg import StateBatch
+
+rclpy.init()
+node = rclpy.create_node(sys.argv[1], enable_rosout=False)
+qos = QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=0, reliability=ReliabilityPolicy.RELIABLE)
+if sys.argv[1] == "reader":
+    reader = node.create_subscription(StateBatch, "states", lambda message: None, qos)
+    print(flush=True)
+    sys.stdin.read()
+else:
+    writer = node.create_publisher(StateBatch, "states", qos)
+    while not writer.get_subscription_count():
+        pass
+    kept = 0
+    try:
+        while kept < 20000:
+            writer.publish(StateBatch())
+            kept += 1
+    except rclpy.impl.implementation_singleton.rclpy_implementation.RCLError:
+        pass
+    print(kept)
+"""
+
+
+def test_so_many_batches_wait_for_a_reader_that_takes_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the writer, and as many at the reader: both are bounded by the profile (40 MB of batches each)."""
+    pytest.importorskip("rclpy")
+    for name in (*PROFILE_VARIABLES, "ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION"):
+        monkeypatch.delenv(name, raising=False)
+    command = [sys.executable, "-P", "-W", "ignore", "-c", KEPT]
+    with free_domain() as domain:
+        environment = os.environ | node_environment(domain, LOOPBACK_PROFILE)
+        with subprocess.Popen(
+            [*command, "reader"], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ) as reader:
+            assert reader.stdout is not None
+            assert reader.stdin is not None
+            reader.stdout.readline()
+            writer = subprocess.run([*command, "writer"], env=environment, capture_output=True, text=True, check=True)
+            reader.stdin.close()
+    from msg_agents.nodes.agents.state_batches import BATCH_SIZE
+
+    kept = int(writer.stdout)
+    assert kept == 2 * 1250
+    assert kept * BATCH_SIZE <= 2 * 41_000_000
 
 
 @pytest.mark.parametrize("value", ["0", "1"])

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from msg_agents.discovery.profiles import PROFILE_VARIABLES
 from msg_agents.discovery.rtps import PEERS_VARIABLE
-from msg_agents.processes.environment import PROFILE_VARIABLES
 from msg_agents.processes.hosts import Hosts
 from msg_agents.processes.process_plan import Share, plan_network
 from msg_analysis.errors import InputError
