@@ -131,7 +131,7 @@ class WrittenFile:
         """Append messages (see ``BagWriter.write_many``) and count them in ``sequences``; the topics that they have."""
         head = np.zeros(len(of), MESSAGE_HEAD)
         head["log_time"] = head["publish_time"] = time_ns
-        order = np.argsort(of, kind="stable")
+        order = np.argsort(of.astype(np.uint16), kind="stable")  # a radix sort; channels of MCAP have 16 bits
         present, first, counts = np.unique(of[order], return_index=True, return_counts=True)
         names = [topics[topic] for topic in present.tolist()]
         earlier = [sequences[name] for name in names]

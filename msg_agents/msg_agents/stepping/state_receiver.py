@@ -110,7 +110,7 @@ class StateReceiver:
         new = np.ones(len(agent), np.bool_)
         if not len(agent):
             return new
-        order = np.argsort(agent, kind="stable")
+        order = np.argsort(agent.astype(np.uint16), kind="stable")  # a radix sort; a bag has fewer topics than 2^16
         agents, steps, marks = agent[order], step[order], marks_of(contents[order])
         first = np.flatnonzero(np.diff(agents, prepend=-1))  # of each agent
         follows = np.diff(steps, prepend=0) == 1

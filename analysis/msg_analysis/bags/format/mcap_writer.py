@@ -52,6 +52,7 @@ from msg_analysis.types import AnyArray, IntArray
 MAGIC = b"\x89MCAP0\r\n"
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time; then the data
 _MESSAGE_RECORD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("head", MESSAGE_HEAD)])  # the same
+ENTRY = struct.Struct("<QQ")  # of an index: log time, place among the records of the chunk
 MESSAGE_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries; then the entries
 CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the records
 FOOTER = struct.Struct("<BQQQ")  # what of it the checksum of the summary covers
@@ -86,7 +87,7 @@ class McapWriter:
         self._counts: dict[int, int] = {}  # messages by channel, of the chunks that are finished
         self._chunk: list[bytes] = []  # records of the chunk in progress, in parts
         self._size = 0  # of the chunk in progress
-        self._index: dict[int, list[int]] = defaultdict(list)  # by channel: time and place of every message in turn
+        self._index: dict[int, bytearray] = defaultdict(bytearray)  # by channel: an ENTRY for each message
         stream.write(MAGIC + _encoded(Header(profile=profile, library=library)))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
@@ -140,7 +141,7 @@ class McapWriter:
         length = len(data)
         published = time_ns if published_ns is None else published_ns
         self._chunk += (MESSAGE.pack(Opcode.MESSAGE, length + 22, channel, sequence, time_ns, published), data)
-        self._index[channel] += (time_ns, self._size)
+        self._index[channel] += ENTRY.pack(time_ns, self._size)
         self._size += length + MESSAGE.size
         if self._size > self._chunk_size:
             self._finish_chunk()
@@ -177,11 +178,11 @@ class McapWriter:
         self._chunk.append(records.tobytes())
         order = np.argsort(head["channel"], kind="stable")
         entries = np.column_stack((head["log_time"], (place - MESSAGE.size + self._size).astype(np.uint64)))
-        flat = entries[order].ravel().tolist()
+        flat = memoryview(entries[order].astype("<u8").tobytes())
         channels, first, counts = np.unique(head["channel"][order], return_index=True, return_counts=True)
         for number in np.argsort(order[first]).tolist():  # as they come
             begin = int(first[number])
-            self._index[int(channels[number])] += flat[2 * begin : 2 * (begin + int(counts[number]))]
+            self._index[int(channels[number])] += flat[ENTRY.size * begin : ENTRY.size * (begin + int(counts[number]))]
         self._size += total
         if self._size > self._chunk_size:
             self._finish_chunk()
@@ -190,15 +191,14 @@ class McapWriter:
         """Write the chunk in progress; one without messages stays in progress."""
         if not self._index:
             return
-        records = b"".join(self._chunk)
-        entries = {channel: np.array(index, dtype="<u8") for channel, index in self._index.items()}
+        records, entries = b"".join(self._chunk), dict(self._index)
         self._chunk.clear()
         self._index.clear()
         self._size = 0
         compressed = _compressed(records, self._compression)
         name = COMPRESSION_NAMES[self._compression].encode()
-        start = int(min(index[::2].min() for index in entries.values()))
-        end = int(max(index[::2].max() for index in entries.values()))
+        times = np.frombuffer(b"".join(entries.values()), "<u8")[::2]
+        start, end = int(times.min()), int(times.max())
         tail = struct.pack(f"<I{len(name)}sQ", len(name), name, len(compressed))
         length = CHUNK.size - 9 + len(tail) + len(compressed)
         head = CHUNK.pack(Opcode.CHUNK, length, start, end, len(records), zlib.crc32(records)) + tail
@@ -206,10 +206,10 @@ class McapWriter:
         after = place + len(head) + len(compressed)
         indexes, offsets = bytearray(), {}
         for channel, index in entries.items():
-            self._counts[channel] = self._counts.get(channel, 0) + len(index) // 2
+            self._counts[channel] = self._counts.get(channel, 0) + len(index) // ENTRY.size
             offsets[channel] = after + len(indexes)
-            indexes += MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, index.nbytes + 6, channel, index.nbytes)
-            indexes += index.tobytes()
+            indexes += MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, len(index) + 6, channel, len(index))
+            indexes += index
         for part in (head, compressed, indexes):
             self._stream.write(part)
         chunk_index = ChunkIndex(
