@@ -80,6 +80,9 @@ def profile_for_hosts(
 
     find("maxInitialPeersRange").text = str(participants)
     find("transport_descriptor").remove(find("interfaceWhiteList"))  # messages go to other hosts
+    for each in find("profiles").findall("./*"):
+        if each.get("profile_name", "").startswith("/"):  # batches stay small: a link that loses parts loses the whole
+            find("profiles").remove(each)
     discovery = ET.Element(_tag("discovery_config"))
     find("builtin").insert(0, discovery)
     for key, seconds in (("leaseDuration", lease), ("leaseAnnouncement", ANNOUNCEMENT)):
