@@ -172,7 +172,7 @@ def test_hosts_of_unlike_processors(lan: Lan) -> None:
 
 def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: random.Random) -> None:
     """Its cable is pulled, or its interface goes down: everybody waits, then all goes on, and nothing is lost."""
-    prepare(lan, 400)
+    prepare(lan, 200)
     host, cable = rng.choice(NAMES), rng.random() < 0.5
     hosts = lan.start_all()
     lan.network.wait_until_moving("base")
@@ -206,7 +206,7 @@ def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
 @pytest.mark.parametrize("pace", ["lockstep", "realtime"])
 def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> None:
     """A lease of 5 s instead of a minute; it is cut off for 12 s, so that both sides have given each other up."""
-    prepare(lan, 1000 if pace == "lockstep" else 40, run={"pace": pace})
+    prepare(lan, 250 if pace == "lockstep" else 40, run={"pace": pace})
     command = [str(PROGRAM), "host", str(lan.run_file), str(lan.hosts_file), "--profile"]
     profile = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     short, count = re.subn(r"(<leaseDuration>\s*<sec>)60", r"\g<1>5", profile)
