@@ -162,7 +162,7 @@ def test_a_rate_that_is_too_low_is_named(network: Any) -> None:
 
 
 def test_a_killed_agent_comes_back_on_its_host(network: Any, hosts: set[int]) -> None:
-    run = start(network, {"duration": 200}, "--no-analyse", default={"delay_ms": 0.5})
+    run = start(network, {"duration": 80}, "--no-analyse", default={"delay_ms": 0.5})
     wait_until_moving(network, hosts)
     victim = next(process for process in network.processes("agent") if process.agent == 3)
     victim.kill()

@@ -141,7 +141,7 @@ def test_a_reader_is_killed(network: Any) -> None:
 
 def test_a_stranger_is_refused(network: Any) -> None:
     with free_domain() as domain, cyclone(domain, "--forge") as reader:
-        result = network.run(network.experiment(run={"duration": 100}), domain=domain, readers=["cyclone_reader"])
+        result = network.run(network.experiment(run={"duration": 50}), domain=domain, readers=["cyclone_reader"])
         came(reader)
     assert result.failures == []
     equal_to_the_twin(result.trajectory)

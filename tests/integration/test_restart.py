@@ -109,7 +109,7 @@ def test_budget(network: Any) -> None:
 def test_who_comes_back_repeats_only_what_peers_may_lack(network: Any) -> None:
     """Not the thousands of states that it keeps, neither by itself nor for latched requests of earlier restarts."""
     with free_domain() as domain:
-        file = network.file(run={"duration": 400, "processes": 5})
+        file = network.file(run={"duration": 200, "processes": 5})
         run = network.record(file, "--domain", str(domain), "--restarts", "2", "--json")
         command = [sys.executable, "-P", "-c", LISTENER, "/agent_3/state"]
         listener = subprocess.Popen(command, env=node_environment(domain), stdout=subprocess.PIPE, text=True)
