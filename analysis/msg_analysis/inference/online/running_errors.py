@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,8 +32,6 @@ from msg_analysis.common.large_arrays import BLOCK_NUMBERS
 from msg_analysis.inference.errors.estimates import Estimate, beside
 from msg_analysis.inference.errors.time_means import Value, forms_of, packed_moments, values_of
 from msg_analysis.inference.observed.observation import bounded
-from msg_analysis.inference.online.heard_evidence import HeardEvidence
-from msg_analysis.inference.online.logged_states import LoggedStates, StateLog
 from msg_analysis.inference.online.recent_steps import Lateness, Recent, RecentSteps
 from msg_analysis.inference.online.running_evidence import AnyTime, RunningEvidence, needs_log, supports
 from msg_analysis.inference.online.running_interval import RunningInterval
@@ -42,6 +41,10 @@ from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.types import FloatArray, IntArray
 from msg_analysis.wire.refusals import Refusal
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.online.heard_evidence import HeardEvidence
+    from msg_analysis.inference.online.logged_states import LoggedStates, StateLog
 
 EVERY_STEP = 20  # agents up to which every step is used for the standard errors of the nodes; beyond, one in m / 20
 MOST_BYTES = 256 * 2**20  # memory for the standard errors of the nodes; where that is too little, they are left out
@@ -87,13 +90,16 @@ class LiveEstimate:
         self._errors = RunningErrors(record, prediction, nodes=nodes)
         self._plain: RunningEvidence | None = None
         self._heard: HeardEvidence | None = None
+        self.log: StateLog | None = None  # None: the messages are not needed
         if evidence and prediction is not None and supports(prediction):
             if needs_log(experiment):
-                self._heard = HeardEvidence(prediction, experiment.run.replicas)
+                from msg_analysis.inference.online.heard_evidence import HeardEvidence  # most runs need none of these
+                from msg_analysis.inference.online.logged_states import StateLog
+
+                self._heard, self.log = HeardEvidence(prediction, experiment.run.replicas), StateLog(record)
             else:
                 self._plain = RunningEvidence(prediction, experiment.run.replicas)
         self.evidence = self._heard or self._plain
-        self.log = StateLog(record) if self._heard else None  # None: the messages are not needed
         self.steps = StepCollector(
             experiment.agents,
             len(experiment.graph_list),
