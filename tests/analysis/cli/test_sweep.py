@@ -118,7 +118,7 @@ def test_tables_hold_what_theory_says_and_nothing_is_done_again(tmp_path: Path, 
 def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path, here: Call) -> None:
     """Runs of a fixed seed: the same numbers to the last digit, and nothing computed twice."""
     over = {"switching.scale": {"from": 0.1, "to": 10, "count": 9, "spacing": "log"}}
-    experiment = EXPERIMENT | {"run": {"dt": 0.05, "duration": 100}}
+    experiment = EXPERIMENT | {"run": {"dt": 0.05, "duration": 400}}
     path, out = file(tmp_path, experiment=experiment, kind="simulate", over=over), tmp_path / "out"
     journal = out / "points.jsonl"
     process = start(path, "--out", out)
