@@ -136,7 +136,7 @@ def test_so_many_batches_wait_for_a_reader_that_takes_none(monkeypatch: pytest.M
     from msg_agents.nodes.agents.state_batches import BATCH_SIZE
 
     kept = int(writer.stdout)
-    assert kept == 2 * 1250
+    assert kept == 2 * 680
     assert kept * BATCH_SIZE <= 2 * 41_000_000
 
 

@@ -57,7 +57,7 @@ MESSAGE_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the 
 CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the records
 FOOTER = struct.Struct("<BQQQ")  # what of it the checksum of the summary covers
 INDEXES_IN_MEMORY = 2**24  # bytes of the indexes of chunks; what is beyond is kept in a temporary file
-ZSTD_LEVEL = 1  # of noisy states zstd's own level, 3, makes nothing smaller, and takes twice the time
+ZSTD_LEVEL = -1  # noisy states: 3 % larger than with zstd's own level, 3, in a third of the time
 COMPRESSION_NAMES: dict[Compression, str] = {"none": "", "zstd": "zstd", "lz4": "lz4"}
 
 

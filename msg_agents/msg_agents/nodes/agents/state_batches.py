@@ -30,9 +30,9 @@ from msg_agents.processes.process_plan import RECORDER
 from msg_analysis.wire.state_batches import encode_batch
 from msg_analysis.wire.topics import Topic
 
-BATCH_SIZE, SMALL_BATCH_SIZE = 2**15, 2**13
-"""Bytes after which a batch is sent. Before the agents wait for a recorder that has stopped, the middleware keeps 1,250
-batches for it by our profiles for one machine, and 5,000 by others: 40 MB in either case."""
+BATCH_SIZE, SMALL_BATCH_SIZE = 60_000, 2**13
+"""Bytes after which a batch is sent. Before the agents wait for a recorder that has stopped, the middleware keeps 680
+batches for it by our profiles for one machine, and 5,000 by others: 40 MB in either case. One fits into a datagram."""
 
 BATCH_TIME = 0.1  # s of wall time after which a batch is sent with the next state, however small it is
 SEND_PERIOD = 0.5  # s of wall time after which it is sent in any case
