@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "cyclone_dds"))
 from cyclone_messages import ActiveGraph, AgentState, Header, Node, Progress, Time, state_topic
 from cyclonedds.qos import Policy
 
-QUIET = 1.0  # s after the end of the run without a message
+QUIET, LONGEST_QUIET = 1.0, 10.0  # s after the end of the run without a message: with all last states, and without
 
 
 def entry(topic: str, message: Any) -> Any:
@@ -43,6 +43,12 @@ def forge(node: Node, run: list[int], agents: int) -> None:
     node.writers["graph"].write(ActiveGraph(header, another, 0, 2, "ring", 0, 10**6, [1], [2], [9.0]))
     node.writers["end"].write(Progress(header, run, 0, 10**6))
     node.writers["progress"].write(Progress(header, run, 1, 10**6))
+
+
+def missing(came: dict[str, list[Any]], states: list[str]) -> bool:
+    """Whether the last state of an agent has not come; on a busy machine it may come a while after the end."""
+    last = came["end"][-1][1] if came["end"] else 0
+    return any(not came[topic] or max(each[0] for each in came[topic][-20:]) < last for topic in states)
 
 
 def main() -> None:
@@ -69,7 +75,7 @@ def main() -> None:
     node.announce()
     came: dict[str, list[Any]] = {topic: [] for topic in readers}
     last = time.monotonic()
-    while not came["end"] or time.monotonic() < last + QUIET:
+    while not came["end"] or time.monotonic() < last + (LONGEST_QUIET if missing(came, states) else QUIET):
         held = options.until and not options.until.exists()
         for topic, reader in readers.items():
             if held and topic in states and len(came[topic]) >= 20:
