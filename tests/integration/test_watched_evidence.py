@@ -90,6 +90,7 @@ def test_a_wrong_network_is_ended(network: Any, law: str) -> None:
     assert result["any_time"]["questions"][0]["about"] == "noise of agent 3"
     cause = result["blame"][0]  # over the whole run, or in a stretch that is clearer
     assert (cause["kind"], cause["agent"]) == ("noise", 3), cause
+    assert 1.0 < cause["estimate"] < 2.0, cause
     trajectory = read_bag(result["bag"])
     assert trajectory.completeness.complete
     assert trajectory.record.experiment.steps == result["until"]["step"] == result["steps"]

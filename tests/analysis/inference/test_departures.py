@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
@@ -23,6 +24,7 @@ from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
 from msg_analysis.inference.statistics.mixture_evidence import variance_evidence
 from msg_analysis.inference.statistics.windows import WindowEvidence, Windows
+from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
@@ -299,6 +301,19 @@ def test_the_largest_innovation() -> None:
     large = white[np.abs(white) > 4.0] ** 2
     mean = np.exp(variance_evidence(np.ones(len(large)), large)[:, 0]).sum() / 4000
     assert np.exp(sums.evidence()[0, 0]) == pytest.approx(0.5 * (1.0 + mean))
+
+
+def test_a_network_that_never_moves() -> None:
+    """All innovations are 0: lags say nothing, and the verdict says what is wrong."""
+    law = ValidExperiment.parse(LINE_RING | {"run": {"dt": 0.05, "duration": 20.0, "replicas": 2, "start": "zero"}})
+    run = simulate(law)
+    still = dataclasses.replace(run, states=np.zeros_like(run.states))
+    finding = summed(Observation.of(still, predict(law)), LongLags).finding()
+    assert finding is not None
+    assert (finding.log_p, finding.estimate) == (0.0, 0.0)
+    result = compare(still)
+    assert result.verdict == "disagrees"
+    assert result.blame[0].words == "agent 1 does not move in any of its steps, although it has noise"
 
 
 def test_long_lags() -> None:

@@ -89,10 +89,11 @@ class LagSums:
     def clearest(self) -> Lag | None:
         """Of all lags and columns (Bonferroni); None where there are too few numbers."""
         lags = np.flatnonzero(self.products >= MIN_SAMPLES)
-        score, information = self.score[lags], self.information[lags]
+        # Of numbers that all are 0 there is no information, and nothing to see.
+        score, information = self.score[lags], np.maximum(self.information[lags], np.finfo(float).tiny)
         if not score.size:
             return None
-        z = score / np.sqrt(np.maximum(information, np.finfo(float).tiny))
+        z = score / np.sqrt(information)
         row, column = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
         log_p = math.log(2.0 * z.size) + float(log_normal_tail(abs(z[row, column])))
         coefficient = float(score[row, column] / information[row, column])
