@@ -71,8 +71,10 @@ def test_windows_are_those_of_a_loop(steps: int, size: int) -> None:
     windows = Windows(steps, 2)
     found = {}
     for begin in range(0, steps, size):
-        for level, first, sums in windows.add(numbers[begin : begin + size]):
-            found |= {(level, int(f)): s for f, s in zip(first, sums, strict=True)}
+        ended = windows.add(numbers[begin : begin + size])
+        keys = zip(ended.level.tolist(), ended.first.tolist(), strict=True)
+        found |= dict(zip(keys, ended.sums, strict=True))
+        assert [ended.level[row] for row in ended.begins] == ended.levels.tolist() == np.unique(ended.level).tolist()
         there = [(level, first) for level, first in windows_of(steps) if first + 2**level <= windows.steps]
         assert sorted(found) == sorted(there)
         begun = [level for level, first in windows_of(steps) if first < windows.steps]
@@ -90,8 +92,8 @@ def test_the_evidence_of_windows_is_their_mean(seen: int) -> None:
     logs = np.random.default_rng(3).standard_normal(50)
     windows = Windows(50, 1)
     evidence = WindowEvidence(windows, 1)
-    for level, first, _ in windows.add(np.zeros((seen, 1))):
-        evidence.add(level, logs[first][:, None] / (level + 1))
+    ended = windows.add(np.zeros((seen, 1)))
+    evidence.add(ended.level, (logs[ended.first] / (ended.level + 1))[:, None])
     levels = [
         [
             np.exp(logs[first] / (level + 1)) if first + 2**level <= seen else float(first >= seen)

@@ -13,7 +13,7 @@ from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, kind_weights
 from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence, any_time_evidence
 from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.evidence import LOOKS, Evidence
+from msg_analysis.inference.verdict.evidence import Evidence, usual_looks
 from msg_analysis.inference.verdict.pool import compare_pooled
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
@@ -216,7 +216,7 @@ def test_questions_of_single_parts_keep_their_share() -> None:
 def test_one_pass_for_the_tests_and_the_evidence(changes: dict[str, Any]) -> None:
     """In the pass of the innovations the evidence is the same as in a pass of its own."""
     observation = observed(experiment(duration=40.0, **changes))
-    looks = spaced_steps(observation.steps, LOOKS)
+    looks = spaced_steps(observation.steps, usual_looks(observation.steps))
     shared, own = Evidence.of(observation, 0.01).watched, WatchedEvidence.of(observation, looks)
     assert shared.steps is not None
     assert own.steps is not None

@@ -25,8 +25,8 @@ import numpy as np
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Place, Question
 from msg_analysis.inference.departures.long_lags import LagSums
 from msg_analysis.inference.statistics.distributions import log_chi2_below, log_chi2_tail, normal_score
-from msg_analysis.inference.statistics.mixture_evidence import log_mean, variance_evidence
-from msg_analysis.inference.statistics.windows import WindowEvidence, Windows
+from msg_analysis.inference.statistics.mixture_evidence import log_mean, variance_constant, variance_evidence
+from msg_analysis.inference.statistics.windows import EndedWindows, WindowEvidence, Windows
 from msg_analysis.types import FloatArray, IntArray
 
 SHARE = 0.1  # of the logarithm of the p-value
@@ -57,6 +57,8 @@ class NoiseOverTime(Departure):
         self._evidence = WindowEvidence(self._windows, columns)
         self._lags = LagSums(columns, 1)
         levels = self._windows.levels
+        self._sizes = self._numbers << np.arange(levels)[:, None]  # (levels, columns) numbers in a window
+        self._known = variance_constant(self._sizes)  # (levels, columns, K)
         self._counts = np.zeros(levels, np.int64)  # windows of runs that were merged
         self._runs = 1
         # Largest and smallest sum of each length and column, the first step, and the run.
@@ -72,14 +74,25 @@ class NoiseOverTime(Departure):
         if self._together:
             squares = np.column_stack([squares, squares.sum(axis=1)])
         self._lags.add(normal_score(squares, self._numbers)[:, :, None])
-        every = np.arange(self._columns)
-        for level, first, sums in self._windows.add(squares):
-            if not len(sums):
-                continue
-            for side, at in enumerate((sums.argmax(axis=0), sums.argmin(axis=0))):
-                self._take(side, level, sums[at, every], first[at], np.ones(self._columns, np.int64))
-            mixed = log_mean(variance_evidence(self._numbers << level, sums), axis=-1)
-            self._evidence.add(level, mixed)
+        ended = self._windows.add(squares)
+        self._keep(ended)
+        numbers, constant = (np.repeat(each[ended.levels], ended.counts, axis=0) for each in (self._sizes, self._known))
+        mixed = log_mean(variance_evidence(numbers, ended.sums, constant), axis=-1)
+        self._evidence.add(ended.level, mixed)
+
+    def _keep(self, ended: EndedWindows) -> None:
+        """Keep the most extreme windows, of this run."""
+        ends = ended.begins + ended.counts
+        for side, extreme in enumerate((np.maximum, np.minimum)):
+            found = extreme.reduceat(ended.sums, ended.begins, axis=0)  # (L, columns)
+            old = self._extreme[side, ended.levels]
+            more = (found > old if side == 0 else found < old) | np.isnan(found)
+            for row, column in np.argwhere(more).tolist():
+                sums = ended.sums[ended.begins[row] : ends[row], column]
+                at = int(sums.argmax() if side == 0 else sums.argmin())
+                place = side, int(ended.levels[row]), column
+                self._extreme[place], self._first[place] = sums[at], ended.first[ended.begins[row] + at]
+                self._run[place] = 1
 
     def _take(self, side: int, level: int, sums: FloatArray, first: IntArray, run: IntArray) -> None:
         """Keep what is more extreme."""

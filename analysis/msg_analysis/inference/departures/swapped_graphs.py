@@ -59,15 +59,15 @@ class SwappedGraphs(Departure):
         first, second = self._pairs.T
         swapped = np.where(modes[:, None] == first, density[:, second], logged[:, None])
         swapped = np.where(modes[:, None] == second, density[:, first], swapped)
-        for level, begin, sums in self._windows.add(swapped - logged[:, None]):
-            if not len(sums):
-                continue
-            self._evidence.add(level, sums)
-            at, pair = np.unravel_index(int(np.argmax(sums)), sums.shape)
-            value = float(sums[at, pair] - np.log(float(self._windows.planned[level])))
-            if value > self._best:
-                start = int(begin[at]) + 1
-                self._best, self._pair, self._place = value, int(pair), Place(start, start + (1 << level) - 1)
+        ended = self._windows.add(swapped - logged[:, None])
+        level = ended.level
+        self._evidence.add(level, ended.sums)
+        values = ended.sums - np.log(self._windows.planned[level])[:, None]
+        at, pair = np.unravel_index(int(np.argmax(values)), values.shape)
+        if values[at, pair] > self._best:
+            start = int(ended.first[at]) + 1
+            self._best, self._pair = float(values[at, pair]), int(pair)
+            self._place = Place(start, start + (1 << int(level[at])) - 1)
 
     def merge(self, other: Self) -> None:
         """No window goes over from one run to another."""

@@ -30,7 +30,7 @@ from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
 from msg_analysis.inference.statistics.mixture_evidence import (
     coefficient_evidence,
-    log_mean,
+    log_means,
     log_sum,
     proportion_evidence,
     row_evidence,
@@ -320,7 +320,7 @@ class EvidenceSums:
         families = self.families()
         if not families:
             return 0.0
-        each = np.array([float(log_mean(logs.ravel())) for logs in families.values()])
+        each = log_means(list(families.values()))
         return float(log_sum(each + np.log(kind_weights(list(families))), axis=0))
 
 

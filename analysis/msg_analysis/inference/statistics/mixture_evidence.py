@@ -20,6 +20,8 @@ Each is a martingale of mean 1 while the null hypothesis holds, so it ever passe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.special import betaln, gammaln
 
@@ -28,12 +30,17 @@ from msg_analysis.types import FloatArray, IntArray
 VARIANCES = ((2.0, 1.0), (1000.0, 1.0), (300.0, 1.1), (300.0, 0.9))
 """Alternatives to a variance: strengths a, and factors c that they are near; the larger a, the nearer."""
 
+_STRENGTHS = np.array([strength for strength, _ in VARIANCES])  # a
+_NEAR = np.array([strength * factor for strength, factor in VARIANCES])  # b = a c
+
 SHARES = (0.05, 0.3)  # standard deviations tau of the alternatives to a coefficient, 1 in the law
 ROW_STRENGTHS = (3.0, 30.0)  # changes of a row that the alternatives are worth
 PROPORTION_STRENGTHS = (2.0, 20.0, 200.0)  # successes that the alternatives are worth
 
 
-def variance_evidence(samples: FloatArray | IntArray, squares: FloatArray) -> FloatArray:
+def variance_evidence(
+    samples: FloatArray | IntArray, squares: FloatArray, constant: FloatArray | None = None
+) -> FloatArray:
     """Against variance 1 of independent normal samples: factors theta of the variance ~ inverse gamma(a, b), b = a c.
 
     log of b^a G(a + n/2) exp(S/2) / (G(a) (b + S/2)^(a + n/2)), the mixture of the likelihood ratios of theta.
@@ -44,17 +51,24 @@ def variance_evidence(samples: FloatArray | IntArray, squares: FloatArray) -> Fl
         (..., ) numbers n
     squares
         (..., ) sums of squares S
+    constant
+        (..., K) ``variance_constant(samples)``, where it is known: it takes most of the time
 
     Returns
     -------
     FloatArray
         (..., K) of each of ``VARIANCES``
     """
-    a, factors = np.array(VARIANCES).T
-    b = a * factors
-    half, s = np.asarray(samples, dtype=float)[..., None] / 2.0, np.asarray(squares)[..., None] / 2.0
+    half, s = np.asarray(samples)[..., None] / 2.0, np.asarray(squares)[..., None] / 2.0
+    known = variance_constant(samples) if constant is None else constant
     # (a + n/2) log(b / (b + s)) instead of two large terms that cancel.
-    return np.asarray(gammaln(a + half) - gammaln(a) - half * np.log(b) - (a + half) * np.log1p(s / b) + s)
+    return np.asarray(known - (_STRENGTHS + half) * np.log1p(s / _NEAR) + s)
+
+
+def variance_constant(samples: FloatArray | IntArray) -> FloatArray:
+    """(..., K): log of G(a + n/2) / (G(a) b^(n/2)), what ``variance_evidence`` has of the numbers n (..., ) alone."""
+    half = np.asarray(samples)[..., None] / 2.0
+    return np.asarray(gammaln(_STRENGTHS + half) - gammaln(_STRENGTHS) - half * np.log(_NEAR))
 
 
 def coefficient_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
@@ -137,6 +151,17 @@ def proportion_evidence(successes: IntArray, trials: IntArray, probability: Floa
 def log_mean(logarithms: FloatArray, axis: int = 0) -> FloatArray:
     """Log of the mean of evidence along an axis: evidence again, without a correction for the number of questions."""
     return np.asarray(log_sum(logarithms, axis) - np.log(logarithms.shape[axis]))
+
+
+def log_means(parts: Sequence[FloatArray]) -> FloatArray:
+    """(P,): log of the mean of the evidence of each part, arrays of any shape but not empty; all of them in one go."""
+    sizes = np.array([part.size for part in parts])
+    begins, joined = np.cumsum(sizes) - sizes, np.concatenate([part.ravel() for part in parts])
+    largest = np.maximum.reduceat(joined, begins)
+    finite = np.where(np.isfinite(largest), largest, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore", under="ignore", over="ignore"):
+        total = np.log(np.add.reduceat(np.exp(joined - np.repeat(finite, sizes)), begins) / sizes)
+    return np.asarray(finite + total)
 
 
 def log_sum(logarithms: FloatArray, axis: int) -> FloatArray:

@@ -16,12 +16,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from msg_analysis.inference.statistics.mixture_evidence import log_sum
 from msg_analysis.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EndedWindows:
+    """Windows that ended in some steps, ordered by their length."""
+
+    levels: IntArray  # (L,) lengths 2^level that there are, ascending
+    begins: IntArray  # (L,) row of the first window of each length
+    counts: IntArray  # (L,) windows of each length
+    first: IntArray  # (w,) first steps, from 0
+    sums: FloatArray  # (w, K)
+
+    @property
+    def level(self) -> IntArray:
+        """(w,) of each window."""
+        return np.repeat(self.levels, self.counts)
 
 
 class Windows:
@@ -39,22 +55,26 @@ class Windows:
         self._last = [np.empty((0, columns)) for _ in range(self.levels)]
         self._cells = [0] * self.levels  # of 2^l steps, that were seen
 
-    def add(self, numbers: FloatArray) -> Iterator[tuple[int, IntArray, FloatArray]]:
-        """Level l, first steps (w,) from 0, and sums (w, K) of windows that end in steps with ``numbers`` (b, K)."""
-        yield 0, self.steps + np.arange(len(numbers)), numbers
+    def add(self, numbers: FloatArray) -> EndedWindows:
+        """The windows that end in steps with ``numbers`` (b, K)."""
+        first, sums = [self.steps + np.arange(len(numbers))], [numbers]
         self.steps += len(numbers)
         cells = numbers
         for level in range(1, self.levels):
             half = level - 1
             joined = np.concatenate([self._last[half], cells])
             number = self._cells[half] - len(self._last[half]) + np.arange(max(len(joined) - 1, 0))
-            sums = joined[:-1] + joined[1:]
             self._cells[half] += len(cells)
             self._last[half] = joined[-1:]
-            if not len(sums):
-                return
-            yield level, number << half, sums
-            cells = sums[number % 2 == 0]
+            if not len(number):
+                break
+            first.append(number << half)
+            sums.append(joined[:-1] + joined[1:])
+            cells = sums[level][number % 2 == 0]
+        counts = np.array([len(each) for each in sums])
+        levels = np.flatnonzero(counts)
+        begins = (np.cumsum(counts) - counts)[levels]
+        return EndedWindows(levels, begins, counts[levels], np.concatenate(first), np.concatenate(sums))
 
     def seen(self) -> IntArray:
         """(levels,) windows that have ended."""
@@ -77,11 +97,11 @@ class WindowEvidence:
         self._windows = windows
         self._ended, self._others = np.full(columns, -np.inf), np.zeros(columns)
 
-    def add(self, level: int, logarithms: FloatArray) -> None:
-        """Evidence (w, K) of windows that ended."""
+    def add(self, levels: IntArray, logarithms: FloatArray) -> None:
+        """Evidence (w, K) of windows that ended, of 2^levels (w,) steps."""
         if len(logarithms):
-            share = np.log(float(self._windows.planned[level] * self._windows.levels))
-            self._ended = np.logaddexp(self._ended, log_sum(logarithms, 0) - share)
+            shares = np.log(self._windows.planned[levels] * float(self._windows.levels))
+            self._ended = np.logaddexp(self._ended, log_sum(logarithms - shares[:, None], 0))
 
     def merge(self, other: WindowEvidence) -> None:
         """With that of other runs."""

@@ -38,7 +38,7 @@ from msg_analysis.inference.statistics.batch_means import batch_interval
 from msg_analysis.inference.statistics.confidence_sequence import steps_to_half_width
 from msg_analysis.inference.statistics.holm import holm
 from msg_analysis.inference.verdict.comparison import Comparison, Test
-from msg_analysis.inference.verdict.evidence import DECIDED_LOOKS, LOOKS, Evidence
+from msg_analysis.inference.verdict.evidence import Evidence
 from msg_analysis.inference.verdict.trust import trusted
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Trajectory
@@ -79,8 +79,8 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
     if observation.steps < MIN_STEPS and not trajectory.completeness.complete:
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
     until = trajectory.record.until
-    looks = DECIDED_LOOKS if until is not None and until.decided else LOOKS
-    return judge(trajectory, prediction, Evidence.of(observation, level, looks), level)
+    decided = until is not None and until.decided
+    return judge(trajectory, prediction, Evidence.of(observation, level, decided=decided), level)
 
 
 def judge(

@@ -33,8 +33,10 @@ from msg_analysis.inference.realtime.laws import Laws, measure_laws
 from msg_analysis.inference.realtime.logged_pattern import means_in_lockstep
 from msg_analysis.inference.realtime.timing import Timing, measure_timing
 from msg_analysis.inference.sequential.watched_evidence import Watch, WatchedEvidence
+from msg_analysis.types import IntArray
 
-LOOKS = 80  # at most, at the evidence over time
+LOOKS = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
+STEPS_PER_LOOK = 40  # between these
 DECIDED_LOOKS = 400  # where the evidence has decided when the run ended, and so decides the verdict
 
 
@@ -64,13 +66,14 @@ class Evidence:
         return [*laws, *([self.means] if self.means.long_enough else [])] if self.decisive else []
 
     @classmethod
-    def of(cls, observation: Observation, level: float, looks: int = LOOKS) -> Evidence:
-        """Evidence of one run; laws of a run in real time are tested at ``level``."""
+    def of(cls, observation: Observation, level: float, *, decided: bool = False) -> Evidence:
+        """Of one run, which ended when its evidence ``decided``; in real time, laws are tested at ``level``."""
+        looks = spaced_steps(observation.steps, DECIDED_LOOKS if decided else usual_looks(observation.steps))
         with blas_threads(observation.step.agents):
             return cls._of(observation, level, looks)
 
     @classmethod
-    def _of(cls, observation: Observation, level: float, looks: int) -> Evidence:
+    def _of(cls, observation: Observation, level: float, looks: IntArray) -> Evidence:
         laws, timing, position, given = None, None, None, None
         if observation.timers:
             timing, order = measure_timing(observation), order_events(observation)
@@ -80,7 +83,7 @@ class Evidence:
             means = time_means(observation)
             kept = observation.prediction.system.readout is not None
             given = means_in_lockstep(observation) if kept else means_given_path(observation)
-        watch = Watch(observation, spaced_steps(observation.steps, looks))
+        watch = Watch(observation, looks)
         innovations = InnovationSums(observation, position, watch)
         return cls(
             steps=observation.steps,
@@ -121,6 +124,12 @@ class Evidence:
             timing=None,
             laws=None,
         )
+
+
+def usual_looks(steps: int) -> int:
+    """At the evidence over time of a run with so many steps, at most."""
+    few, most = LOOKS
+    return min(max(steps // STEPS_PER_LOOK, few), most)
 
 
 def _merged_means(one: TimeMeans, steps: int, other: TimeMeans, more: int) -> TimeMeans:
