@@ -25,7 +25,7 @@ from scipy.special import xlogy
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Question
 from msg_analysis.inference.statistics.distributions import log_chi2_tail
-from msg_analysis.inference.statistics.mixture_evidence import proportion_evidence
+from msg_analysis.inference.statistics.mixture_evidence import proportion_constant, proportion_evidence
 from msg_analysis.model.network.markov_chain import stationary_law
 from msg_analysis.types import FloatArray, IntArray
 
@@ -51,6 +51,7 @@ class Sojourns(Departure):
         n = law.step.modes
         self._edges = [_edges(float(p)) for p in self._leaving]  # ages at which the parts 1, 2, ... begin
         self.steps, self.left = np.zeros((n, PARTS), np.int64), np.zeros((n, PARTS), np.int64)
+        self._known = proportion_constant(self._leaving[self._tested, None])  # (G, 1, K)
         self._age = 0  # of the sojourn at the step that comes next
 
     def add(self, block: Block) -> None:
@@ -112,21 +113,24 @@ class Sojourns(Departure):
         rows = self._tested
         if not len(rows):
             return np.empty((0, 1))
-        each = np.hstack([self._in_parts(rows, joined) for joined in JOINED])
-        return np.vstack([each, each.sum(axis=0)])
+        steps, left = _in_parts(self.steps[rows]), _in_parts(self.left[rows])  # (G, 8 + 4 + 2)
+        each = proportion_evidence(left, steps, self._leaving[rows, None], self._known)
+        ends = np.cumsum([PARTS // joined for joined in JOINED])
+        parts = np.hstack([group.sum(axis=1) for group in np.split(each, ends[:-1], axis=1)])
+        return np.vstack([parts, parts.sum(axis=0)])
 
     def questions(self) -> list[Question]:
         """Sojourns in a graph, and all."""
         return [*(("sojourns in {}", (graph,)) for graph in self._tested.tolist()), ("sojourns", ())]
 
-    def _in_parts(self, rows: IntArray, joined: int) -> FloatArray:
-        """(G, K) evidence with so many parts joined to one."""
-        steps, left = (each[rows].reshape(len(rows), -1, joined).sum(axis=2) for each in (self.steps, self.left))
-        return np.asarray(proportion_evidence(left, steps, self._leaving[rows, None]).sum(axis=1))
-
     @property
     def _tested(self) -> IntArray:
         return np.flatnonzero((self._leaving > 0.0) & (self._leaving < 1.0))
+
+
+def _in_parts(counts: IntArray) -> IntArray:
+    """(G, 8 + 4 + 2): counts (G, 8) of the parts, and of each ``JOINED`` number of them."""
+    return np.hstack([counts.reshape(len(counts), -1, joined).sum(axis=2) for joined in JOINED])
 
 
 def _edges(leaving: float) -> IntArray:

@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS
 from msg_analysis.inference.errors.given_path import steps_of_path
 from msg_analysis.inference.errors.time_means import without_rounding
 from msg_analysis.inference.observed.observation import Observation
@@ -236,29 +237,35 @@ def _covariance(
     coordinates: tuple[FloatArray, FloatArray],
     lags: IntArray,
 ) -> FloatArray:
-    """(L, L): sum of Cov(D_j | past), backwards over the steps; forms (L, N + 1, d, d) H, y, C^T C y (N + 1, R, d)."""
+    """(L, L): sum of Cov(D_j | past); ``forms`` (L, N + 1, d, d) H, which are overwritten; y, C^T C y (N + 1, R, d)."""
     y, seen = coordinates
     steps, replicas, number = len(which), y.shape[1], len(lags)
     along = matrices[which]
-    left = np.zeros((number, steps + 1, *y.shape[1:]))  # (W_k+l-1 ... W_k+1)^T C^T C y(k), what leaves a_j with k
+    left = np.zeros((number, steps, *y.shape[1:]))  # (W_k+l-1 ... W_k+1)^T C^T C y(k), what leaves a_j with k
+    felt = np.zeros_like(left)  # a_j + 1: at first what enters it
     for place, lag in enumerate(lags.tolist()):
         if lag:
-            window = _windows(along[1:], lag - 1)  # from k + 1 on
+            window = _windows(along[1:], lag - 1)[:steps]  # from k + 1 on
             left[place, : len(window)] = seen[: len(window)] @ window
-    total = np.zeros((number, number))
-    dual = forms[:, -1].copy()  # Y(j + 1)
-    felt = np.zeros((number, *y.shape[1:]))  # a_j + 1, without what leaves it
+            felt[place, lag - 1 :] = seen[: steps - lag + 1]
     transposed = [matrix.T for matrix in matrices]
-    for j, kind in zip(range(steps - 1, -1, -1), which[::-1].tolist(), strict=True):
-        felt = felt @ matrices[which[j + 1]] if j + 1 < steps else felt
-        for place, lag in enumerate(lags.tolist()):
-            if lag and j - lag + 1 >= 0:
-                felt[place] += seen[j - lag + 1]
-        added = dual @ noise[kind]
-        total += 2.0 / replicas * (added.reshape(number, -1) @ added.transpose(0, 2, 1).reshape(number, -1).T)
-        slope = (2.0 * (y[j] @ transposed[kind]) @ dual + felt).reshape(number * replicas, -1)
-        weighted = (slope @ noise[kind]).reshape(number, -1)
-        total += weighted @ slope.reshape(number, -1).T / replicas**2
-        felt = felt - left[:, j]
-        dual = forms[:, j] + transposed[kind] @ dual @ matrices[kind]
+    kinds = which.tolist()
+    for j in range(steps - 2, -1, -1):
+        following = kinds[j + 1]
+        felt[:, j] += (felt[:, j + 1] - left[:, j + 1]) @ matrices[following]
+        forms[:, j + 1] += transposed[following] @ forms[:, j + 2] @ matrices[following]  # now Y(j + 1)
+    total = np.zeros((number, number))
+    length = max(1, BLOCK_NUMBERS // forms[:, 0].size)
+    for first in range(0, steps, length):
+        part = slice(first, min(first + length, steps))
+        duals, added = forms[:, part.start + 1 : part.stop + 1], noise[which[part]]
+        spread = duals @ added
+        total += 2.0 / replicas * (_rows(spread) @ _rows(spread.transpose(0, 1, 3, 2)).T)
+        slope = 2.0 * (y[part] @ along[part].transpose(0, 2, 1)) @ duals + felt[:, part]
+        total += _rows(slope @ added) @ _rows(slope).T / replicas**2
     return (total + total.T) / 2.0
+
+
+def _rows(array: FloatArray) -> FloatArray:
+    """All numbers of each lag in a row."""
+    return array.reshape(len(array), -1)

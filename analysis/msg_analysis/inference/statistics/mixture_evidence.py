@@ -126,7 +126,9 @@ def row_evidence(counts: FloatArray | IntArray, law: FloatArray) -> FloatArray:
     return found
 
 
-def proportion_evidence(successes: IntArray, trials: IntArray, probability: FloatArray | float) -> FloatArray:
+def proportion_evidence(
+    successes: IntArray, trials: IntArray, probability: FloatArray | float, constant: FloatArray | None = None
+) -> FloatArray:
     """Against a known probability of independent successes: probabilities ~ beta of that mean.
 
     Parameters
@@ -135,6 +137,8 @@ def proportion_evidence(successes: IntArray, trials: IntArray, probability: Floa
         (..., ) counts
     probability
         (..., ) between 0 and 1, both excluded
+    constant
+        (..., K) ``proportion_constant(probability)``, where it is known
 
     Returns
     -------
@@ -143,9 +147,20 @@ def proportion_evidence(successes: IntArray, trials: IntArray, probability: Floa
     """
     p = np.asarray(probability, dtype=float)[..., None]
     hit, miss = np.asarray(successes)[..., None], (np.asarray(trials) - np.asarray(successes))[..., None]
+    a, b = _beta_law(p)
+    known = proportion_constant(probability) if constant is None else constant
+    return np.asarray(betaln(a + hit, b + miss) - known - hit * np.log(p) - miss * np.log1p(-p))
+
+
+def proportion_constant(probability: FloatArray | float) -> FloatArray:
+    """(..., K): log B(a, b), what ``proportion_evidence`` has of the probabilities (..., ) alone."""
+    return np.asarray(betaln(*_beta_law(np.asarray(probability, dtype=float)[..., None])))
+
+
+def _beta_law(p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Its numbers a (K,) and b (..., K), for probabilities (..., 1)."""
     strength = np.array(PROPORTION_STRENGTHS)
-    a, b = strength, strength * (1.0 - p) / p
-    return np.asarray(betaln(a + hit, b + miss) - betaln(a, b) - hit * np.log(p) - miss * np.log1p(-p))
+    return strength, strength * (1.0 - p) / p
 
 
 def log_mean(logarithms: FloatArray, axis: int = 0) -> FloatArray:
