@@ -18,10 +18,13 @@ from msg_analysis.wire.receiving import state_frame
 
 
 def messages_of(bag: Path) -> list[tuple[str, bytes]]:
-    """(topic, message) of a bag in one file, in its order."""
+    """(topic, message) of a bag in one file, in the order of time."""
     (file,) = bag.glob("*.mcap")
     with file.open("rb") as stream:
-        return [(channel.topic, message.data) for _, channel, message in make_reader(stream).iter_messages()]
+        # Ordered here: by the library, it takes three times as long.
+        records = list(make_reader(stream).iter_messages(log_time_order=False))
+    records.sort(key=lambda record: record[2].log_time)
+    return [(channel.topic, message.data) for _, channel, message in records]
 
 
 def watch(live: LiveEstimate, messages: list[tuple[str, bytes]], *, disorder: float = 0.0, every: int = 200) -> None:

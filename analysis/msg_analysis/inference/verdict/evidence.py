@@ -36,7 +36,7 @@ from msg_analysis.inference.sequential.watched_evidence import Watch, WatchedEvi
 from msg_analysis.types import IntArray
 
 LOOKS = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
-STEPS_PER_LOOK = 40  # between these
+STEPS_PER_LOOK = 100  # between these
 DECIDED_LOOKS = 400  # where the evidence has decided when the run ended, and so decides the verdict
 
 
