@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 import signal
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -43,8 +46,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     Workers begin with equal parts of the list, in order: of two of them, one has all the networks of both.
     """
     pairs = max(1, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) // 2)
-    networks = sorted((item for item in items if INTEGRATION in item.path.parents), key=_limit, reverse=True)
-    others = [item for item in items if INTEGRATION not in item.path.parents]
+    networks = sorted((item for item in items if _has_network(item.path)), key=_limit, reverse=True)
+    others = [item for item in items if not _has_network(item.path)]
     items[:] = [
         item
         for pair in range(pairs)
@@ -57,6 +60,11 @@ def pytest_collection_finish() -> None:
     gc.freeze()
     gc.set_threshold(OBJECTS_BETWEEN_COLLECTIONS, *gc.get_threshold()[1:])
     gc.enable()
+
+
+@functools.cache
+def _has_network(path: Path) -> bool:
+    return INTEGRATION in path.parents
 
 
 def _limit(item: pytest.Item) -> float:
@@ -81,3 +89,12 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     if config.getoption("--nothing-skipped") and avoidable:
         reporter.write_line(f"skipped, but can run here: {'; '.join(avoidable)}", red=True)
         session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """One for all pages of a module."""
+    from browser import chromium
+
+    with chromium() as found:
+        yield found

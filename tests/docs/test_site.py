@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import os
+import contextlib
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from browser import CUT_OR_SCROLLED, FAINT, Log, chromium
+from browser import CUT_OR_SCROLLED, FAINT, Log
+from click.testing import CliRunner
+from mkdocs.__main__ import cli
 from pages import EXPERIMENTS, ROOT, blocks
 
 LOADS = {"img": "src", "script": "src", "iframe": "src", "source": "src", "link": "href"}
@@ -41,13 +42,11 @@ class Links(HTMLParser):
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The site, built as ``make docs`` does it."""
     target = tmp_path_factory.mktemp("site")
-    mkdocs = Path(sys.executable).with_name("mkdocs")
-    subprocess.run(
-        [mkdocs, "build", "--strict", "--quiet", "--site-dir", target],
-        cwd=ROOT,
-        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
-        check=True,
-    )
+    with contextlib.chdir(ROOT):
+        built = CliRunner(env={"NO_MKDOCS_2_WARNING": "1"}).invoke(
+            cli, ["build", "--strict", "--quiet", "--site-dir", str(target)]
+        )
+    assert built.exit_code == 0, built.output
     return target
 
 
@@ -105,70 +104,76 @@ def test_graphs_of_the_examples(site: Path) -> None:
     assert all(colours.count(f"{used}:") == 2 for used in set(re.findall(r"--graph-\d", text)))  # light and dark
 
 
-def test_example_report(site: Path) -> None:
+def test_example_report(browser: Any, site: Path) -> None:
     """In its page and in its own tab: by the commands of the page, in its scheme, drawn without a complaint."""
     report = site / "reports/line_ring.html"
     commands = next(blocks(ROOT / "docs/example_report.md", "sh")).splitlines()
     assert f"<code>{' &amp;&amp; '.join(commands)}</code>" in report.read_text(encoding="utf-8")
-    with chromium() as browser:
-        page = browser.new_page(
-            viewport={"width": 1280, "height": 900}, color_scheme="null"
-        )  # not emulated, as that wins in frames
-        log = Log(page)
-        page.goto((site / "example_report.html").as_uri())
-        page.locator("iframe.report").scroll_into_view_if_needed()
-        inside = page.frame_locator("iframe.report")
-        inside.locator("body[data-ready=yes]").wait_for()
-        assert inside.locator(".verdict strong").inner_text() == "✓ The run agrees with the prediction."
-        inside.locator("body").evaluate("() => window.drawAll()")  # also what is below
-        inside.locator("body[data-ready=yes]").wait_for()
-        assert inside.locator(".plot canvas").count() > 5
-        page.locator("label[for=__palette_1]").click()
-        follows = """() => new Promise((done) => {
-            const dark = matchMedia("(prefers-color-scheme: dark)");
-            dark.matches ? done(true) : dark.addEventListener("change", () => done(dark.matches));
-        })"""
-        assert inside.locator("body").evaluate(follows)
-        with page.expect_popup() as opened:
-            page.locator("a.md-button").click()
-        alone = opened.value
-        alone.wait_for_selector("body[data-ready=yes]")
-        assert alone.url == report.as_uri()
+    # The scheme is not emulated, as that wins in frames.
+    page = browser.new_page(viewport={"width": 1280, "height": 900}, color_scheme="null")
+    log = Log(page)
+    page.goto((site / "example_report.html").as_uri())
+    page.locator("iframe.report").scroll_into_view_if_needed()
+    inside = page.frame_locator("iframe.report")
+    inside.locator("body[data-ready=yes]").wait_for()
+    assert inside.locator(".verdict strong").inner_text() == "✓ The run agrees with the prediction."
+    inside.locator("body").evaluate("() => window.drawAll()")  # also what is below
+    inside.locator("body[data-ready=yes]").wait_for()
+    assert inside.locator(".plot canvas").count() > 5
+    page.locator("label[for=__palette_1]").click()
+    follows = """() => new Promise((done) => {
+        const dark = matchMedia("(prefers-color-scheme: dark)");
+        dark.matches ? done(true) : dark.addEventListener("change", () => done(dark.matches));
+    })"""
+    assert inside.locator("body").evaluate(follows)
+    with page.expect_popup() as opened:
+        page.locator("a.md-button").click()
+    alone = opened.value
+    alone.wait_for_selector("body[data-ready=yes]")
+    assert alone.url == report.as_uri()
     assert [url for url in log.requests if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
     assert log.complaints == []
+    page.context.close()
+
+
+@pytest.fixture(scope="module")
+def texts(browser: Any, site: Path) -> dict[str, Any]:
+    """Pages with tables, graphs, code in several languages, equations and the API, opened."""
+    opened = {}
+    for name in ("index", "examples", "commands", "theory", "api", "which_page"):
+        opened[name] = page = browser.new_page(viewport={"width": 390, "height": 844})
+        page.goto((site / f"{name}.html").as_uri())
+        page.add_style_tag(content="* { transition: none !important; }")
+    return opened
 
 
 @pytest.mark.parametrize("scheme", ["default", "slate"])
-def test_texts_can_be_read(site: Path, scheme: str) -> None:
-    """On pages with tables, graphs, code in several languages, equations and the API: no text is faint or cut."""
-    with chromium() as browser:
-        page = browser.new_page(viewport={"width": 390, "height": 844})
-        for name in ("index", "examples", "commands", "theory", "api", "which_page"):
-            page.goto((site / f"{name}.html").as_uri())
-            page.add_style_tag(content="* { transition: none !important; }")
-            page.evaluate(f"document.body.dataset.mdColorScheme = '{scheme}'")
-            for width in (390, 1280):
-                page.set_viewport_size({"width": width, "height": 844})
-                assert page.evaluate(FAINT) == [], (name, width)
-                assert page.evaluate(CUT_OR_SCROLLED) == [], (name, width)
+def test_texts_can_be_read(texts: dict[str, Any], scheme: str) -> None:
+    """No text is faint or cut."""
+    for name, page in texts.items():
+        page.evaluate(f"document.body.dataset.mdColorScheme = '{scheme}'")
+        for width in (390, 1280):
+            page.set_viewport_size({"width": width, "height": 844})
+            assert page.evaluate(FAINT) == [], (name, width)
+            assert page.evaluate(CUT_OR_SCROLLED) == [], (name, width)
 
 
-def test_in_a_browser(site: Path, pages: dict[Path, Links]) -> None:
+def test_in_a_browser(browser: Any, site: Path, pages: dict[Path, Links]) -> None:
     """Opened from the disk: no request to anywhere, no error, nothing wider than a phone, and the search finds."""
     wide = []
-    with chromium() as browser:
-        page = browser.new_page(viewport={"width": 390, "height": 844})
-        log = Log(page)
-        for file in pages:
-            page.goto(file.as_uri())
-            if page.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth"):
-                wide.append(file.name)
-        page.set_viewport_size({"width": 1280, "height": 900})
-        page.goto((site / "index.html").as_uri())
-        page.locator(".md-search__input").fill("supermodularity")
-        first = page.locator(".md-search-result__link").first
-        first.wait_for(timeout=30_000)
-        assert "leaders.html" in str(first.get_attribute("href"))
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    log = Log(page)
+    for file in pages:
+        page.goto(file.as_uri())
+        if page.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth"):
+            wide.append(file.name)
+    page.set_viewport_size({"width": 1280, "height": 900})
+    page.goto((site / "index.html").as_uri())
+    page.locator(".md-search__input").fill("supermodularity")
+    first = page.locator(".md-search-result__link").first
+    first.wait_for(timeout=30_000)
+    assert "leaders.html" in str(first.get_attribute("href"))
     assert [url for url in log.requests if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
     assert log.complaints == []
     assert wide == []
+    page.close()

@@ -38,20 +38,16 @@ FAINT = """() => {
     const part = (value) => (value <= 0.04045 * 255 ? value / 255 / 12.92 : ((value / 255 + 0.055) / 1.055) ** 2.4);
     const light = ([r, g, b]) => 0.2126 * part(r) + 0.7152 * part(g) + 0.0722 * part(b);
     const over = (front, back, share) => [0, 1, 2].map((i) => share * front[i] + (1 - share) * back[i]);
-    const behind = (one) => {
-        const layers = [];
-        for (let place = one; place; place = place.parentElement) {
-            const found = numbers(getComputedStyle(place).backgroundColor);
-            if (found.length === 3 || found[3] > 0) layers.push(found);
-            if (found.length === 3 || found[3] === 1) break;
-        }
-        return layers.reduceRight((back, front) => over(front, back, front[3] ?? 1), [255, 255, 255]);
+    const once = (compute, found = new Map()) => (one) => {
+        if (!found.has(one)) found.set(one, compute(one));
+        return found.get(one);
     };
-    const opaque = (one) => {
-        let share = 1;
-        for (let place = one; place; place = place.parentElement) share *= getComputedStyle(place).opacity;
-        return share;
-    };
+    const behind = once((one) => {
+        if (!one) return [255, 255, 255];
+        const layer = numbers(getComputedStyle(one).backgroundColor), share = layer[3] ?? 1;
+        return share === 1 ? layer.slice(0, 3) : over(layer, behind(one.parentElement), share);
+    });
+    const opaque = once((one) => (one ? getComputedStyle(one).opacity * opaque(one.parentElement) : 1));
     const faint = [], walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
     for (let node = walker.nextNode(); node; node = walker.nextNode()) {
         const one = node.parentElement, style = getComputedStyle(one);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -19,12 +20,16 @@ FORGOTTEN = 4  # blocks after which no burst of these tests goes on
 
 
 class Links:
-    """Noise and loss of every message of a run."""
+    """Noise and loss of every message of a run; who hears whom under each graph."""
 
-    def __init__(self, what: ValidExperiment) -> None:
+    def __init__(self, what: ValidExperiment, model: Any) -> None:
         self._noise, self._loss, self._replicas = what.noise, what.loss.tolist(), what.run.replicas
         self._key = np.random.SeedSequence(what.run.seed).generate_state(2, np.uint64)
         self.normal, self._uniform, self._chain = cache(self._normals), cache(self._uniforms), cache(self._fates)
+        gain = model.noise_gain if isinstance(model, StepModel) else what.step_noise_gain
+        self.sources = cache(lambda g, i: [(j, w) for j, w in enumerate(gain[g][i].tolist()) if w])
+        self.senders = cache(lambda g, i: model.neighbours(g, i).tolist())
+        self.inputs = cache(lambda g, i: [(j, float(model.nominal[g, i, j])) for j in model.inputs(g, i).tolist()])
 
     def _philox(self, stream: int, number: int, block: int) -> np.random.Generator:
         counter = [0, block % 2**64, number, stream]
@@ -69,16 +74,18 @@ class Links:
 def choose(what: ValidExperiment, inbox: list[int], lost: Callable[[int], bool]) -> int | None:
     """The step of the message that is used, of those that came (ascending); None: the own value."""
     usable = max(0, inbox[-1] - what.noise.delay) if inbox else 0
-    came = [step for step in inbox if step <= usable]
-    if what.noise.on_loss == "hold":
-        came = [step for step in came if not lost(step)]
-    return None if not came or lost(came[-1]) else came[-1]
+    for place in reversed(range(bisect_right(inbox, usable))):
+        if not lost(inbox[place]):
+            return inbox[place]
+        if what.noise.on_loss != "hold":
+            return None
+    return None
 
 
 def assert_by_hand(trajectory: Trajectory) -> None:
     """Compute a run of the twin again: every state, publication and log entry, to the last bit."""
     what, model = trajectory.record.experiment, trajectory.record.model
-    links, m, real_time = Links(what), what.agents, what.run.pace == "realtime"
+    links, m, real_time = Links(what, model), what.agents, what.run.pace == "realtime"
     step_of = STEPS[what.protocol.info.name if what.protocol and not isinstance(model, StepModel) else ""]
     x: list[Any] = trajectory.states[0].tolist()
     values = [row[: what.run.replicas] for row in x]
@@ -89,8 +96,7 @@ def assert_by_hand(trajectory: Trajectory) -> None:
         after: list[Any] = [None] * m
         for i in order:
             heard: dict[int, list[float]] = {}
-            senders = model.neighbours(g, i).tolist()
-            for d, j in enumerate(senders):
+            for d, j in enumerate(links.senders(g, i)):
                 step = choose(what, inbox[j], lambda step, i=i, j=j: links.lost(i, j, step))
                 newest = max(0, inbox[j][-1] - what.noise.delay)
                 if trajectory.used is not None:
@@ -116,22 +122,22 @@ def assert_by_hand(trajectory: Trajectory) -> None:
     assert (trajectory.used is not None) == bool(real_time or what.noise.delay or what.noise.holds)
 
 
-def _noise(what: ValidExperiment, links: Links, gain: Any, k: int, i: int) -> list[float]:
+def _noise(what: ValidExperiment, links: Links, k: int, g: int, i: int) -> list[float]:
     """Row i of the noise gain (m, m) times the sources, in ascending order."""
     total = [0.0] * what.run.replicas
-    terms = [(w, links.of(PROCESS, j, k)) for j, w in enumerate(gain[i].tolist()) if w]
-    for number, (weight, source) in enumerate(terms):
+    for number, (j, weight) in enumerate(links.sources(g, i)):
+        source = links.of(PROCESS, j, k)
         total = [weight * s if number == 0 else t + weight * s for t, s in zip(total, source, strict=True)]
     return total
 
 
 def _linear(what: ValidExperiment, model: Any, links: Links, k: int, g: int, i: int, x: Any, heard: Any) -> list[float]:
-    noise, offset = _noise(what, links, model.noise_gain[g], k, i), float(model.offsets[g, i])
+    noise, offset = _noise(what, links, k, g, i), float(model.offsets[g, i])
     following = []
     for r in range(what.run.replicas):
         total = None
-        for j in model.inputs(g, i).tolist():
-            term = float(model.nominal[g, i, j]) * heard.get(j, x)[r]
+        for j, weight in links.inputs(g, i):
+            term = weight * heard.get(j, x)[r]
             total = term if total is None else total + term
         following.append(total + (noise[r] + offset))
     return following
@@ -149,7 +155,7 @@ def _saturated(
     what: ValidExperiment, model: Any, links: Links, k: int, g: int, i: int, x: Any, heard: Any
 ) -> list[float]:
     felt = {j: [min(max(v - o, -1.0), 1.0) for v, o in zip(values, x, strict=True)] for j, values in heard.items()}
-    noise, pull = _noise(what, links, what.step_noise_gain[g], k, i), _pull(what, g, i, felt)
+    noise, pull = _noise(what, links, k, g, i), _pull(what, g, i, felt)
     return [o + what.step_length * u + n for o, u, n in zip(x, pull, noise, strict=True)]
 
 
@@ -159,7 +165,7 @@ def _integral_action(
     replicas, dt = what.run.replicas, what.step_length
     own, integral = x[:replicas], x[replicas:]
     pull = _pull(what, g, i, {j: [v - o for v, o in zip(values, own, strict=True)] for j, values in heard.items()})
-    noise = _noise(what, links, what.step_noise_gain[g], k, i)
+    noise = _noise(what, links, k, g, i)
     return [
         *(o + dt * (u + 1.0 * z + 0.0) + n for o, u, z, n in zip(own, pull, integral, noise, strict=True)),
         *(z + dt * u for z, u in zip(integral, pull, strict=True)),

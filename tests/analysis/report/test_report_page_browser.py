@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import CUT, FAINT, Log, chromium
+from browser import CUT, FAINT, Log
 from PIL import Image
 
 from msg_analysis.inference.verdict.compare import compare
@@ -23,11 +24,10 @@ from msg_analysis.report.html.plots.colours import BLUE, DARK
 from msg_analysis.report.html.report_page import write_report
 from msg_analysis.twin.simulate import simulate
 
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
+# Not stationary: a run of 100 agents from their stationary law has a long past to be simulated.
+HUNDRED: dict[str, Any] = {"duration": 50, "replicas": 16, "start": "zero"}
+LONG: dict[str, Any] = {"duration": 200, "replicas": 16, "start": "zero"}
+KILLED: dict[str, Any] = {"kind": "killed", "step": 1800, "node": "agent_2", "words": "agent_2: killed"}
 
 
 def _document(agents: int, **run: Any) -> dict[str, Any]:
@@ -75,13 +75,24 @@ def _check(page: Any, log: Log, path: Path) -> None:
     assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
 
 
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Path, Trajectory]]:
+    """The report of a run, and the run, by the number of agents and the settings of the run."""
+
+    @functools.cache
+    def made(agents: int, **run: Any) -> tuple[Path, Trajectory]:
+        path, trajectory = tmp_path_factory.mktemp("reports") / "report.html", _trajectory(agents, **run)
+        events = [KILLED] if len(trajectory.modes) > KILLED["step"] else []
+        write_report(compare(trajectory), trajectory, path, events=events)
+        return path, trajectory
+
+    return made
+
+
 @pytest.mark.parametrize("agents", [5, 100])
-def test_small_and_large(browser: Any, tmp_path: Path, agents: int) -> None:
+def test_small_and_large(browser: Any, reports: Callable[..., tuple[Path, Trajectory]], agents: int) -> None:
     """Hover shows values; agents are chosen by numbers and by a click; paper has everything."""
-    # Not stationary: a run of 100 agents from their stationary law has a long past to be simulated.
-    trajectory = _trajectory(agents, **({"duration": 20} if agents == 5 else {"duration": 6, "start": "zero"}))
-    path = tmp_path / "report.html"
-    write_report(compare(trajectory), trajectory, path)
+    path, _ = reports(agents, **({} if agents == 5 else HUNDRED))
     assert path.stat().st_size < 3_000_000
     page, log = _open(browser, path)
     _check(page, log, path)
@@ -233,12 +244,9 @@ def test_a_finger_scrolls_the_page(browser: Any, disagrees: Path) -> None:
     page.close()
 
 
-def test_trajectories(browser: Any, tmp_path: Path) -> None:
+def test_trajectories(browser: Any, reports: Callable[..., tuple[Path, Trajectory]]) -> None:
     """Agents are switched on and off, and every part of the run can be seen, with the keyboard alone."""
-    trajectory = _trajectory(5, duration=200)
-    path = tmp_path / "report.html"
-    killed = {"kind": "killed", "step": 1800, "node": "agent_2", "words": "agent_2: killed"}
-    write_report(compare(trajectory), trajectory, path, events=[killed])
+    path, trajectory = reports(5, **LONG)
     page, log = _open(browser, path)
 
     def drawn(name: str, column: str) -> Any:
@@ -298,11 +306,9 @@ def test_trajectories(browser: Any, tmp_path: Path) -> None:
     page.close()
 
 
-def test_figures_are_drawn_when_they_are_near(browser: Any, tmp_path: Path) -> None:
+def test_figures_are_drawn_when_they_are_near(browser: Any, reports: Callable[..., tuple[Path, Trajectory]]) -> None:
     """Those far below are not, until they are printed: on paper there are all."""
-    trajectory = _trajectory(5)
-    path = tmp_path / "report.html"
-    write_report(compare(trajectory), trajectory, path)
+    path, _ = reports(5)
     page, log = _open(browser, path)
     figures, drawn = page.locator(".figure").count(), page.locator(".figure:not(:empty)").count()
     assert 4 <= drawn < figures - 4
@@ -320,12 +326,12 @@ def test_figures_are_drawn_when_they_are_near(browser: Any, tmp_path: Path) -> N
     page.close()
 
 
-@pytest.mark.parametrize(("agents", "duration"), [(5, 200), (100, 50)])
-def test_replicas(browser: Any, tmp_path: Path, agents: int, duration: float) -> None:
+@pytest.mark.parametrize(("agents", "run"), [(5, LONG), (100, HUNDRED)])
+def test_replicas(
+    browser: Any, reports: Callable[..., tuple[Path, Trajectory]], agents: int, run: dict[str, Any]
+) -> None:
     """Each that has room can be chosen with the keyboard; its values are those of the run, to 16 bits of their span."""
-    trajectory = _trajectory(agents, duration=duration, replicas=16, start="zero")
-    path = tmp_path / "report.html"
-    write_report(compare(trajectory), trajectory, path)
+    path, trajectory = reports(agents, **run)
     assert path.stat().st_size < 3_000_000
     page, log = _open(browser, path)
     offered = page.locator("#replica option").all_inner_texts()

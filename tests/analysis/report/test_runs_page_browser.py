@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import FAINT, Log, chromium
+from browser import FAINT, Log
 
 from msg_analysis import Experiment
 from msg_analysis.report.html.runs_page import write_runs_page
@@ -23,12 +22,6 @@ CUT = """() => [...document.querySelectorAll("body *")].filter((one) => {
     const {left, right} = one.getBoundingClientRect();
     return one.checkVisibility() && !one.closest("thead, svg") && (right > window.innerWidth + 0.5 || left < -0.5);
 }).length"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from browser import CUT, FAINT, Log, chromium
+from browser import CUT, FAINT, Log
 
 from msg_analysis.report.figures.sideways import shifted
 from msg_analysis.report.html.sweep_page import write_sweep_page
@@ -40,45 +40,45 @@ def page_of(directory: Path, over: dict[str, list[Any]], fails: Any = None) -> P
 
 
 @pytest.mark.parametrize("keys", [1, 3])
-def test_keys_and_pointer(tmp_path: Path, keys: int) -> None:
+def test_keys_and_pointer(browser: Any, tmp_path: Path, keys: int) -> None:
     """Lines over each key; a heat map over two; beside each other for the values of a third."""
     every = {"switching.rates.<b>$$x$$.ring": [0.1, 1, 10], "noise.loss": [0, 0.5, 0.9], "run.dt": [0.05, 0.1]}
     over = dict(list(every.items())[:keys])
     path = page_of(tmp_path, over, fails=0.1 if keys == 3 else None)
-    with chromium() as browser:
-        page = browser.new_page(viewport={"width": 390, "height": 800}, color_scheme="dark" if keys == 3 else "light")
-        log = Log(page)
-        page.goto(path.as_uri())
+    page = browser.new_page(viewport={"width": 390, "height": 800}, color_scheme="dark" if keys == 3 else "light")
+    log = Log(page)
+    page.goto(path.as_uri())
+    page.wait_for_selector("body[data-ready=yes]")
+    assert page.locator("[data-name^=map_]").count() == {1: 0, 3: 2}[keys]
+    assert page.locator("#along input").count() == {1: 0, 3: 3}[keys]
+    page.focus("[data-name=lines_0_0]")
+    page.keyboard.press("ArrowRight")
+    said = page.inner_text("#point-lines_0_0")
+    assert said.startswith("switching rate from <b>$$x$$ to ring = 0.1")
+    assert "1 ± 0.98 (95 %), predicted 1.25" in said
+    page.keyboard.press("Escape")
+    assert page.inner_text("#point-lines_0_0") == ""
+    if keys > 1:
+        page.check("#along input >> nth=1")
+        page.wait_for_selector("[data-name=lines_1_0]")
+        assert not page.is_visible("[data-name=lines_0_0]")
+        for width in (390, 1280):
+            page.set_viewport_size({"width": width, "height": 800})
+            assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+            for scheme in ("light", "dark"):
+                page.emulate_media(color_scheme=scheme)
+                assert page.evaluate(CUT) == []
+                assert page.evaluate(FAINT) == []
+        page.locator("[data-name=map_0_0]").scroll_into_view_if_needed()
+        page.locator("[data-name=map_0_0] .figure:not(:empty)").wait_for()
         page.wait_for_selector("body[data-ready=yes]")
-        assert page.locator("[data-name^=map_]").count() == {1: 0, 3: 2}[keys]
-        assert page.locator("#along input").count() == {1: 0, 3: 3}[keys]
-        page.focus("[data-name=lines_0_0]")
-        page.keyboard.press("ArrowRight")
-        said = page.inner_text("#point-lines_0_0")
-        assert said.startswith("switching rate from <b>$$x$$ to ring = 0.1")
-        assert "1 ± 0.98 (95 %), predicted 1.25" in said
-        page.keyboard.press("Escape")
-        assert page.inner_text("#point-lines_0_0") == ""
-        if keys > 1:
-            page.check("#along input >> nth=1")
-            page.wait_for_selector("[data-name=lines_1_0]")
-            assert not page.is_visible("[data-name=lines_0_0]")
-            for width in (390, 1280):
-                page.set_viewport_size({"width": width, "height": 800})
-                assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
-                for scheme in ("light", "dark"):
-                    page.emulate_media(color_scheme=scheme)
-                    assert page.evaluate(CUT) == []
-                    assert page.evaluate(FAINT) == []
-            page.locator("[data-name=map_0_0]").scroll_into_view_if_needed()
-            page.locator("[data-name=map_0_0] .figure:not(:empty)").wait_for()
-            page.wait_for_selector("body[data-ready=yes]")
-            box = page.locator("[data-name=map_0_0]").bounding_box()
-            page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-            page.locator(".bk-Tooltip", has_text="loss of messages").first.wait_for()
-            assert "<i>broke</i>" in page.inner_text(".verdict")
-        assert log.complaints == []
-        assert log.requests == [path.as_uri()]
+        box = page.locator("[data-name=map_0_0]").bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.locator(".bk-Tooltip", has_text="loss of messages").first.wait_for()
+        assert "<i>broke</i>" in page.inner_text(".verdict")
+    assert log.complaints == []
+    assert log.requests == [path.as_uri()]
+    page.close()
 
 
 def test_names_of_keys_and_columns() -> None:

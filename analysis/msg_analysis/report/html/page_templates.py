@@ -16,10 +16,29 @@
 
 from __future__ import annotations
 
+import types
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import jinja2
+from jinja2.bccache import Bucket
+
+
+class _Compiled(jinja2.BytecodeCache):
+    """Templates that are compiled once in a process."""
+
+    def __init__(self) -> None:
+        self._code: dict[str, types.CodeType] = {}
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        bucket.code = self._code.get(bucket.checksum)
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        if bucket.code is not None:
+            self._code[bucket.checksum] = bucket.code
+
+
+_COMPILED = _Compiled()
 
 
 def page_template(name: str, filters: Mapping[str, Callable[..., Any]] | None = None) -> jinja2.Template:
@@ -30,6 +49,7 @@ def page_template(name: str, filters: Mapping[str, Callable[..., Any]] | None = 
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        bytecode_cache=_COMPILED,
     )
     environment.filters |= filters or {}
     return environment.get_template(name)
