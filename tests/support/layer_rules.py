@@ -6,6 +6,7 @@ A layer is a folder, without its sub-folders, or a module beside them.
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,15 +33,20 @@ def modules(places: Places) -> dict[str, Path]:
 
 def imported(file: Path, known: Mapping[str, Path]) -> Iterator[str]:
     """Every module that a file imports, wherever: at its top, in functions, or for type checkers only."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in _import_statements(file.read_text(encoding="utf-8")):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
+        else:
             assert node.level == 0, f"{file}: a relative import"
             assert node.module
             for alias in node.names:
                 full = f"{node.module}.{alias.name}"
                 yield full if full in known else node.module
+
+
+@functools.cache
+def _import_statements(source: str) -> list[ast.Import | ast.ImportFrom]:
+    return [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Import | ast.ImportFrom)]
 
 
 def graph(places: Places) -> nx.DiGraph:
