@@ -339,7 +339,9 @@ def _note_reconstruction(axes: Axes) -> None:
 
 def _settle(figure: Figure) -> None:
     """Make the layout, and round it: its last digits depend on the iteration order of a set."""
-    figure.draw_without_rendering()
+    layout = figure.get_layout_engine()
+    assert layout
+    layout.execute(figure)
     figure.set_layout_engine("none")
     for axes in figure.axes:
         axes.set_position(np.round(axes.get_position(original=True).bounds, 5).tolist())
