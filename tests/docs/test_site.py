@@ -44,7 +44,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     target = tmp_path_factory.mktemp("site")
     with contextlib.chdir(ROOT):
         built = CliRunner(env={"NO_MKDOCS_2_WARNING": "1"}).invoke(
-            cli, ["build", "--strict", "--quiet", "--site-dir", str(target)]
+            cli, ["build", "--strict", "--site-dir", str(target)]
         )
     assert built.exit_code == 0, built.output
     return target
