@@ -106,12 +106,8 @@ def squared_deviations(experiment, process, seed):
         if noise.loss:  # a lost value is replaced by one's own
             pull = np.where(random.random((NETWORKS, m, m)) >= noise.loss.default, pull, x[:, :, None])
         drawn = random.standard_normal(x.shape)
-        moved = np.empty_like(x)
-        for g in range(len(weights)):
-            now = modes == g
-            heard = np.broadcast_to(pull[now], (int(now.sum()), m, m))
-            moved[now] = own[g] * x[now] + np.einsum("ab,rab->ra", coupling[g], heard)
-            moved[now] += drawn[now] @ gain[g].T
+        moved = own[modes] * x + np.einsum("rab,rab->ra", coupling[modes], pull)
+        moved += np.einsum("rab,rb->ra", gain[modes], drawn)
         past = [moved, *past[:-1]]
         modes = jumped(random, modes, transition)
     deviation = past[0] - (past[0].mean(axis=1, keepdims=True) if experiment.problem == "consensus" else 0.0)
