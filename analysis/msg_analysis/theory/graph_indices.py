@@ -22,12 +22,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import networkx as nx
 import numpy as np
 import scipy.linalg
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.network.graphs import Graph
+from msg_analysis.model.network.graphs import Graph, hops
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.system import jump_system as systems
 from msg_analysis.theory.system.jump_system import JumpSystem
@@ -74,7 +73,7 @@ def graph_indices(graph: Graph) -> GraphIndices | None:
 
     From r_uv = L^+_uu + L^+_vv - 2 L^+_uv (Klein and Randić 1993): sum_v r_uv = m L^+_uu + tr(L^+).
     """
-    if not graph.symmetric or not nx.is_connected(nx.from_numpy_array(graph.adjacency)):
+    if not graph.symmetric or (hops(graph.adjacency > 0, [0]) < 0).any():
         return None
     m = graph.agents
     helmert = scipy.linalg.helmert(m)

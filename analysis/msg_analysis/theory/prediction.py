@@ -26,7 +26,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import networkx as nx
 import numpy as np
 
 from msg_analysis.common.blas_threads import blas_threads, few_blas_threads, one_blas_thread
@@ -35,6 +34,7 @@ from msg_analysis.common.text.json_numbers import finite
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.common.text.number_words import number_text
 from msg_analysis.errors import InputError, NotAvailableError
+from msg_analysis.model.network.graphs import hops, widest_reaching
 from msg_analysis.model.step.sequential_law import StepLaw, build_run_model, step_law
 from msg_analysis.model.step.step_model import StepModel, build_step_model
 from msg_analysis.theory.moments import MomentSolver
@@ -370,12 +370,7 @@ def _static(system: JumpSystem, names: Sequence[str] | None) -> Moments | None:
 
 def _holds_together(experiment: ValidExperiment, mode: int) -> bool:
     """Whether one graph held fixed bounds the errors: one agent, or the reference, reaches all others."""
-    graph = experiment.graph_list[mode]
-    digraph: nx.DiGraph = nx.DiGraph()
-    digraph.add_nodes_from(range(1, graph.agents + 1))
-    digraph.add_edges_from((source, target) for source, target, _ in graph.arcs)
-    if experiment.problem == "tracking":
-        digraph.add_edges_from((0, int(leader) + 1) for leader in np.flatnonzero(experiment.leader_gains))
-        return 0 in digraph and len(nx.descendants(digraph, 0)) == graph.agents
-    parts = nx.condensation(digraph)
-    return sum(int(degree == 0) for _, degree in parts.in_degree()) == 1
+    leads = experiment.graph_list[mode].adjacency.T > 0
+    leaders = np.flatnonzero(experiment.leader_gains).tolist()
+    sources = leaders if experiment.problem == "tracking" else widest_reaching(leads)
+    return bool((hops(leads, sources) >= 0).all())

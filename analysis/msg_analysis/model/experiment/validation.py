@@ -23,12 +23,12 @@ import numpy as np
 
 from msg_analysis.common.text.agent_names import agent_name, agent_text
 from msg_analysis.model.experiment.problems import problem, show
-from msg_analysis.model.network.graphs import Graph, hops
+from msg_analysis.model.network.graphs import Graph, hops, widest_reaching
 from msg_analysis.model.network.markov_chain import MarkovChain, Time
 from msg_analysis.model.spec.graphs import SwitchingSpec
 from msg_analysis.model.spec.noise import LossSpec, NoiseGain, NoiseSpec
 from msg_analysis.model.spec.run import LeadersSpec, RunSpec
-from msg_analysis.types import BoolArray, FloatArray
+from msg_analysis.types import FloatArray
 
 SUM_TOLERANCE = 1e-9
 STEP_TOLERANCE = 1e-9
@@ -172,29 +172,13 @@ def connection_problems(
     some agent (tracking: the leaders together) reaches every other one.
     """
     union = np.any([graph.adjacency.T > 0 for graph in graphs], axis=0)
-    sources = _widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
+    sources = widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
     lost = np.flatnonzero(hops(union, sources) < 0).tolist()
     if not lost:
         return []
     start = "a leader" if leaders is not None else f"agent{_list(sources, names)}"
     text = f"agent{_list(lost, names)} cannot be reached from {start} in the union of all graphs"
     return [problem("graphs", text, "expected a union that connects all agents", "add an edge, or lower `agents`")]
-
-
-def _widest_reaching(leads: BoolArray) -> list[int]:
-    """The vertices from which the most others are reached, of one strongly connected component only.
-
-    ``leads[i, j]`` (v, v): an arc leads from i to j.
-    """
-    known = np.zeros(len(leads), dtype=bool)
-    widest, reached = 0, known.copy()
-    for vertex in range(len(leads)):
-        if not known[vertex]:  # else a vertex that reaches it was tried, which reaches at least as many
-            found = hops(leads, [vertex]) >= 0
-            known |= found
-            if found.sum() > reached.sum():
-                widest, reached = vertex, found
-    return np.flatnonzero(reached & (hops(leads.T, [widest]) >= 0)).tolist()
 
 
 def _list(agents: Sequence[int], names: Sequence[str] | None, longest: int = 8) -> str:

@@ -37,6 +37,22 @@ def hops(leads: BoolArray, sources: Collection[int]) -> IntArray:
     return level
 
 
+def widest_reaching(leads: BoolArray) -> list[int]:
+    """The vertices from which the most others are reached, of one strongly connected component only.
+
+    ``leads[i, j]`` (v, v): an arc leads from i to j.
+    """
+    known = np.zeros(len(leads), dtype=bool)
+    widest, reached = 0, known.copy()
+    for vertex in range(len(leads)):
+        if not known[vertex]:  # else a vertex that reaches it was tried, which reaches at least as many
+            found = hops(leads, [vertex]) >= 0
+            known |= found
+            if found.sum() > reached.sum():
+                widest, reached = vertex, found
+    return np.flatnonzero(reached & (hops(leads.T, [widest]) >= 0)).tolist()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
     """One mode of the switching network.
