@@ -27,7 +27,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
 
 LIMIT = 12.0  # s for both agents to make steps: long enough for a machine that is busy
-MEASURED = 1.0  # s of steps
+MEASURED = 0.5  # s of steps: some thousand
 PAIR = {
     "name": "doctor",
     "graphs": {"pair": {"path": [1, 2]}},
