@@ -1,10 +1,10 @@
 """Our own commands are forked from a process that has imported everything, instead of being executed.
 
 Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis``, the fork server of a network and the
-nodes of tests (``python -P -c CODE``), if nothing is asked for but streams, a directory, a session, a network namespace
-(``ip netns exec``), and variables that are read after the imports. It executes all else as ever. A forked process is a
-child of the process that asked, has the title of its command, and its mark can be read in its environment, as after
-exec.
+nodes of tests (``python -P -c CODE``), if nothing is asked for but streams, a directory, a session, a function of this
+folder that is called first, a network namespace (``ip netns exec``), and variables that are read after the imports. It
+executes all else as ever. A forked process is a child of the process that asked, has the title of its command, and its
+mark can be read in its environment, as after exec.
 """
 
 from __future__ import annotations
@@ -57,10 +57,11 @@ PREPARED = (
     "scipy.stats",
 )
 READ_LATER = re.compile(
-    "(ROS_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_|PYDANTIC_|KMP_).*|NO_COLOR|COLUMNS|LINES|PYTHON(SAFEPATH|UNBUFFERED)|"
+    "(ROS_|RMW_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_|PYDANTIC_|KMP_).*|NO_COLOR|COLUMNS|LINES|PYTHON(SAFEPATH|UNBUFFERED)|"
     "(MKL|OMP|OPENBLAS)_NUM_THREADS"
 )
 """Names of variables that are read after the imports, or are the same for all that is forked (libraries set KMP_)."""
+SUPPORT = Path(__file__).parent
 CLONE_NEWNET = 0x40000000  # linux/sched.h
 LONGEST_TITLE = 2000
 FREE = 200  # descriptors from here on are not used
@@ -99,7 +100,9 @@ def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Seque
     of_ours = Path(command[0]).parent == Path(sys.executable).parent and Path(command[0]).name in PROGRAMS
     close, kept, directory, environment = arguments[2:6]
     new_group, *identity = arguments[16:21]
-    unusual = not close or new_group != -1 or identity != [None, None, None, -1] or arguments[21] is not None
+    first = arguments[21]
+    known = first is None or (Path(first.__code__.co_filename).parent == SUPPORT and first.__qualname__.isidentifier())
+    unusual = not close or new_group != -1 or identity != [None, None, None, -1] or not known
     if unusual or not (of_ours or (command[1:3] in (OF_NODE_SERVER, OF_NODE) and command[0] == sys.executable)):
         return None
     lines = [f"{name}={value}" for name, value in os.environ.items()] if environment is None else environment
@@ -109,6 +112,7 @@ def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Seque
         "directory": os.fsdecode(directory or Path.cwd()),
         "environment": dict(os.fsdecode(line).split("=", 1) for line in lines),
         "session": arguments[15],
+        "first": first and [first.__module__, first.__qualname__],
         "kept": [number for number in kept if number != arguments[13]],
     }
 
@@ -185,6 +189,9 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
     for source, target in zip(free, [0, 1, 2, *request["kept"]], strict=True):
         os.dup2(source, target)
         os.close(source)
+    if request["first"]:
+        place, name = request["first"]
+        getattr(importlib.import_module(place), name)()
     _open_streams()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     random.seed()
@@ -246,6 +253,7 @@ def main() -> None:
 
     setproctitle("commands of tests")  # it finds its place only before the environment is changed
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.path.append(str(SUPPORT))
     for name in PREPARED:
         importlib.import_module(name)
     importlib.import_module(NODE_SERVER).prepare()

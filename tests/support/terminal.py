@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pty
 import select
@@ -11,6 +12,14 @@ import termios
 import time
 from pathlib import Path
 from typing import Any
+
+
+def take_terminal() -> None:
+    """Make the terminal that is stdin that of this process, in a session of its own."""
+    os.setsid()
+    for number in (signal.SIGINT, signal.SIGHUP):  # the tests may run under nohup or in the background
+        signal.signal(number, signal.SIG_DFL)
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
 class Terminal:
@@ -23,20 +32,12 @@ class Terminal:
         self._slave = slave
         self.text = ""
 
-        def own() -> None:
-            os.setsid()
-            for number in (signal.SIGINT, signal.SIGHUP):  # the tests may run under nohup or in the background
-                signal.signal(number, signal.SIG_DFL)
-            import fcntl
-
-            fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-
         self.process = subprocess.Popen(
             command,
             stdin=slave,
             stdout=slave,
             stderr=slave,
-            preexec_fn=own,
+            preexec_fn=take_terminal,
             # readline adds its own, also to the environment of pytest's workers, and they would fix the size
             env={name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")},
         )
