@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -196,7 +197,7 @@ forge = {
     "wrong length": lambda: send_state(replicas=rng.choice([0, 1, 3, 50])),
     "not finite": lambda: send_state(value=rng.choice([np.nan, np.inf, -np.inf]), step=now[0] + 60),
     "step out of range": lambda: send_state(step=rng.choice([last + 1, 2**40, 2**63 - 1, 2**64 - 1])),
-    "step too old": lambda: send_state(step=rng.randrange(now[0] - 6100)),
+    "step too old": lambda: send_state(step=rng.randrange(now[0] - 8000)),  # the recorder may be 2,000 steps behind
     "a step that a peer cannot have reached": lambda: send_state(step=min(now[0] + 12_500, last)),
     "undecodable": lambda: state.publish(bytes([0, 1, 0, 0]) + rng.randbytes(rng.randrange(1, 200))),
     "other run, graph": lambda: graph.publish(ActiveGraph(0, other, 0, 1, "line", 0, last - 1).encode()),
@@ -204,7 +205,7 @@ forge = {
     "other run, end": lambda: end.publish(Progress(0, other, 0, last).encode()),
     "unknown agent, progress": lambda: progress.publish(Progress(0, run, 6, last).encode()),
 }
-while now[0] < 6300:
+while now[0] < 8300:
     rclpy.spin_once(node, timeout_sec=0.1)
 order = [name for name in forge for _ in range(20)]
 rng.shuffle(order)
@@ -213,15 +214,14 @@ for name in order:
         rclpy.spin_once(node, timeout_sec=0)
     forge[name]()
 print(now[0], flush=True)
-while True:
-    rclpy.spin_once(node, timeout_sec=1)
+time.sleep(600)
 """
 
 
 def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
     """Everything that cannot be, in any order, sent to a run that is under way; the intruder is killed at last."""
-    # 25,000 steps: in time, the last one is more than 6,000 ahead, and the recorder refuses it as impossible.
-    file = network.file(run={"duration": 1250, "processes": 3})
+    # 20,000 steps: in time, the last one is more than 6,000 ahead, and the recorder refuses it as impossible.
+    file = network.file(run={"duration": 1000, "processes": 3})
     with free_domain() as domain:
         options = ("--out", network.directory / "runs", "--domain", str(domain), "--json")
         run = network.start("run", file, *options)
@@ -234,7 +234,7 @@ def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Ra
         )
         try:
             assert intruder.stdout is not None
-            assert int(intruder.stdout.readline()) < 17_000  # it was in time
+            assert int(intruder.stdout.readline()) < 13_000  # it was in time
             result = network.completed(run)
         finally:
             intruder.kill()
@@ -263,14 +263,18 @@ def test_second_processes_of_agents(network: Any) -> None:
     other = network.directory / "other.json"
     other.write_text(new_record(network.experiment(run={"duration": 100, "seed": 8})).to_json(with_key=True))
     with free_domain() as domain:
-        file = network.file(run={"duration": 100, "processes": 3})
+        # 8,000 steps: of 2,000, a quiet machine has made the last one before the first is seen in the bag.
+        file = network.file(run={"duration": 400, "processes": 3})
         run = network.record(file, "--domain", str(domain), "--json")
         network.wait_until_moving()
         (first, *_) = network.processes("agent")
         first.kill(signal.SIGSTOP)  # the network stands still until they have left
+        time.sleep(0.5)
+        assert len(network.nodes()) == 5, "too fast to be stopped in the middle"
         environment = node_environment(domain)
+        # What gets lost while they look for each other comes again after 3 s, and the same can happen to that.
         doubles = {
-            agent: network.start("agent", record, "--agent", agent, "--discovery-timeout", "6", **environment)
+            agent: network.start("agent", record, "--agent", agent, "--discovery-timeout", "12", **environment)
             for agent, record in (("2", network.run_file()), ("4", other))
         }
         for agent, double in doubles.items():

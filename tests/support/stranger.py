@@ -32,6 +32,7 @@ from rclpy.duration import Duration
 from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress, StateBatch
 from std_msgs.msg import String
 from msg_agents.nodes.ros.qos import ros_profile
+from msg_agents.nodes.ros.rclpy_error import RCLError
 from msg_analysis.wire.topics import LATCHED, STREAM
 
 AGENTS, PROCESSES, OF_BATCHES = int(sys.argv[3]), 2, int(sys.argv[4])
@@ -52,9 +53,16 @@ publishers = {
 for topic, publisher in publishers.items():
     while publisher.get_subscription_count() < readers[topic]:
         time.sleep(0.1)
+def publish(topic, data):
+    while True:
+        try:
+            return publishers[topic].publish(bytes.fromhex(data))
+        except RCLError:  # on a busy machine: readers have not acknowledged yet what it keeps for them
+            pass
+
 early = int(sys.argv[2])
 for topic, data in messages[:early]:
-    publishers[topic].publish(bytes.fromhex(data))
+    publish(topic, data)
 for publisher in publishers.values():
     assert publisher.wait_for_all_acked(Duration(seconds=30))
 referee = rclpy.create_node("referee", enable_rosout=False)
@@ -62,13 +70,13 @@ topics = {"graph": ActiveGraph} | {f"agent_{i}/state": AgentState for i in range
 for topic, kind in topics.items():
     referee.create_subscription(kind, topic, lambda _: None, latched if topic == "graph" else stream)
 for topic, data in messages[early:]:
-    publishers[topic].publish(bytes.fromhex(data))
+    publish(topic, data)
     time.sleep(0.0001)
 of_states = [message for message in dict(messages).items() if message[0].endswith("/state")]
 while int(sys.argv[5]):
     for topic, data in of_states:
-        publishers[topic].publish(bytes.fromhex(data))
-    time.sleep(0.001)
+        publish(topic, data)
+    time.sleep(0.004)
 time.sleep(600)
 """
 Forgery = tuple[str, bytes]  # topic, message
