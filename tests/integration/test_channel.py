@@ -19,6 +19,7 @@ from msg_agents.channel.namespaces import open_hosts
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.errors import NotAvailableError
 
+ENDLESS = {"duration": 10_000}  # 200,000 steps: no test waits for them
 LEVEL = 1e-6  # false-alarm rate of the test of a loss; the losses have a fixed seed, the numbers of packets do not
 MARK_OF_TESTS = b"MSG_AGENTS_TEST="
 PROGRAM = Path(sys.executable).with_name("msg-agents")
@@ -121,6 +122,8 @@ def test_real_time_over_a_bad_channel(network: Any) -> None:
     run = start(
         network,
         {"duration": 3, "pace": "realtime"},
+        "--write-report",
+        "never",
         hosts={"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}},
         default={"loss": 0.4, "burst": 3, "delay_ms": 2},
         recorder="clean",
@@ -171,7 +174,7 @@ def test_a_killed_agent_comes_back_on_its_host(network: Any, hosts: set[int]) ->
 
 
 def test_a_killed_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
-    run = start(network, {"duration": 100_000}, "--no-analyse")
+    run = start(network, ENDLESS, "--no-analyse")
     wait_until_moving(network, hosts)
     (channel,) = network.processes("channel")
     channel.kill()
@@ -184,7 +187,7 @@ def test_a_killed_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
 
 
 def test_a_stopped_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
-    run = start(network, {"duration": 100_000}, "--no-analyse")
+    run = start(network, ENDLESS, "--no-analyse")
     wait_until_moving(network, hosts)
     (channel,) = network.processes("channel")
     channel.kill(signal.SIGSTOP)
@@ -196,7 +199,7 @@ def test_a_stopped_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_run_leaves_nothing_behind(network: Any, hosts: set[int], number: signal.Signals) -> None:
-    run = start(network, {"duration": 100_000}, "--no-analyse")
+    run = start(network, ENDLESS, "--no-analyse")
     wait_until_moving(network, hosts)
     run.send_signal(number)
     run.communicate(timeout=60)

@@ -128,7 +128,7 @@ def _read_late(network: Any, domain: int, begun: Path, found: Path) -> dict[str,
 def test_a_reader_is_killed(network: Any) -> None:
     """The writers keep what it has not read until its lease ends; then the run goes on."""
     seen = network.directory / "seen"
-    file = network.file(run={"duration": 300})
+    file = network.file(run={"duration": 300, "processes": 2})
     with free_domain() as domain, cyclone(domain, "--seen", seen, uri=SHORT_LEASE) as reader:
         run = network.start(
             *("run", file, "--out", network.directory / "runs", "--no-analyse", "--json"),
@@ -140,8 +140,9 @@ def test_a_reader_is_killed(network: Any) -> None:
 
 
 def test_a_stranger_is_refused(network: Any) -> None:
+    what = network.experiment(run={"duration": 50, "processes": 2})
     with free_domain() as domain, cyclone(domain, "--forge") as reader:
-        result = network.run(network.experiment(run={"duration": 50}), domain=domain, readers=["cyclone_reader"])
+        result = network.run(what, domain=domain, readers=["cyclone_reader"])
         came(reader)
     assert result.failures == []
     equal_to_the_twin(result.trajectory)

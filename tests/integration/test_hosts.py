@@ -167,14 +167,14 @@ def test_hosts_of_unlike_processors(lan: Lan) -> None:
     """In discrete time, where W is an exponential, and with a start that is drawn."""
     switching = {"transition": [[0.9, 0.1], [0.4, 0.6]]}
     prepare(lan, 500, time="discrete", switching=switching, run={"dt": 1})
-    whole(lan, ended(lan.start_all(left=another_processor()), 0))
+    whole(lan, ended(lan.start_all("--no-analyse", left=another_processor()), 0))
 
 
 def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: random.Random) -> None:
     """Its cable is pulled, or its interface goes down: everybody waits, then all goes on, and nothing is lost."""
     prepare(lan, 200)
     host, cable = rng.choice(NAMES), rng.random() < 0.5
-    hosts = lan.start_all()
+    hosts = lan.start_all("--no-analyse")
     lan.network.wait_until_moving("base")
     time.sleep(rng.uniform(0, 0.5))
     assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
@@ -191,8 +191,8 @@ def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
 
     They say so themselves, so nobody waits for a lease of a minute, or for the patience of the others.
     """
-    prepare(lan, 20000)
-    hosts = lan.start_all("--patience", "1000")
+    prepare(lan, 5000)
+    hosts = lan.start_all("--no-analyse", "--patience", "1000")
     lan.network.wait_until_moving("base")
     hosts["left"].send_signal(signal.SIGINT)
     texts = ended(hosts, 3, timeout=50)
@@ -206,7 +206,7 @@ def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
 @pytest.mark.parametrize("pace", ["lockstep", "realtime"])
 def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> None:
     """A lease of 5 s instead of a minute; it is cut off for 12 s, so that both sides have given each other up."""
-    prepare(lan, 250 if pace == "lockstep" else 40, run={"pace": pace})
+    prepare(lan, 250 if pace == "lockstep" else 30, run={"pace": pace})
     command = [str(PROGRAM), "host", str(lan.run_file), str(lan.hosts_file), "--profile"]
     profile = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     short, count = re.subn(r"(<leaseDuration>\s*<sec>)60", r"\g<1>5", profile)
@@ -214,7 +214,7 @@ def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> 
     file = lan.network.directory / "short.xml"
     file.write_text(short)
     setting = dict.fromkeys(PROFILE_VARIABLES, str(file)) | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
-    hosts = lan.start_all("--patience", "60", **dict.fromkeys(NAMES, setting))
+    hosts = lan.start_all("--no-analyse", "--patience", "60", **dict.fromkeys(NAMES, setting))
     lan.network.wait_until_moving("base")
     assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
     lan.plug("left", "down", cable=True)

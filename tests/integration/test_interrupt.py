@@ -101,7 +101,7 @@ def test_at_any_moment_after_the_network(network: Any) -> None:
 def test_agents_that_are_interrupted_say_nothing(network: Any) -> None:
     """A signal shuts rclpy down between two calls of a callback, and what is then published is no error of ours."""
     fast = {"duration": 10_000, "replicas": 1, "processes": 2, "pace": "realtime", "speed": 60.0}
-    run = network.start("run", network.file(run=fast), "--out", network.directory / "runs", "--json", "--restarts", "0")
+    run = network.record(network.file(run=fast), "--restarts", "0")
     network.wait_until_moving()
     agents = network.processes("agent")
     for process in agents:

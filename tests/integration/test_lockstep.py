@@ -143,7 +143,7 @@ def _imported(log: str) -> set[str]:
 def test_two_runs_at_the_same_time(network: Any) -> None:
     """Of one experiment, into one directory, in the same second: they neither hear nor overwrite each other."""
     file, out = network.file(run={"processes": 1}), network.directory / "runs"
-    runs = [network.start("run", file, "--out", out, "--seed", seed) for seed in ("1", "2")]
+    runs = [network.record(file, "--seed", seed) for seed in ("1", "2")]
     for run in runs:
         stdout, stderr = run.communicate(timeout=100)
         assert run.returncode == 0, stdout + stderr

@@ -55,7 +55,7 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
         assert listener.stdout.readline() == "ready\n"
         markers = network.start("markers", "--replica", "2", "--frame", "lab")
         assert "waiting for one" in markers.stderr.readline()
-        result = network.run(network.experiment(run={"duration": STEPS * 0.05}), domain=domain)
+        result = network.run(network.experiment(run={"duration": STEPS * 0.05, "processes": 2}), domain=domain)
         assert result.failures == []
         pictures = json.loads(listener.communicate(timeout=60)[0])
         stderr = markers.communicate(timeout=60)[1]

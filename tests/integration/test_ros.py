@@ -200,8 +200,8 @@ def test_a_stranger(network: Any, domain: int) -> None:
     """A plain rclpy node sees graphs and states of a running network, and ends with it."""
     watching = start("python", stranger(network.directory), cwd=network.directory)
     network.wait_for(lambda: participants(domain), 60, "the stranger has a node")  # later it would wait for ever
-    file = network.file(run={"pace": "realtime", "speed": 2.5})  # 6 s
-    result = network.completed(network.start("run", file, "--out", network.directory, "--domain", domain, "--json"))
+    file = network.file(run={"pace": "realtime", "speed": 2.5, "processes": 2})  # 6 s
+    result = network.completed(network.record(file, "--domain", str(domain), "--json"))
     assert result["strangers"] == []
     printed = end(watching)
     graphs = re.findall(r"^steps (\d+) to (\d+): (line|ring), (\d+) arcs$", printed, re.M)

@@ -24,7 +24,8 @@ BIN = Path(sys.executable).parent
 
 def sweep_file(network: Any, **sweep: Any) -> Path:
     path = network.directory / "rates.yaml"
-    path.write_text(yaml.safe_dump({"experiment": network.experiment().to_document(), **sweep}, sort_keys=False))
+    experiment = network.experiment(run={"processes": 2}).to_document()
+    path.write_text(yaml.safe_dump({"experiment": experiment, **sweep}, sort_keys=False))
     return path
 
 

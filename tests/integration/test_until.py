@@ -26,6 +26,14 @@ PLANNED = 40_000
 PROGRAM = Path(sys.executable).with_name("msg-analysis")
 
 
+def start(network: Any, until: str, *options: str, **changes: Any) -> subprocess.Popen[str]:
+    """A run to a precision, without a report: nobody looks at that."""
+    file, out = network.file(**changes), network.directory
+    quiet = ("--json", "--write-report", "never")
+    run: subprocess.Popen[str] = network.start("run", file, "--out", out, *quiet, "--until", until, *options)
+    return run
+
+
 def ended(result: dict[str, Any], planned: int = PLANNED) -> int:
     """The step at which a run ended, before the planned one, as result, run record and bag say it."""
     until, record = result["until"], read_bag(result["bag"]).record
@@ -58,8 +66,7 @@ def complete(result: RunResult) -> None:
 )
 def test_ends_at_a_precision(network: Any, changes: dict[str, Any]) -> None:
     changes = changes | {"run": LONG | changes.get("run", {})}
-    run = network.start("run", network.file(**changes), "--out", network.directory, "--json", "--until", "30%")
-    result = network.completed(run)
+    result = network.completed(start(network, "30%", **changes))
     step = ended(result)
     assert result["steps"] == step
     assert result["until"]["reason"].startswith("precision 30 % reached at step ")
@@ -75,31 +82,26 @@ def test_ends_at_a_precision(network: Any, changes: dict[str, Any]) -> None:
 
 def test_real_time(network: Any) -> None:
     run = {"pace": "realtime", "speed": 20, "duration": 4000, "replicas": 8, "processes": 2}
-    command = ("run", network.file(run=run), "--out", network.directory, "--json", "--until", "30%")
-    result = network.completed(network.start(*command))
+    result = network.completed(start(network, "30%", run=run))
     assert ended(result, 80_000) == result["steps"]
 
 
 def test_restarts_0_and_no_record(network: Any) -> None:
     """States are kept for the observer, although not for restarts; without a bag, the result says how it ended."""
-    options = ("--until", "40%", "--restarts", "0", "--json", "--out", network.directory)
-    result = network.completed(network.start("run", network.file(run=LONG), *options))
-    ended(result)
-    stdout, stderr = network.start("run", network.file(run=LONG), *options, "--no-record").communicate(timeout=100)
+    ended(network.completed(start(network, "40%", "--restarts", "0", run=LONG)))
+    stdout, stderr = start(network, "40%", "--restarts", "0", "--no-record", run=LONG).communicate(timeout=100)
     assert '"ended_early": true' in stdout, stderr
 
 
 def test_not_reached(network: Any) -> None:
-    command = ("run", network.file(run={"duration": 50}), "--out", network.directory, "--json", "--until", "0.1%")
-    result = network.completed(network.start(*command))
+    result = network.completed(start(network, "0.1%", run={"duration": 50, "processes": 2}))
     assert (result["until"]["ended_early"], result["steps"]) == (False, 1000)
     assert result["until"]["reason"].startswith("not reached: precision ")
 
 
 def test_killed_processes(network: Any, repetition: int, rng: random.Random) -> None:
     """An agent and the switcher are killed and come back, before or after the end is announced."""
-    command = ("run", network.file(run=LONG), "--out", network.directory, "--json", "--until", "25%", "--restarts", "9")
-    run = network.start(*command)
+    run = start(network, "25%", "--restarts", "9", run=LONG)
     network.wait_for(lambda: network.recorded_bytes(".") > 50_000, 60, "recorded states")
     for kind in rng.sample(["agent", "switcher", "switcher"], 3):
         there = network.processes(kind)
@@ -160,9 +162,8 @@ def test_is_watched_to_its_end(network: Any, domain: int) -> None:
         found: dict[str, Any] = json.loads(stdout)
         return found
 
-    options = ("--until", "30%", "--json", "--out", network.directory, "--split-size", "1", "--domain", str(domain))
     live = network.start("live", "--json", "--timeout", "60")
-    run = network.start("run", network.file(run=LONG), *options)
+    run = start(network, "30%", "--split-size", "1", "--domain", str(domain), run=LONG)
     result = network.completed(run)
     step = ended(result)
     assert watched(run)["last_step"] >= step - 1  # an agent may have gone a little further
@@ -194,7 +195,8 @@ def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Ex
 
     monkeypatch.setattr(running_errors.LiveEstimate, "report", fail)
     notes: list[str] = []
-    result = network.run(network.experiment(run={"duration": 200}), until=Until(0.5), on_note=notes.append)
+    experiment = network.experiment(run={"duration": 200, "processes": 2})
+    result = network.run(experiment, until=Until(0.5), on_note=notes.append)
     complete(result)
     assert len(result.trajectory.modes) == 4000
     assert not result.until["ended_early"]
