@@ -214,7 +214,7 @@ def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> 
     file = lan.network.directory / "short.xml"
     file.write_text(short)
     setting = dict.fromkeys(PROFILE_VARIABLES, str(file)) | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
-    hosts = lan.start_all("--no-analyse", "--patience", "60", **dict.fromkeys(NAMES, setting))
+    hosts = lan.start_all("--patience", "60", **dict.fromkeys(NAMES, setting))
     lan.network.wait_until_moving("base")
     assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
     lan.plug("left", "down", cable=True)

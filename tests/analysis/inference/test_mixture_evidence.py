@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import integrate, special, stats
 
 from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
 from msg_analysis.inference.statistics.mixture_evidence import (
@@ -14,6 +14,7 @@ from msg_analysis.inference.statistics.mixture_evidence import (
     VARIANCES,
     coefficient_evidence,
     log_mean,
+    log_means,
     proportion_evidence,
     row_evidence,
     variance_evidence,
@@ -116,3 +117,16 @@ def test_a_bound_that_holds_at_all_times() -> None:
     # Near as low as it can be where it was asked to be: the best mixture of that time is at most 1 % lower.
     others = [float(simultaneous_half_width(2000.0, target)) for target in np.geomspace(20.0, 2e5, 60)]
     assert float(bound[-1]) <= 1.01 * min(others)
+
+
+def test_means_of_parts_are_those_of_each() -> None:
+    parts = [
+        *np.split(np.random.default_rng(4).normal(scale=400.0, size=(7, 3)), [1, 4]),
+        np.array([-np.inf, 2.0]),
+        np.full(3, -np.inf),
+        np.array([np.inf, 1.0]),
+        np.array([-1000.0]),
+        np.array([900.0, 1000.0]),
+    ]
+    expected = [special.logsumexp(part) - np.log(part.size) for part in parts]
+    assert log_means(parts) == pytest.approx(expected, rel=1e-12)
