@@ -25,6 +25,7 @@ from typing import Any
 import forked_commands
 import pytest
 import yaml
+from left_processes import describe, last_words
 from started_processes import started_processes
 
 pytest.importorskip("rclpy")
@@ -122,6 +123,7 @@ class Network:
     mark: str
     directory: Path
     traces: set[Path] = field(default_factory=set)  # what nobody should find after the end
+    commands: list[subprocess.Popen[str]] = field(default_factory=list)  # that it has started
     _looked: list[float] = field(default_factory=lambda: [0.0])
 
     def processes(self, *kinds: str) -> list[Process]:
@@ -169,13 +171,15 @@ class Network:
 
     def start(self, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
         """Start ``msg-agents`` with these arguments."""
-        return subprocess.Popen(
+        command = subprocess.Popen(
             [str(PROGRAM), *(str(argument) for argument in arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             env=os.environ | {"NO_COLOR": "1", **environment},
         )
+        self.commands.append(command)
+        return command
 
     def record(self, file: Path, *options: str | Path, **environment: str) -> subprocess.Popen[str]:
         """Start ``msg-agents run`` without a verdict."""
@@ -253,8 +257,12 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network
     network = Network(mark, tmp_path)
     yield network
     left = network.processes()
+    if left:
+        print(describe([process.pid for process in left], [path for path in network.traces if path.is_dir()]))
     for process in left:
         process.kill()
+    if left:
+        print(last_words(network.commands))
     assert not left, "processes outlived the test"
     assert [path for path in network.traces if path.exists()] == []
 

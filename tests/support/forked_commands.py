@@ -257,6 +257,7 @@ def main() -> None:
     for name in PREPARED:
         importlib.import_module(name)
     importlib.import_module(NODE_SERVER).prepare()
+    importlib.import_module("left_processes").show_stacks_when_asked()
     serve(socket.socket(fileno=int(sys.argv[1])), run)
 
 
