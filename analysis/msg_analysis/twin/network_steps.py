@@ -56,12 +56,12 @@ def _blocks(experiment: ValidExperiment, model: StepModel, modes: IntArray, firs
     noise = ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas)
     for begin in range(0, len(modes), STEPS_PER_BLOCK):
         now, number = modes[begin : begin + STEPS_PER_BLOCK], (first + begin) // STEPS_PER_BLOCK
-        of_agents = [noise.block(i, number) for i in range(model.agents)]
-        drives = np.empty((len(now), model.agents, experiment.run.replicas))
-        for mode in np.unique(now):
-            steps = np.flatnonzero(now == mode)
-            for i, of_agent in enumerate(of_agents):
-                drives[steps, i] = of_agent[mode][steps] + model.offsets[mode][i]
+        drives, steps = np.empty((len(now), model.agents, experiment.run.replicas)), np.arange(len(now))
+        for i in range(model.agents):
+            of_modes = noise.block(i, number)
+            alike = all(each is of_modes[0] for each in of_modes)
+            drives[:, i] = of_modes[0][: len(now)] if alike else np.stack(of_modes)[now, steps]
+            drives[:, i] += model.offsets[now, i][:, None]
         yield first + begin, now, drives
 
 

@@ -20,6 +20,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -316,17 +317,42 @@ def _make(directory: Path | None) -> Path | None:
 LONGEST_RECORD = 512 << 20  # bytes; those of large networks in discrete time hold the matrices of their steps
 
 
+_read_ahead: dict[Path, RunRecord] = {}
+
+
 def load_record(path: Path) -> RunRecord:
     """Read a run record from ``msg-agents prepare``; InputError if it cannot be read or is not one."""
-    from msg_analysis.common.bounded_input import read_text
+    from msg_analysis.model.run.record import RunRecord
+
+    return _read_ahead.get(path) or RunRecord.from_json(_text_of(path), str(path))
+
+
+def read_record_ahead(path: Path) -> None:
+    """Read a run record, and prepare its model, for the processes that this one forks: they need not do it again.
+
+    Not one with a protocol, whose code its user wrote: it is imported in the processes of the nodes only.
+    """
     from msg_analysis.errors import InputError
     from msg_analysis.model.run.record import RunRecord
 
+    if path in _read_ahead:
+        return
+    with suppress(InputError):  # the nodes will say it
+        text = _text_of(path)
+        if '"protocol": {' not in text:
+            record = RunRecord.from_json(text, str(path))
+            _ = record.model  # kept in the record
+            _read_ahead[path] = record
+
+
+def _text_of(path: Path) -> str:
+    from msg_analysis.common.bounded_input import read_text
+    from msg_analysis.errors import InputError
+
     try:
-        text = read_text(path, LONGEST_RECORD)
+        return read_text(path, LONGEST_RECORD)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error}): expected a run record from msg-agents prepare") from error
-    return RunRecord.from_json(text, str(path))
 
 
 def record_of(bag: Path | None, run_record: Path | None) -> RunRecord | None:

@@ -170,10 +170,15 @@ def _wake(environment: Mapping[str, str], control: socket.socket, output: IO[byt
     return server
 
 
-def serve(control: socket.socket, run: Callable[[Any, list[int]], object]) -> NoReturn:
+def serve(
+    control: socket.socket,
+    run: Callable[[Any, list[int]], object],
+    read_ahead: Callable[[Any], object] = lambda _: None,
+) -> NoReturn:
     """Fork processes as the other side requests it, and end when that does.
 
-    A forked process does ``run`` with its request and its descriptors. It is a child of our parent.
+    A forked process does ``run`` with its request and its descriptors. It is a child of our parent. Before, this
+    process does ``read_ahead`` with every request: what that leaves, the forked ones have.
     """
     gc.freeze()  # the collector writes to the objects that it looks at, and their memory would be copied
     gc.enable()
@@ -183,12 +188,15 @@ def serve(control: socket.socket, run: Callable[[Any, list[int]], object]) -> No
         message, descriptors, _, _ = socket.recv_fds(control, LONGEST, MOST_DESCRIPTORS)
         if not message:
             os._exit(0)
+        requests = json.loads(message)
+        for request, _ in requests:
+            read_ahead(request)
         try:
             between = os.fork()  # the parent of those that it forks, until it ends
         except OSError:
             os._exit(1)
         if not between:
-            _fork_each(control, json.loads(message), descriptors, run)
+            _fork_each(control, requests, descriptors, run)
         for descriptor in descriptors:
             os.close(descriptor)
         if os.waitpid(between, 0)[1]:

@@ -33,7 +33,6 @@ class ProcessNoise:
 
     def __init__(self, seed: int, noise_gain: FloatArray, replicas: int) -> None:
         self._shape = (STEPS_PER_BLOCK, replicas)
-        self._gain = noise_gain
         agents = noise_gain.shape[1]
         sources = int(np.count_nonzero(noise_gain.any(axis=0), axis=1).max(initial=1))
 
@@ -43,18 +42,24 @@ class ProcessNoise:
             return normals(seed, Stream.PROCESS, agent, block, self._shape)
 
         self._source = source
+        self._rows = lru_cache(maxsize=None)(lambda agent: _different_rows(noise_gain[:, agent]))
 
     def block(self, agent: int, block: int) -> list[FloatArray]:
         """For each mode, the noise of one agent (from 0) in one block of steps, (STEPS_PER_BLOCK, replicas).
 
         Modes with the same noise share one array.
         """
-        rows = self._gain[:, agent]
-        drawn = {key: self._combined(row, block) for key, row in {row.tobytes(): row for row in rows}.items()}
-        return [drawn[row.tobytes()] for row in rows]
+        rows, of_mode = self._rows(agent)
+        drawn = [
+            weighted_sum(weights, [self._source(j, block) for j in used]) if used else np.zeros(self._shape)
+            for used, weights in rows
+        ]
+        return [drawn[row] for row in of_mode]
 
-    def _combined(self, row: FloatArray, block: int) -> FloatArray:
-        used = np.flatnonzero(row)
-        if not used.size:
-            return np.zeros(self._shape)
-        return weighted_sum([float(row[j]) for j in used], [self._source(int(j), block) for j in used])
+
+def _different_rows(rows: FloatArray) -> tuple[list[tuple[list[int], list[float]]], list[int]]:
+    """Sources (from 0) and weights of each different one of an agent's rows (n, m), and for each mode which it is."""
+    number: dict[bytes, int] = {}
+    of_mode = [number.setdefault(row.tobytes(), len(number)) for row in rows]
+    different = [rows[of_mode.index(row)] for row in range(len(number))]
+    return [(np.flatnonzero(row).tolist(), row[row != 0.0].tolist()) for row in different], of_mode

@@ -222,7 +222,7 @@ class Agent(NetworkNode):
 
     def _take_over(self) -> bytes | None:
         """Resume from the last state that an earlier process published; its message, or None without one."""
-        published = self._published.read()
+        published = self._published.read() if self._published.found else []
         if published:
             step, message = published[-1][0], self._parts(published[-1][1])[0]
             frame = self._whole.unwrap(message)

@@ -1,0 +1,60 @@
+"""The run record of a node: read once for all that are forked, or by the node itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from msg_agents.cli import nodes
+from msg_agents.cli.nodes import load_record, read_record_ahead
+from msg_analysis.errors import InputError
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.twin.simulate import new_record
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nodes, "_read_ahead", {})
+
+
+def written(directory: Path, **changes: Any) -> Path:
+    graphs = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
+    switching = {"generator": [[-1, 1], [1, -1]]}
+    document = {"name": "net", "problem": "consensus", "time": "continuous", "graphs": graphs, "switching": switching}
+    run = {"dt": 0.05, "duration": 5, "start": [1.0, -1.0, 2.0]}
+    file = directory / "run.json"
+    file.write_text(new_record(ValidExperiment.parse({**document, **changes, "run": run})).to_json(with_key=True))
+    return file
+
+
+def test_read_once(tmp_path: Path) -> None:
+    file = written(tmp_path)
+    alone = load_record(file)
+    read_record_ahead(file)
+    known = load_record(file)
+    read_record_ahead(file)
+    assert load_record(file) is known
+    assert "model" in vars(known)
+    assert (known.to_json(with_key=True), known.key) == (alone.to_json(with_key=True), alone.key)
+    file.unlink()  # the processes that are forked need the file no more
+    assert load_record(file) is known
+
+
+def test_the_code_of_a_protocol_is_left_to_the_nodes(tmp_path: Path) -> None:
+    file = written(tmp_path, protocol={"name": "saturated"})
+    read_record_ahead(file)
+    file.unlink()
+    with pytest.raises(InputError, match=r"run\.json: cannot be read"):
+        load_record(file)
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"format": 1}', "\x00"])
+def test_what_is_no_record_is_an_error_of_the_node(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "run.json"
+    file.write_text(text)
+    read_record_ahead(file)
+    read_record_ahead(tmp_path / "missing.json")
+    with pytest.raises(InputError, match=r"run\.json: not a run record"):
+        load_record(file)
