@@ -37,6 +37,7 @@ class NewestValues(AgentInputs[Value]):
     def __init__(self, *, reach: Callable[[], int], **options: Any) -> None:
         super().__init__(**options)
         self._reach = reach
+        self._reached = NOTHING  # what ``reach`` gave when it was asked last: a clock is not read for every message
         self._values: dict[int, Value] = {}
         self._mode: int | None = None
         self._first_step = NOTHING  # of the newest sojourn
@@ -48,7 +49,7 @@ class NewestValues(AgentInputs[Value]):
         """
         if first_step <= self._first_step:
             return Refusal.REPEATED
-        if first_step > self._reach():
+        if not self._within_reach(first_step):
             return Refusal.TOO_EARLY
         self._mode, self._first_step = mode, first_step
         return None
@@ -61,11 +62,16 @@ class NewestValues(AgentInputs[Value]):
         if step <= newest:
             differs = step == newest and self._values.get(agent, value) != value
             return Refusal.CONTRADICTION if differs else Refusal.REPEATED
-        if step > self.steps or step > self._reach():
+        if step > self.steps or not self._within_reach(step):
             return Refusal.TOO_NEW
         self._newest[agent] = step
         self._values[agent] = value
         return None
+
+    def _within_reach(self, step: int) -> bool:
+        if step > self._reached:
+            self._reached = self._reach()
+        return step <= self._reached
 
     def known(self, agent: int) -> Value:
         """The newest value of an agent."""
@@ -73,7 +79,7 @@ class NewestValues(AgentInputs[Value]):
 
     def review(self) -> None:
         """Drop what is beyond ``reach``: it was taken before the epoch was known."""
-        reach = self._reach()
+        reach = self._reached = self._reach()
         for j, step in self._newest.items():
             if step > reach:
                 self._newest[j] = NOTHING

@@ -16,9 +16,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from typing import cast
 
-from rclpy.clock import Clock
+from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
@@ -33,14 +35,16 @@ class DueTimer:
     """
 
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:
-        self._clock = node.get_clock()
+        self._clock = cast(ROSClock, node.get_clock())
         self._callback = callback
         self._timer = node.create_timer(FAR_OFF, self._fire)
         self._timer.cancel()
 
     def now(self) -> int:
         """Time of the clock [ns]; 0 under use_sim_time until ``/clock`` has been received."""
-        return int(self._clock.now().nanoseconds)
+        if self._clock.ros_time_is_active:
+            return int(self._clock.now().nanoseconds)
+        return time.time_ns()  # what that clock reads then, in a third of the time
 
     def set(self, when: int, now: int | None = None) -> None:
         """Call back at time ``when`` of the clock [ns], at once if it has passed; ``now``: its time, if known."""
