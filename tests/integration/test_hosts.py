@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 import yaml
 from processors import another_processor
+from set_clock import SetClock
 
 from msg_agents.discovery.profiles import PROFILE_VARIABLES
 from msg_analysis.bags.reader import read_bag
@@ -234,32 +235,12 @@ def test_clocks_of_one_machine_agree(lan: Lan) -> None:
     assert json.loads(texts["left"][0])["clocks"] is None
 
 
-AHEAD = """
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <time.h>
-int clock_gettime(clockid_t clock, struct timespec *found) {
-    static int (*next)(clockid_t, struct timespec *);
-    if (!next) next = dlsym(RTLD_NEXT, "clock_gettime");
-    int failed = next(clock, found);
-    if (!failed && clock == CLOCK_REALTIME) {
-        found->tv_nsec += 200000000;
-        if (found->tv_nsec >= 1000000000) { found->tv_nsec -= 1000000000; found->tv_sec += 1; }
-    }
-    return failed;
-}
-"""
-
-
 def test_a_clock_that_is_ahead_is_found(lan: Lan) -> None:
     """That of the left host is 200 ms ahead of the others, by a library; dt / speed is 50 ms."""
-    if shutil.which("gcc") is None:
-        pytest.skip("no gcc, which makes a clock that is ahead")
-    library = lan.network.directory / "ahead.so"
-    command = ["gcc", "-shared", "-fPIC", "-o", library, "-x", "c", "-", "-ldl"]
-    subprocess.run(command, input=AHEAD, text=True, check=True)
+    clock = SetClock(lan.network.directory)
+    clock.set_ahead(0.2)
     prepare(lan, 10, run={"pace": "realtime"})
-    texts = ended(lan.start_all("--no-analyse", left={"LD_PRELOAD": str(library)}), 0)
+    texts = ended(lan.start_all("--no-analyse", left=clock.environment), 0)
     for entry in json.loads(texts["base"][0])["clocks"]:
         low, high = entry["ahead_ms"]
         assert low <= (200 if entry["node"] in ("agent_1", "agent_4") else 0) <= high

@@ -6,6 +6,7 @@ makes of it, to the last bit.
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import re
@@ -21,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from set_clock import SetClock
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
@@ -214,3 +216,15 @@ def test_two_runs_at_the_same_time(network: Any) -> None:
     assert {trajectory.record.experiment.run.seed for trajectory in trajectories} == {1, 2}
     for trajectory in trajectories:
         assert_possible(trajectory)
+
+
+def test_the_clock_is_set_back(network: Any) -> None:
+    """By three seconds, for all processes of the run: it says so, waits, and its log is possible."""
+    clock = SetClock(network.directory)
+    run = network.record(network.file(run=REALTIME | {"duration": 15}), "--json", **clock.environment)
+    network.wait_until_moving()
+    clock.set_ahead(-3.0)
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 0, stderr
+    assert re.search(r"note: the clock of this machine was set back by 3\.0 s: no step is due", stderr)
+    assert_possible(read_bag(json.loads(stdout)["bag"]))

@@ -44,7 +44,7 @@ from msg_agents.running.run_folder import make_bag_directory, workshop
 from msg_agents.running.run_result import RunResult
 from msg_agents.running.supervisor import ACCOUNTS, CLOCKS, CRASHED, STEPS, Supervisor
 from msg_agents.running.surroundings import ROS_LOGS, surroundings, will_introduce
-from msg_agents.stepping.stall_detection import LagDetector, StallDetector
+from msg_agents.stepping.stall_detection import ClockDetector, LagDetector, StallDetector
 from msg_agents.terminal.interruption import Interruption
 from msg_agents.watching.early_end import EarlyEnd
 from msg_agents.watching.view import View
@@ -250,7 +250,7 @@ def _watch(
     began: float | None = None
     stall, steps, run = StallDetector(), experiment.steps, experiment.run
     due = run.speed / experiment.step_length  # steps per second in real time
-    lag = LagDetector(due) if run.pace == "realtime" and follow_clock else None
+    lag, clock = (LagDetector(due), ClockDetector()) if run.pace == "realtime" and follow_clock else (None, None)
     events, warned = EventLog(result.events), None
     while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
         time.sleep(POLL)
@@ -263,6 +263,9 @@ def _watch(
             view.note(warned)
         view.look(supervisor.steps)
         reached = min(supervisor.steps, default=-1)
+        if clock and (words := clock.update()):
+            view.note(words)
+            lag = LagDetector(due)
         if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
             view.note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor, result.experiment.names)}")
         if reached < 0:

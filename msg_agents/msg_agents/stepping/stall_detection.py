@@ -12,7 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Stalls and lags: steps per second, and when to warn that there are none, or fewer than in real time."""
+"""Stalls and lags: steps per second, and when to warn that there are none, or fewer than in real time.
+
+Steps in real time follow the clock of the system, which can be set while they do.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +24,7 @@ import time
 STALL_TIME = 5.0  # s without a step, after which an agent counts as stalled
 LAG_TIME = 2.0
 """s by which a run in real time is behind its clock after which it counts as too slow; agents report every 0.2 s."""
+CLOCK_STEP = 0.5  # s by which the clock must have been set to be noted
 
 
 class StallDetector:
@@ -67,3 +71,26 @@ class LagDetector:
             return None
         self._next_warning = 2.0 * behind
         return behind
+
+
+class ClockDetector:
+    """Notices that the clock of this machine has been set, by comparison with the one that nobody sets."""
+
+    def __init__(self) -> None:
+        self._apart = time.time() - time.monotonic()
+
+    def update(self) -> str | None:
+        """What has happened since the last call, in words."""
+        before, self._apart = self._apart, time.time() - time.monotonic()
+        forward = self._apart - before
+        if abs(forward) < CLOCK_STEP:
+            return None
+        if forward > 0.0:
+            return (
+                f"the clock of this machine was set forward by {forward:.1f} s, or the machine slept: the steps of "
+                "that time are made at once, too late"
+            )
+        return (
+            f"the clock of this machine was set back by {-forward:.1f} s: no step is due until it is there again, "
+            "since steps in real time follow it; a new run begins at once"
+        )

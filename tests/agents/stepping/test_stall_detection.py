@@ -8,14 +8,15 @@ from types import SimpleNamespace
 import pytest
 
 from msg_agents.stepping import stall_detection
-from msg_agents.stepping.stall_detection import LagDetector, StallDetector
+from msg_agents.stepping.stall_detection import ClockDetector, LagDetector, StallDetector
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """A clock to be set; it begins at 100 s."""
-    found = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(stall_detection, "time", SimpleNamespace(monotonic=lambda: found.now))
+    """A clock to be set; it begins at 100 s. ``wall``: that of the system."""
+    found = SimpleNamespace(now=100.0, wall=1e9)
+    times = SimpleNamespace(monotonic=lambda: found.now, time=lambda: found.wall)
+    monkeypatch.setattr(stall_detection, "time", times)
     assert time.monotonic is not stall_detection.time.monotonic
     return found
 
@@ -44,3 +45,19 @@ def test_a_run_at_half_the_speed(clock: SimpleNamespace) -> None:
         if behind := detector.update(50 * second):
             told.append((second, behind))
     assert told == [(4, 2.0), (8, 4.0), (16, 8.0), (32, 16.0)]
+
+
+def test_a_clock_that_is_set(clock: SimpleNamespace) -> None:
+    detector, told = ClockDetector(), []
+    for tick in range(1, 1001):  # 20 ms each; the clock is slewed by 10 %, which is no step
+        clock.now, clock.wall = 100.0 + 0.02 * tick, clock.wall + 0.022
+        if tick == 400:
+            clock.wall -= 3600.0
+        if tick == 700:
+            clock.wall += 2.5
+        if tick == 800:
+            clock.wall -= 0.4
+        if words := detector.update():
+            told.append((tick, words.partition(":")[0]))
+    set_forward = "the clock of this machine was set forward by 2.5 s, or the machine slept"
+    assert told == [(400, "the clock of this machine was set back by 3600.0 s"), (700, set_forward)]
