@@ -206,7 +206,7 @@ def _jump(a: FloatArray, b: FloatArray, radius: float, label: str, title: str, m
         f'stroke-width="1.5"{mark}/>'
         f'<path d="M{_at(end)}L{_at(left)}L{_at(right)}Z" fill="var(--soft)"/>'
         f'<text x="{middle[0]:.1f}" y="{middle[1]:.1f}" font-size="13" fill="var(--ink)" text-anchor="middle" '
-        'stroke="var(--page)" stroke-width="5" paint-order="stroke" dominant-baseline="central">'
+        'stroke="var(--page)" stroke-width="8" paint-order="stroke" dominant-baseline="central">'
         f"{escape(label)}</text></g>"
     )
 
