@@ -46,7 +46,7 @@ def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> 
         title="share of time",
         y_range=Range1d(len(names) - 0.4, -0.6),
         toolbar_location=None,
-        x_axis_label="line: predicted",
+        x_axis_label="bar: measured; mark: predicted",
     )
     most = 1.12 * max(share.max(), stationary.max())
     shares.x_range = Range1d(0.0, float(most))
