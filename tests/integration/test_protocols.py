@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import yaml
 
+from msg_agents.processes import hung_process
+from msg_agents.running import supervisor
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import ValidExperiment
@@ -27,6 +29,22 @@ class Broken(Protocol):
     def step(self, k, mode, state, heard, noise):
         if k == 17 and self.agent == 2:
             ctypes.CDLL(None)._exit(0)  # os._exit would be an error of the protocol
+        return state
+"""
+HANGING = """
+import os
+import threading
+from pathlib import Path
+from msg_analysis.protocol import Protocol
+
+class Broken(Protocol):
+    def step(self, k, mode, state, heard, noise):
+        mark = Path(os.environ["HANGING"])
+        if k == 1000 and self.agent == 2 and not mark.exists():
+            mark.touch()
+            lock = threading.Lock()
+            lock.acquire()
+            lock.acquire()
         return state
 """
 BROKEN = """
@@ -98,6 +116,22 @@ def test_a_protocol_that_ends_its_process(network: Any) -> None:
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 3, stderr
     assert "failed: agents_3_to_5: exit code 0 before its last step" in stderr
+
+
+@pytest.mark.parametrize("restarts", [3, 0])
+def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, restarts: int) -> None:
+    """Once: its process is ended and comes back. Without restarts the run ends. Nobody waits for ever."""
+    for module in (hung_process, supervisor):
+        monkeypatch.setattr(module, "HUNG", 3.0)
+    packages = _install(network, HANGING)
+    monkeypatch.syspath_prepend(packages)
+    what = network.experiment(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
+    environment = {"PYTHONPATH": str(packages), "HANGING": str(network.directory / "mark")}
+    result = network.run(what, restarts=restarts, environment=environment)
+    words = "agents_3_to_5: hung, its main thread has not run for 3 s"
+    assert [line.startswith(words) for line in result.restarts] == ([True] if restarts else [])
+    assert any(line.startswith(words) for line in result.failures) == (not restarts)
+    assert result.trajectory.completeness.complete == bool(restarts)
 
 
 def test_a_protocol_that_fails(network: Any) -> None:

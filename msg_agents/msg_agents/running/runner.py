@@ -180,6 +180,7 @@ def run_network(
                         last_step=experiment.steps,
                         fork_server=fork_server,
                         introducer=around.introducer,
+                        ends_hung=share is None,  # with several hosts, the switcher waits for others at its end
                     ) as supervisor,
                 ):
                     plans = plan_network(

@@ -33,6 +33,7 @@ from typing import Any, Self
 from msg_agents.discovery.introducer import Introducer
 from msg_agents.processes.core_pinning import keep_to
 from msg_agents.processes.fork_server import NodeServer, NodeStart
+from msg_agents.processes.hung_process import HUNG, HungDetector
 from msg_agents.processes.process_plan import CHANNEL, RECORDER, SWITCHER, ProcessPlan
 from msg_agents.processes.status_file import Account, read_accounts, read_clocks, read_steps
 from msg_analysis.common.forked_processes import Process
@@ -42,6 +43,7 @@ ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0)
 
 AT_ONCE = 50  # processes that are started together: so many log files are then open
 POLL = 0.02  # s
+LOOK = 1.0  # s between two looks whether processes have hung
 SILENCE = 3.0  # s; accounts are written once a second
 CHANNEL_SILENCE = 10.0  # s after which a channel that reports nothing is given up
 EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
@@ -67,6 +69,7 @@ class Child:
     number: int = 1  # of this start; 2: restarted once
     ended: float | None = None  # when it was first seen to have ended with exit code 0 [s]
     early: bool = False  # whether it did so before its last step
+    detector: HungDetector | None = None  # None: it is not watched
     given_up: str | None = None  # why it was ended
 
     @property
@@ -135,9 +138,11 @@ class Supervisor:
     introducer: Introducer | None = None  # without one, the children look for each other
     namespaces: Mapping[str, int] = field(default_factory=dict)  # descriptors by name of the process; else that of ours
     options: Mapping[str, Sequence[str]] = field(default_factory=dict)  # more of them, by name of the process
+    ends_hung: bool = False  # whether processes that have hung are ended
     channel: Child | None = None  # carries the packets of the others; not one of ``children``: it has no part to do
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
+    _looked: float = field(default=0.0, init=False)  # for processes that have hung [s of the monotonic clock]
     _control: socket.socket | None = field(default=None, init=False)  # of the channel, which ends when it is closed
 
     def start(self, plans: Sequence[ProcessPlan]) -> None:
@@ -175,7 +180,9 @@ class Supervisor:
                 processes += self.fork_server.fork_nodes(starts)
             processes += [self._spawn(start) for start in starts[len(processes) :]]
         return [
-            Child(plan, process, self._log(plan), number)
+            Child(
+                plan, process, self._log(plan), number, detector=HungDetector(process.pid) if self.ends_hung else None
+            )
             for (plan, number), process in zip(plans, processes, strict=True)
         ]
 
@@ -220,6 +227,7 @@ class Supervisor:
         if self.channel and CHANNEL_SILENCE < self.channel.age_of_account < math.inf and self.channel.running:
             self.channel.given_up = f"no report for {CHANNEL_SILENCE:g} s, as if it was stopped"
             self.channel.process.send_signal(signal.SIGKILL)
+        self._end_hung()
         switching = any(child.running for child in self.children if child.plan.name == SWITCHER)
         for child in self.children:
             if not self.steps or not switching or not child.plan.agents or child.process.poll() != 0:
@@ -227,6 +235,17 @@ class Supervisor:
             child.ended = child.ended or time.monotonic()
             behind = min(self.steps[agent] for agent in child.plan.agents) < self.last_step
             child.early = behind and time.monotonic() > child.ended + EARLY
+
+    def _end_hung(self) -> None:
+        """End processes that have hung: the others would wait for them for ever."""
+        if time.monotonic() < self._looked + LOOK:
+            return
+        self._looked = time.monotonic()
+        for child in self.running:
+            if child.detector is not None and child.detector.update():
+                child.given_up = f"hung, its main thread has not run for {HUNG:g} s"
+                child.process.send_signal(signal.SIGKILL)
+                child.process.wait()
 
     @property
     def by_node(self) -> dict[str, Process]:

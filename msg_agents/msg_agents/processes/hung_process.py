@@ -1,0 +1,58 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether a process has hung: its main thread waits, and has not run for a minute, though nobody has stopped it.
+
+The main thread of a node that waits for others, for its clock, or for a slow reader still runs several times a second.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+
+HUNG = 60.0  # s
+LONGEST_LOOK = 2.0  # s that count at most between two looks: this process may have been stopped with the other
+WAITS = "S"  # of the states of proc(5): neither running, nor waiting for a disk, stopped or traced
+
+
+class HungDetector:
+    """Watches one process; where the system does not say when threads run, no process has ever hung."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._ran: str | None = None  # ns for which its main thread had run when it was looked at
+        self._looked, self._latest, self._still = time.monotonic(), time.time(), 0.0
+
+    def update(self) -> bool:
+        """Look at it, about once a second; whether it has hung."""
+        now, before, self._ran = time.monotonic(), self._ran, _run_time(self._pid)
+        elapsed, self._looked = min(now - self._looked, LONGEST_LOOK), now
+        # The system's clock may have been set back. Waits of the middleware then last until it is there again.
+        wall = time.time()
+        counts = wall >= self._latest and self._ran is not None and self._ran == before
+        self._latest = max(wall, self._latest)
+        self._still = self._still + elapsed if counts else 0.0
+        return self._still >= HUNG
+
+
+def _run_time(pid: int) -> str | None:
+    """For how long the main thread of a process has run [ns], if it waits now and the system counts that (Linux)."""
+    thread = Path(f"/proc/{pid}/task/{pid}")
+    with contextlib.suppress(OSError, IndexError):
+        state = (thread / "stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[0]
+        ran = (thread / "schedstat").read_text(encoding="ascii").split()[0]
+        return ran if state == WAITS and ran != "0" else None
+    return None
