@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -130,8 +131,10 @@ def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, re
     result = network.run(what, restarts=restarts, environment=environment)
     words = "agents_3_to_5: hung, its main thread has not run for 3 s"
     assert [line.startswith(words) for line in result.restarts] == ([True] if restarts else [])
-    assert any(line.startswith(words) for line in result.failures) == (not restarts)
+    assert (f"{words}: log/agents_3_to_5.log has the stacks of its threads" in result.failures) == (not restarts)
     assert result.trajectory.completeness.complete == bool(restarts)
+    log = (result.bag / "log/agents_3_to_5.log").read_text()
+    assert re.search(r"most recent call first.*broken_module\.py\", line 14 in step\n", log, re.DOTALL)
 
 
 def test_a_protocol_that_fails(network: Any) -> None:

@@ -30,6 +30,7 @@ from typing import Any
 
 from msg_agents.cli.servers.node_server import serve_waiting
 from msg_agents.processes.fork_server import leave_one_waiting, serve
+from msg_agents.processes.hung_process import show_stacks_when_asked
 from msg_analysis.common.forked_processes import ALL_FORKED, LONGEST, adopt_orphans
 
 MARK = "MSG_AGENTS_TEST"
@@ -257,7 +258,7 @@ def main() -> None:
     for name in PREPARED:
         importlib.import_module(name)
     importlib.import_module(NODE_SERVER).prepare()
-    importlib.import_module("left_processes").show_stacks_when_asked()
+    show_stacks_when_asked()
     serve(socket.socket(fileno=int(sys.argv[1])), run)
 
 

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import os
-import signal
 import subprocess
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-ASKED = signal.SIGUSR2
+from msg_agents.processes.hung_process import SHOW_STACKS
+
 ANSWER = 0.5  # s that they have to write their stacks
 LONGEST = 6000  # characters of a file
-
-
-def show_stacks_when_asked() -> None:
-    """Let this process, and what it forks, write its stacks to its stderr when it gets the signal ``ASKED``."""
-    faulthandler.register(ASKED)
 
 
 def describe(pids: Sequence[int], folders: Iterable[Path]) -> str:
@@ -27,7 +21,7 @@ def describe(pids: Sequence[int], folders: Iterable[Path]) -> str:
     for pid in pids:
         if _can_answer(pid):
             with contextlib.suppress(OSError):
-                os.kill(pid, ASKED)
+                os.kill(pid, SHOW_STACKS)
     time.sleep(ANSWER)
     for folder in folders:
         for path in sorted([*folder.rglob("*.log"), *folder.rglob("*.json")]):
@@ -57,5 +51,5 @@ def _can_answer(pid: int) -> bool:
     """Whether the signal would not end it."""
     with contextlib.suppress(OSError):
         fields = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
-        return bool(int(fields["SigCgt"], 16) >> (ASKED - 1) & 1)
+        return bool(int(fields["SigCgt"], 16) >> (SHOW_STACKS - 1) & 1)
     return False

@@ -42,6 +42,7 @@ from msg_agents.nodes.peer_presence import PeerPresence
 from msg_agents.nodes.ros.node_parameters import ros_arguments
 from msg_agents.processes.environment import discovery_scope
 from msg_agents.processes.fork_server import ends_at_once
+from msg_agents.processes.hung_process import show_stacks_when_asked
 from msg_agents.recovery.takeover import Takeover
 from msg_analysis.errors import InputError
 
@@ -101,6 +102,7 @@ def run_nodes(
 
     NotFoundError: names the missing nodes. InputError: names that several nodes have, or what a node failed with.
     """
+    show_stacks_when_asked()
     # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
     # installed on top, ends the spin between two callbacks.
     told: list[int] = []

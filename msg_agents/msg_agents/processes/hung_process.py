@@ -20,12 +20,22 @@ The main thread of a node that waits for others, for its clock, or for a slow re
 from __future__ import annotations
 
 import contextlib
+import faulthandler
+import io
+import signal
 import time
 from pathlib import Path
 
 HUNG = 60.0  # s
+SHOW_STACKS = signal.SIGUSR1  # makes a node write what its threads are doing
 LONGEST_LOOK = 2.0  # s that count at most between two looks: this process may have been stopped with the other
 WAITS = "S"  # of the states of proc(5): neither running, nor waiting for a disk, stopped or traced
+
+
+def show_stacks_when_asked() -> None:
+    """Let this process, and what it forks, write the stacks of its threads to stderr when it gets SHOW_STACKS."""
+    with contextlib.suppress(RuntimeError, io.UnsupportedOperation):  # it has no stderr
+        faulthandler.register(SHOW_STACKS)
 
 
 class HungDetector:

@@ -33,13 +33,16 @@ from typing import Any, Self
 from msg_agents.discovery.introducer import Introducer
 from msg_agents.processes.core_pinning import keep_to
 from msg_agents.processes.fork_server import NodeServer, NodeStart
-from msg_agents.processes.hung_process import HUNG, HungDetector
+from msg_agents.processes.hung_process import HUNG, SHOW_STACKS, HungDetector
 from msg_agents.processes.process_plan import CHANNEL, RECORDER, SWITCHER, ProcessPlan
 from msg_agents.processes.status_file import Account, read_accounts, read_clocks, read_steps
 from msg_analysis.common.forked_processes import Process
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
 """Signals and the seconds that a process has to obey each."""
+
+AFTER_HANG = ((SHOW_STACKS, 0.5), (signal.SIGKILL, 5.0))
+"""The same for a process that has hung."""
 
 AT_ONCE = 50  # processes that are started together: so many log files are then open
 POLL = 0.02  # s
@@ -71,6 +74,7 @@ class Child:
     early: bool = False  # whether it did so before its last step
     detector: HungDetector | None = None  # None: it is not watched
     given_up: str | None = None  # why it was ended
+    hung: bool = False  # whether that is why
 
     @property
     def running(self) -> bool:
@@ -114,7 +118,9 @@ class Child:
         return code < 0 or (code == CRASHED and self.number == 1)
 
     def last_words(self) -> str:
-        """The last line that it printed."""
+        """The last line that it printed, or where to look."""
+        if self.hung:
+            return f"log/{self.log.name} has the stacks of its threads"
         with contextlib.suppress(OSError):
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             return lines[-1] if lines else ""
@@ -244,8 +250,8 @@ class Supervisor:
         for child in self.running:
             if child.detector is not None and child.detector.update():
                 child.given_up = f"hung, its main thread has not run for {HUNG:g} s"
-                child.process.send_signal(signal.SIGKILL)
-                child.process.wait()
+                child.hung = True
+                self._end([child], AFTER_HANG)
 
     @property
     def by_node(self) -> dict[str, Process]:
@@ -302,8 +308,8 @@ class Supervisor:
             self._end([self.channel])
 
     @staticmethod
-    def _end(children: Sequence[Child]) -> None:
-        for number, patience in ESCALATION:
+    def _end(children: Sequence[Child], escalation: Sequence[tuple[signal.Signals, float]] = ESCALATION) -> None:
+        for number, patience in escalation:
             for child in children:
                 if child.running:
                     child.process.send_signal(number)
