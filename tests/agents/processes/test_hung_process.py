@@ -7,9 +7,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from waiting import wait_for
 
 from msg_agents.processes import hung_process
 from msg_agents.processes.hung_process import LONGEST_LOOK, HungDetector
@@ -86,7 +88,10 @@ def test_neither_a_sleep_of_ours_nor_a_clock_that_is_set_back_counts(
     clock = SimpleNamespace(now=100.0, wall=1e9)
     times = SimpleNamespace(monotonic=lambda: clock.now, time=lambda: clock.wall)
     monkeypatch.setattr(hung_process, "time", times)
-    detector = HungDetector(start(BLOCKED).pid)
+    process = start(BLOCKED)
+    state = Path(f"/proc/{process.pid}/stat")
+    wait_for(lambda: state.read_text().rpartition(")")[2].split()[0] == "S")  # on a busy machine it may still run
+    detector = HungDetector(process.pid)
 
     def passes(seconds: float, wall: float | None = None) -> bool:
         clock.now, clock.wall = clock.now + seconds, clock.wall + (seconds if wall is None else wall)
