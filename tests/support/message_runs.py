@@ -46,11 +46,12 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
 
     transition = scipy.linalg.expm(dt * law.chain.matrix)
     shares = np.linalg.matrix_power(transition, 4096)[0]
+    up_to = transition.cumsum(axis=1)
     modes = np.empty(steps, dtype=np.int64)
     mode = random.choice(len(shares), p=shares)
     for k in range(steps):
         modes[k] = mode
-        mode = random.choice(len(shares), p=transition[mode])
+        mode = int(up_to[mode].searchsorted(random.random() * up_to[mode, -1], side="right"))
 
     links = sorted({(i, j) for graph in senders for i in range(m) for j in graph[i]})
     lost = {link: lost_messages(random, law.loss[link], noise.burst, steps + 1) for link in links}
@@ -80,11 +81,12 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
     gone = np.zeros((steps, m, most), dtype=bool)
     newest = dict.fromkeys(links, 0)
     order = np.lexsort((np.tile(np.arange(m), steps), np.repeat(np.arange(steps), m), due.ravel()))
-    reference = law.reference
+    gives = [law.reference * (1.0 - w.sum(axis=1)) for w in weights]  # the reference to each agent
     for k, i in np.column_stack(np.unravel_index(order, (steps, m))).tolist():
-        w, own = weights[modes[k], i], states[k, i]
-        total = own * w[i] + reference * (1.0 - w.sum())
-        for d, j in enumerate(senders[modes[k]][i]):
+        mode, own = modes[k], states[k, i]
+        w = weights[mode, i]
+        total = own * w[i] + gives[mode][i]
+        for d, j in enumerate(senders[mode][i]):
             n = k
             if real_time:
                 while newest[i, j] < steps and _there(newest[i, j] + 1, made[k + 1, i], made[:, j], arrives[i, j]):
