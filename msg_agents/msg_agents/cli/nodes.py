@@ -317,7 +317,7 @@ def _make(directory: Path | None) -> Path | None:
 LONGEST_RECORD = 512 << 20  # bytes; those of large networks in discrete time hold the matrices of their steps
 
 
-_read_ahead: dict[Path, RunRecord] = {}
+_read_ahead: dict[Path, RunRecord] = {}  # in a fork server, and in what it has forked
 
 
 def load_record(path: Path) -> RunRecord:
