@@ -259,9 +259,8 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network
     left = network.processes()
     if left:
         print(describe([process.pid for process in left], [path for path in network.traces if path.is_dir()]))
-    for process in left:
-        process.kill()
-    if left:
+        for process in left:
+            process.kill()
         print(last_words(network.commands))
     assert not left, "processes outlived the test"
     assert [path for path in network.traces if path.exists()] == []

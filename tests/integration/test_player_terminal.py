@@ -14,14 +14,10 @@ from typing import Any
 import pytest
 from recorded import contents, mcap
 from terminal import Terminal
+from waiting import state_of
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 SINGLE_KEYS = 0  # of ICANON and ECHO
-
-
-def state(pid: int) -> str:
-    """Of a process: T if it is stopped."""
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
 @pytest.fixture
@@ -142,13 +138,13 @@ def test_stopped_and_continued(network: Any, twin_bag: Path, terminal: Any, monk
     stood = 0.0
     for continued in (b"fg\n", b"bg\n"):
         screen.type(b"\x1a")
-        network.wait_for(lambda: state(player.pid) == "T", 10, "a stopped player")
+        network.wait_for(lambda: state_of(player.pid) == "T", 10, "a stopped player")
         standing = time.monotonic()
         assert screen.local_flags() == usual
         screen.read(1.5)
         stood += time.monotonic() - standing
         screen.type(continued)
-        network.wait_for(lambda: state(player.pid) != "T", 10, "a player that goes on")
+        network.wait_for(lambda: state_of(player.pid) != "T", 10, "a player that goes on")
     assert screen.local_flags() == usual
     screen.type(b"fg\n")
     network.wait_for(lambda: screen.local_flags() == SINGLE_KEYS, 10, "single keys")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import state_of
 
 from msg_agents.running.run_folder import PREFIX
 
@@ -74,7 +75,7 @@ def test_the_command_is_ended_while_readers_are_stopped(
         states = []
         for process in network.processes():
             try:
-                states.append(Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0])
+                states.append(state_of(process.pid))
             except OSError:
                 continue
         return "T" in states

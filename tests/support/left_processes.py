@@ -9,6 +9,8 @@ import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from waiting import state_of
+
 from msg_agents.processes.hung_process import SHOW_STACKS
 
 ANSWER = 0.5  # s that they have to write their stacks
@@ -42,8 +44,7 @@ def last_words(commands: Iterable[subprocess.Popen[str]]) -> str:
 def _state(pid: int) -> str:
     """As the system sees it, and in which of its functions it waits."""
     with contextlib.suppress(OSError):
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        return f"{state} {Path(f'/proc/{pid}/wchan').read_text()}"
+        return f"{state_of(pid)} {Path(f'/proc/{pid}/wchan').read_text()}"
     return "gone"
 
 

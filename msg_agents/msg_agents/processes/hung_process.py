@@ -46,8 +46,8 @@ class HungDetector:
         self._ran: str | None = None  # ns for which its main thread had run when it was looked at
         self._looked, self._latest, self._still = time.monotonic(), time.time(), 0.0
 
-    def update(self) -> bool:
-        """Look at it, about once a second; whether it has hung."""
+    def update(self) -> str | None:
+        """Look at it, about once a second; in words that it has hung, or None."""
         now, before, self._ran = time.monotonic(), self._ran, _run_time(self._pid)
         elapsed, self._looked = min(now - self._looked, LONGEST_LOOK), now
         # The system's clock may have been set back. Waits of the middleware then last until it is there again.
@@ -55,7 +55,7 @@ class HungDetector:
         counts = wall >= self._latest and self._ran is not None and self._ran == before
         self._latest = max(wall, self._latest)
         self._still = self._still + elapsed if counts else 0.0
-        return self._still >= HUNG
+        return f"hung, its main thread has not run for {HUNG:g} s" if self._still >= HUNG else None
 
 
 def _run_time(pid: int) -> str | None:

@@ -33,7 +33,7 @@ from typing import Any, Self
 from msg_agents.discovery.introducer import Introducer
 from msg_agents.processes.core_pinning import keep_to
 from msg_agents.processes.fork_server import NodeServer, NodeStart
-from msg_agents.processes.hung_process import HUNG, SHOW_STACKS, HungDetector
+from msg_agents.processes.hung_process import SHOW_STACKS, HungDetector
 from msg_agents.processes.process_plan import CHANNEL, RECORDER, SWITCHER, ProcessPlan
 from msg_agents.processes.status_file import Account, read_accounts, read_clocks, read_steps
 from msg_analysis.common.forked_processes import Process
@@ -72,9 +72,11 @@ class Child:
     number: int = 1  # of this start; 2: restarted once
     ended: float | None = None  # when it was first seen to have ended with exit code 0 [s]
     early: bool = False  # whether it did so before its last step
-    detector: HungDetector | None = None  # None: it is not watched
     given_up: str | None = None  # why it was ended
-    hung: bool = False  # whether that is why
+    detector: HungDetector = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.detector = HungDetector(self.process.pid)
 
     @property
     def running(self) -> bool:
@@ -118,9 +120,9 @@ class Child:
         return code < 0 or (code == CRASHED and self.number == 1)
 
     def last_words(self) -> str:
-        """The last line that it printed, or where to look."""
-        if self.hung:
-            return f"log/{self.log.name} has the stacks of its threads"
+        """The last line that it printed; none of one that was ended, since it did not say why."""
+        if self.given_up:
+            return ""
         with contextlib.suppress(OSError):
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             return lines[-1] if lines else ""
@@ -186,9 +188,7 @@ class Supervisor:
                 processes += self.fork_server.fork_nodes(starts)
             processes += [self._spawn(start) for start in starts[len(processes) :]]
         return [
-            Child(
-                plan, process, self._log(plan), number, detector=HungDetector(process.pid) if self.ends_hung else None
-            )
+            Child(plan, process, self._log(plan), number)
             for (plan, number), process in zip(plans, processes, strict=True)
         ]
 
@@ -233,7 +233,9 @@ class Supervisor:
         if self.channel and CHANNEL_SILENCE < self.channel.age_of_account < math.inf and self.channel.running:
             self.channel.given_up = f"no report for {CHANNEL_SILENCE:g} s, as if it was stopped"
             self.channel.process.send_signal(signal.SIGKILL)
-        self._end_hung()
+        if self.ends_hung and time.monotonic() >= self._looked + LOOK:
+            self._looked = time.monotonic()
+            self._end_hung()
         switching = any(child.running for child in self.children if child.plan.name == SWITCHER)
         for child in self.children:
             if not self.steps or not switching or not child.plan.agents or child.process.poll() != 0:
@@ -244,13 +246,9 @@ class Supervisor:
 
     def _end_hung(self) -> None:
         """End processes that have hung: the others would wait for them for ever."""
-        if time.monotonic() < self._looked + LOOK:
-            return
-        self._looked = time.monotonic()
         for child in self.running:
-            if child.detector is not None and child.detector.update():
-                child.given_up = f"hung, its main thread has not run for {HUNG:g} s"
-                child.hung = True
+            if words := child.detector.update():
+                child.given_up = f"{words} (stacks in log/{child.log.name})"
                 self._end([child], AFTER_HANG)
 
     @property

@@ -7,11 +7,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from waiting import wait_for
+from started_processes import started_processes
+from waiting import state_of, wait_for
 
 from msg_agents.processes import hung_process
 from msg_agents.processes.hung_process import LONGEST_LOOK, HungDetector
@@ -26,13 +26,11 @@ SLEEPING = "import time; print(flush=True)\nwhile True: time.sleep(0.02)"
 RUNNING = "print(flush=True)\nwhile True: pass"
 HUNG = 0.5  # s
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="machine: no /proc")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="this machine: no /proc")
 
 
 @pytest.fixture
 def start() -> Iterator[Callable[[str], subprocess.Popen[str]]]:
-    processes: list[subprocess.Popen[str]] = []
-
     def start(code: str) -> subprocess.Popen[str]:
         process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
         processes.append(process)
@@ -40,10 +38,8 @@ def start() -> Iterator[Callable[[str], subprocess.Popen[str]]]:
         assert process.stdout.readline() == "\n"
         return process
 
-    yield start
-    for process in processes:
-        process.kill()
-        process.communicate()
+    with started_processes() as processes:
+        yield start
 
 
 @pytest.fixture(autouse=True)
@@ -89,11 +85,10 @@ def test_neither_a_sleep_of_ours_nor_a_clock_that_is_set_back_counts(
     times = SimpleNamespace(monotonic=lambda: clock.now, time=lambda: clock.wall)
     monkeypatch.setattr(hung_process, "time", times)
     process = start(BLOCKED)
-    state = Path(f"/proc/{process.pid}/stat")
-    wait_for(lambda: state.read_text().rpartition(")")[2].split()[0] == "S")  # on a busy machine it may still run
+    wait_for(lambda: state_of(process.pid) == "S")  # on a busy machine it may still run
     detector = HungDetector(process.pid)
 
-    def passes(seconds: float, wall: float | None = None) -> bool:
+    def passes(seconds: float, wall: float | None = None) -> str | None:
         clock.now, clock.wall = clock.now + seconds, clock.wall + (seconds if wall is None else wall)
         return detector.update()
 

@@ -59,7 +59,8 @@ class ProcessNoise:
 
 def _different_rows(rows: FloatArray) -> tuple[list[tuple[list[int], list[float]]], list[int]]:
     """Sources (from 0) and weights of each different one of an agent's rows (n, m), and for each mode which it is."""
-    number: dict[bytes, int] = {}
-    of_mode = [number.setdefault(row.tobytes(), len(number)) for row in rows]
-    different = [rows[of_mode.index(row)] for row in range(len(number))]
-    return [(np.flatnonzero(row).tolist(), row[row != 0.0].tolist()) for row in different], of_mode
+    keys = [row.tobytes() for row in rows]
+    different = dict(zip(keys, rows, strict=True))
+    places = list(different)
+    used = [(np.flatnonzero(row).tolist(), row[row != 0.0].tolist()) for row in different.values()]
+    return used, [places.index(key) for key in keys]

@@ -6,10 +6,9 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from waiting import wait_for
+from waiting import state_of, wait_for
 
 from msg_agents.doctor.networks.fault_injection import FaultInjection
 from msg_agents.doctor.networks.fault_plan import Fault, FaultPlan
@@ -35,7 +34,7 @@ def injection(processes: Processes, *faults: Fault) -> FaultInjection:
 
 
 def stopped(process: subprocess.Popen[bytes]) -> bool:
-    return Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+    return state_of(process.pid) == "T"
 
 
 def test_a_kill_comes_when_all_agents_have_made_its_step(processes: Processes) -> None:
