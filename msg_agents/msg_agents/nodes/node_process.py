@@ -37,6 +37,7 @@ from rclpy.signals import SignalHandlerOptions
 from msg_agents.discovery.introducer import write_introduction
 from msg_agents.discovery.rtps import PREFIX_SIZE, remove_participant
 from msg_agents.nodes.diagnostics import HealthReporter
+from msg_agents.nodes.exit_timer import exit_after
 from msg_agents.nodes.network_node import ACK_TIMEOUT, NetworkNode
 from msg_agents.nodes.peer_presence import PeerPresence
 from msg_agents.nodes.ros.node_parameters import ros_arguments
@@ -206,11 +207,10 @@ def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -
     As long as an executor has a node, the middleware keeps it, and the others are not told.
     """
     # When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
-    # interpreter's lock held or after the interpreter has gone. Then only C code helps: an alarm, whose default action
-    # ends the process. Nothing is lost, because a complete process has delivered everything by now.
+    # interpreter's lock held or after the interpreter has gone. Then only C code helps. Nothing is lost, because a
+    # complete process has delivered everything by now.
     if complete:
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(LEAVE_GRACE)
+        exit_after(LEAVE_GRACE)
     else:
         faulthandler.dump_traceback_later(INTERRUPTED_GRACE, exit=True)
     if executor is not None:

@@ -56,8 +56,7 @@ ACCOUNTS, STEPS, CLOCKS = "accounts", "steps.json", "clocks.json"
 
 def failure_of(code: int) -> str | None:
     """How a process failed, in words, from its exit code or minus the signal that killed it; None if it ended well."""
-    # A process that has done its part and hangs in the middleware ends itself by an alarm: ``node_process.leave``.
-    if code in (0, -signal.SIGALRM):
+    if code == 0:
         return None
     return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
