@@ -50,6 +50,7 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "bags/format",
         "bags",
         "inference/statistics",
+        "inference/evidence",
         "inference/observed",
         "inference/hypothesis_tests",
         "inference/departures",

@@ -20,10 +20,11 @@ from msg_analysis.inference.departures.sojourns import PARTS, Sojourns
 from msg_analysis.inference.departures.stale_values import StaleValues
 from msg_analysis.inference.departures.standing_still import StandingStill
 from msg_analysis.inference.departures.swapped_graphs import SwappedGraphs
+from msg_analysis.inference.evidence.looks import Looks
+from msg_analysis.inference.evidence.mixture_evidence import variance_evidence
+from msg_analysis.inference.evidence.windows import WindowEvidence, Windows
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
-from msg_analysis.inference.statistics.mixture_evidence import variance_evidence
-from msg_analysis.inference.statistics.windows import WindowEvidence, Windows
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
@@ -78,7 +79,9 @@ def test_windows_are_those_of_a_loop(steps: int, size: int) -> None:
         there = [(level, first) for level, first in windows_of(steps) if first + 2**level <= windows.steps]
         assert sorted(found) == sorted(there)
         begun = [level for level, first in windows_of(steps) if first < windows.steps]
-        assert windows.begun().tolist() == [begun.count(level) for level in range(windows.levels)]
+        assert windows.begun(np.array(windows.steps)).tolist() == [
+            begun.count(level) for level in range(windows.levels)
+        ]
     assert windows.planned.tolist() == [
         [level for level, _ in windows_of(steps)].count(level) for level in range(windows.levels)
     ]
@@ -93,7 +96,8 @@ def test_the_evidence_of_windows_is_their_mean(seen: int) -> None:
     windows = Windows(50, 1)
     evidence = WindowEvidence(windows, 1)
     ended = windows.add(np.zeros((seen, 1)))
-    evidence.add(ended.level, (logs[ended.first] / (ended.level + 1))[:, None])
+    if seen:
+        evidence.add(ended, (logs[ended.first] / (ended.level + 1))[:, None], Looks.at_the_end(seen))
     levels = [
         [
             np.exp(logs[first] / (level + 1)) if first + 2**level <= seen else float(first >= seen)
@@ -145,7 +149,7 @@ def test_sojourns_are_counted_as_by_a_loop() -> None:
     path = chain(SLOW, 900, 2)
     sums = sojourns(SLOW, 900)
     for first in range(0, 900, 50):
-        sums.count(path[first : first + 51])
+        sums.count(path[first : first + 51], Looks.at_the_end(50))
     steps, left, age = np.zeros((2, PARTS)), np.zeros((2, PARTS)), 0
     for now, following in zip(path[:-1].tolist(), path[1:].tolist(), strict=True):
         # Part p has the ages by which at least p, and fewer than p + 1, eighths of the sojourns have ended.
@@ -160,7 +164,7 @@ def test_sojourns_are_counted_as_by_a_loop() -> None:
 def test_the_statistic_of_sojourns_is_that_of_a_table() -> None:
     path = chain(SLOW, 20_000, 4)
     sums = sojourns(SLOW, 20_000)
-    sums.count(path)
+    sums.count(path, Looks.at_the_end(len(path)))
     finding = sums.finding()
     assert finding is not None
     total = sum(
@@ -176,7 +180,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
     p = []
     for seed in range(200):
         sums = sojourns(transition, steps)
-        sums.count(chain(transition, steps, seed))
+        sums.count(chain(transition, steps, seed), Looks.at_the_end(steps))
         finding = sums.finding()
         assert finding is not None
         p.append(np.exp(finding.log_p))
@@ -185,7 +189,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
 
 def test_few_sojourns_are_not_tested() -> None:
     sums = sojourns(SLOW, 300)
-    sums.count(chain(SLOW, 300, 1))
+    sums.count(chain(SLOW, 300, 1), Looks.at_the_end(300))
     assert sums.finding() is None
 
 
@@ -244,7 +248,9 @@ def test_noise_over_time_by_lags(agent: int | None) -> None:
     white[:, which] *= np.sqrt(1.0 + size * np.sin(2.0 * np.pi * np.arange(1200) / 10.0))[:, None, None]
     sums = NoiseOverTime(Law(observation.step, 1200, 2, np.ones(5, dtype=bool), True, np.empty((0, 2), int), True))
     for first in range(0, 1200, 37):
-        part = SimpleNamespace(first=first, white=white[first : first + 37])
+        part = SimpleNamespace(
+            first=first, white=white[first : first + 37], looks=Looks.at_the_end(min(37, 1200 - first))
+        )
         sums.add(part)  # type: ignore[arg-type]
     squares = (white**2).sum(axis=2)
     squares = np.column_stack([squares, squares.sum(axis=1)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ from tests.support.line_and_ring import experiment
 
 from msg_analysis.inference.observed.observation import Observation, spaced_steps
 from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
-from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, kind_weights
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.sequential.law_questions import kind_weights
 from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence, any_time_evidence
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.inference.verdict.evidence import Evidence, usual_looks
@@ -50,10 +52,9 @@ def test_the_error_martingale_is_fair() -> None:
             after = system.matrices[g, 0, 0] * y + np.sqrt(system.noise[g, 0, 0]) * nodes
             for j in range(2):
                 for end, weight in zip(after, weights, strict=True):
-                    martingale.total[:] = 0.0
                     a, b = (np.array([[packed_symmetric.pack(np.array([[v * v]]))[0], 1.0]]) for v in (y, end))
-                    martingale.add(np.array([g]), np.array([j]), a, b)
-                    mean += system.chain[g, j] * weight * np.exp(martingale.total)
+                    step = martingale.steps(np.array([g]), np.array([j]), a, b)[0]
+                    mean += system.chain[g, j] * weight * np.exp(step)
             assert mean == pytest.approx(np.ones(len(mean)), abs=1e-8)
 
 
@@ -92,12 +93,12 @@ def test_sums_are_those_of_a_loop_over_the_steps(changes: dict[str, Any]) -> Non
             for j, part in parts.items():
                 score[i, j] += part * e / variance
                 information[i, j] += part**2 / variance
-    assert sums.squares == pytest.approx(squares)
-    assert sums.link_score == pytest.approx(score, abs=1e-9)
-    assert sums.link_information == pytest.approx(information, abs=1e-9)
+    assert sums.total.squares[0] == pytest.approx(squares)
+    assert sums.total.link_score[0] == pytest.approx(score, abs=1e-9)
+    assert sums.total.link_information[0] == pytest.approx(information, abs=1e-9)
     counts = np.zeros((2, 2))
     np.add.at(counts, (observation.modes[:-1], observation.modes[1:]), 1)
-    assert (sums.counts == counts).all()
+    assert (sums.total.counts[0] == counts).all()
 
 
 @pytest.mark.parametrize(
@@ -157,6 +158,34 @@ def test_what_never_moves_is_infinite_evidence() -> None:
     sums.add(same, 0, same.steps)
     assert sums.evidence() < 20.0
     assert "noise" in sums.families()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"run": {"replicas": 3}},
+        {"noise": {"loss": 0.3, "link": 0.2, "broadcast": 0.1}},
+        {"noise": {"process": [1.0, 0.0, 1.0, 1.0, 1.0], "delay": 2}},
+        {"run": {"pace": "realtime"}},
+    ],
+    ids=["plain", "replicas", "on the air", "an agent without noise", "real time"],
+)
+def test_many_looks_in_one_pass_are_those_of_a_pass_each(changes: dict[str, Any]) -> None:
+    """With innovations that are too large, an agent that stands still, and looks after 1 to 150 steps."""
+    observation = observed(experiment(duration=40.0, **changes))
+    observation.states[301, 2] += 3.0
+    observation.states[401:407, 3] = observation.states[400, 3]
+    looks = np.cumsum([1, 1, 2, 5, 3, 120, 150, 100, 7, 12, 1, 150])
+    looks = np.append(looks, observation.steps)
+    together = WatchedEvidence.of(observation, looks)
+    sums, one_by_one = EvidenceSums(observation.prediction, observation.replicas, in_detail=True), []
+    for first, last in pairwise([0, *looks.tolist()]):
+        sums.add(observation, first, last)
+        one_by_one.append(sums.evidence())
+    np.testing.assert_allclose(together.logarithms, one_by_one, rtol=1e-9, atol=1e-9)
+    for kind, logarithms in sums.families().items():
+        assert together.sums.families()[kind] == pytest.approx(logarithms, rel=1e-9, abs=1e-9), kind
 
 
 def test_in_a_comparison() -> None:

@@ -92,11 +92,11 @@ def test_steps_that_were_not_seen(name: str, tmp_path: Path) -> None:
     sums = live.evidence.sums
     both = [k for k in range(8000) if k not in hidden and k + 1 not in hidden]
     assert 0.95 * len(both) < live.evidence.count <= len(both)  # the last ones may wait for values
-    assert 0.85 * len(both) * 2 < sums.samples.min()
+    assert 0.85 * len(both) * 2 < sums.total.samples.min()
     if name != "real time":
-        assert sums.samples.max() < live.evidence.count * 2
+        assert sums.total.samples.max() < live.evidence.count * 2
     # What is there follows the law: chi-square, within five standard deviations of each agent.
-    assert (np.abs(sums.squares - sums.samples) < 5 * np.sqrt(2.0 * sums.samples)).all()
+    assert (np.abs(sums.total.squares - sums.total.samples) < 5 * np.sqrt(2.0 * sums.total.samples)).all()
     assert live.report().any_time.log_evidence < np.log(100.0)
 
 
@@ -108,11 +108,11 @@ def test_values_older_than_what_is_kept(tmp_path: Path, monkeypatch: pytest.Monk
     live, wanted = watched(run, tmp_path), whole_sums(run, predict(run.record.experiment))
     assert live.evidence is not None
     sums = live.evidence.sums
-    assert (sums.samples < wanted.samples).all()
-    assert (sums.samples > 0.5 * wanted.samples).all()
-    assert sums.lost.tolist() == wanted.lost.tolist()
-    assert sums.messages.tolist() == wanted.messages.tolist()
-    assert (np.abs(sums.squares - sums.samples) < 5 * np.sqrt(2.0 * sums.samples)).all()
+    assert (sums.total.samples < wanted.total.samples).all()
+    assert (sums.total.samples > 0.5 * wanted.total.samples).all()
+    assert sums.total.lost.tolist() == wanted.total.lost.tolist()
+    assert sums.total.messages.tolist() == wanted.total.messages.tolist()
+    assert (np.abs(sums.total.squares - sums.total.samples) < 5 * np.sqrt(2.0 * sums.total.samples)).all()
 
 
 def test_impossible_messages(tmp_path: Path) -> None:

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
-from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
-from msg_analysis.inference.statistics.mixture_evidence import (
+from msg_analysis.inference.evidence.mixture_evidence import (
     PROPORTION_STRENGTHS,
     ROW_STRENGTHS,
     SHARES,
@@ -19,6 +18,7 @@ from msg_analysis.inference.statistics.mixture_evidence import (
     row_evidence,
     variance_evidence,
 )
+from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
 
 
 def test_variances_are_mixed_with_the_inverse_gamma_law() -> None:
@@ -129,4 +129,4 @@ def test_means_of_parts_are_those_of_each() -> None:
         np.array([900.0, 1000.0]),
     ]
     expected = [special.logsumexp(part) - np.log(part.size) for part in parts]
-    assert log_means(parts) == pytest.approx(expected, rel=1e-12)
+    assert log_means([part[None] for part in parts])[0] == pytest.approx(expected, rel=1e-12)

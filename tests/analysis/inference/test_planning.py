@@ -127,7 +127,7 @@ def test_gains_have_the_information_of_a_run() -> None:
     (found,) = powers(experiment, Fault("gain", 0.5))
     assert (found.agent, found.sender) in {(0, 4), (4, 0)}  # only the ring has this link
     by_name = {test.name: test for test in found.tests}
-    measured = sums.link_information[0, 4] + sums.link_information[4, 0]
+    measured = sums.total.link_information[0, 0, 4] + sums.total.link_information[0, 4, 0]
     assert run.steps * by_name["innovations: gains"].noncentrality == pytest.approx(0.125 * measured, rel=0.05)
     assert by_name["innovations: gains"].dof == 5 + 8 + 10
     x, ring = run.states[:-1], run.modes == 1

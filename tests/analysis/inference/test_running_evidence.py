@@ -51,7 +51,7 @@ def test_is_the_sum_over_the_whole_run(pieces: int, missing: bool) -> None:
             prediction, observation.states[first : end + 1], observation.modes[first:end], observation.states[first]
         )
         expected.add(part, 0, end - first - (end < 2000))
-    assert seen.sums.counts.tolist() == expected.counts.tolist()
+    assert seen.sums.total.counts.tolist() == expected.total.counts.tolist()
     assert seen.look(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
 
 

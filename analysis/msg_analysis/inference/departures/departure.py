@@ -20,6 +20,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Self
 
+from msg_analysis.inference.evidence.looks import Looks
 from msg_analysis.inference.observed.heard_values import HeardValues
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.types import BoolArray, FloatArray, IntArray
@@ -35,6 +36,7 @@ class Block:
     scale: FloatArray  # (b, m) these standard deviations; infinite without noise
     after: FloatArray  # (b, m, R) states after the steps
     reception: HeardValues  # what was heard in the steps, and the states before them
+    looks: Looks  # when evidence is looked at, T times
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +79,8 @@ class Departure(ABC):
     test: str  # its name in the family of tests, and as a kind of evidence
 
     @abstractmethod
-    def add(self, block: Block) -> None:
-        """Add steps, which follow those that were added before."""
+    def add(self, block: Block) -> FloatArray:
+        """Add steps, which follow those that were added before: (T, ...) of ``evidence`` after each look."""
 
     @abstractmethod
     def merge(self, other: Self) -> None:

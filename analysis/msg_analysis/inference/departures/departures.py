@@ -45,10 +45,10 @@ class Departures:
             SwappedGraphs(law),
         ]
 
-    def add(self, block: Block) -> None:
-        """Add steps, which follow those that were added before."""
-        for kind in self.kinds:
-            kind.add(block)
+    def add(self, block: Block) -> dict[str, FloatArray]:
+        """Add steps, which follow those that were added before: (T, ...) of ``families`` after each look."""
+        each = {kind.test: kind.add(block) for kind in self.kinds}
+        return {test: logarithms for test, logarithms in each.items() if logarithms.size}
 
     def merge(self, other: Departures) -> None:
         """Add the sums of other runs of the same experiment, with other seeds."""
@@ -62,7 +62,7 @@ class Departures:
     def families(self) -> dict[str, FloatArray]:
         """For each kind the evidence on its questions, logarithms (questions, alternatives)."""
         each = {kind.test: kind.evidence() for kind in self.kinds}
-        return {test: logarithms for test, logarithms in each.items() if len(logarithms)}
+        return {test: logarithms for test, logarithms in each.items() if logarithms.size}
 
     def question(self, test: str, row: int, graphs: Sequence[str]) -> str | None:
         """What a row of ``families`` is about, with graphs by name; None where the kind is none of these."""

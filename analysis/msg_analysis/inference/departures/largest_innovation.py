@@ -22,9 +22,9 @@ from typing import Self
 import numpy as np
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Place, Question
+from msg_analysis.inference.evidence.event_evidence import EventEvidence
+from msg_analysis.inference.evidence.mixture_evidence import variance_evidence
 from msg_analysis.inference.statistics.distributions import log_normal_tail
-from msg_analysis.inference.statistics.event_evidence import EventEvidence
-from msg_analysis.inference.statistics.mixture_evidence import variance_evidence
 from msg_analysis.types import FloatArray
 
 LARGE = 4.0  # standard deviations; smaller innovations have the evidence 0
@@ -46,20 +46,22 @@ class LargestInnovation(Departure):
         self._samples = 0
         self._largest, self._agent, self._place, self._runs = 0.0, 0, Place(0, 0), 1
 
-    def add(self, block: Block) -> None:
+    def add(self, block: Block) -> FloatArray:
         """Look at the innovations of a block."""
-        white = block.white[:, self._agents]
+        white, looks = block.white[:, self._agents], block.looks
         if not white.size:
-            return
+            return np.empty((looks.count, 0, 1))
         self._samples += white.size
         sizes = np.abs(white)
-        large = sizes[sizes > LARGE]
-        self._evidence.add(white.size, variance_evidence(np.ones(len(large)), large**2)[:, 0])
+        large = sizes > LARGE
+        logarithms = variance_evidence(np.ones(int(large.sum())), sizes[large] ** 2)[:, 0]
+        seen, when = looks.lengths * white[0].size, looks.after(np.nonzero(large)[0])
         at = int(np.argmax(sizes))
         if not sizes.flat[at] <= abs(self._largest):  # also a NaN
             step, place, _ = np.unravel_index(at, white.shape)
             self._largest, self._agent = float(white.flat[at]), int(self._agents[place])
             self._place = Place(block.first + int(step) + 1, block.first + int(step) + 1)
+        return self._evidence.add(seen, logarithms, when)[:, None, None]
 
     def merge(self, other: Self) -> None:
         """The larger one."""

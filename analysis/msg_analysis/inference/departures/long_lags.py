@@ -24,8 +24,9 @@ import numpy as np
 import scipy.fft
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Question
+from msg_analysis.inference.evidence.looks import Looks
+from msg_analysis.inference.evidence.mixture_evidence import coefficient_evidence
 from msg_analysis.inference.statistics.distributions import log_normal_tail
-from msg_analysis.inference.statistics.mixture_evidence import coefficient_evidence
 from msg_analysis.types import FloatArray
 
 LAGS = 100
@@ -55,23 +56,24 @@ class LagSums:
         shape = (LAGS, columns)
         self.score, self.information, self.products = np.zeros(shape), np.zeros(shape), np.zeros(LAGS, np.int64)
 
-    def add(self, numbers: FloatArray) -> None:
-        """Add the products of numbers (b, columns, samples) with themselves and the earlier ones."""
+    def add(self, numbers: FloatArray, looks: Looks) -> tuple[FloatArray, FloatArray]:
+        """Add the products of numbers (b, columns, samples) with the earlier ones.
+
+        (T, 100, columns) each: ``score`` and ``information`` after each look.
+        """
         joined = np.concatenate([self._tail, numbers])
-        old, end = len(self._tail), len(joined)
-        lags = np.arange(1, min(LAGS, end - 1) + 1)
-        # Products of all lags at once, by Fourier transforms so long that no two of them overlap.
-        length = scipy.fft.next_fast_len(len(numbers) + LAGS, real=True)
-        late = np.zeros((*numbers.shape[1:], length))
-        late[:, :, old:end] = np.moveaxis(numbers, 0, 2)
-        every = scipy.fft.rfft(np.moveaxis(joined, 0, 2), length)
-        spectrum = np.einsum("mrf,mrf->mf", scipy.fft.rfft(late), every.conj())
-        self.score[: len(lags)] += scipy.fft.irfft(spectrum, length)[:, lags].T
-        begin = np.maximum(old, lags)
+        old, lags = len(self._tail), np.arange(1, LAGS + 1)
+        # (T, lags): between the looks, the numbers that have one so many steps before them, in ``joined``.
+        ends = np.repeat(old + looks.ends[:, None], LAGS, axis=1)
+        begins = np.minimum(np.maximum(old + looks.begins[:, None], lags), ends)
         sums = np.vstack([np.zeros(joined.shape[1]), (joined**2).sum(axis=2).cumsum(axis=0)])
-        self.information[: len(lags)] += sums[end - lags] - sums[begin - lags]
-        self.products[: len(lags)] += (end - begin) * numbers.shape[2]
+        information = sums[np.maximum(ends - lags, 0)] - sums[np.maximum(begins - lags, 0)]
+        information = self.information + information.cumsum(axis=0)
+        score = self.score + _products(joined, old, looks).cumsum(axis=0)
+        self.score, self.information = score[-1], information[-1]
+        self.products += (ends - begins).sum(axis=0) * numbers.shape[2]
         self._tail = joined[-LAGS:].copy()
+        return score, information
 
     def merge(self, other: Self) -> None:
         """No lag goes over from one run to another."""
@@ -101,9 +103,32 @@ class LagSums:
             log_p, int(column), int(lags[row]) + 1, coefficient, 1.0 / math.sqrt(float(information[row, column]))
         )
 
-    def evidence(self) -> FloatArray:
-        """(columns, 100, K) logarithms."""
-        return coefficient_evidence(self.score.T, self.information.T)
+
+def _products(joined: FloatArray, old: int, looks: Looks) -> FloatArray:
+    """(T, LAGS, columns): sums of numbers between the looks times those 1 to 100 steps before.
+
+    ``joined`` (old + b, columns, samples): the numbers, after ``old`` earlier ones.
+    """
+    found = np.empty((looks.count, LAGS, joined.shape[1]))
+    # By Fourier transforms so long that no two products overlap; stretches of about the same length together.
+    classes = np.frexp(looks.lengths + LAGS)[1]
+    for each in np.unique(classes):
+        rows = np.flatnonzero(classes == each)
+        length = scipy.fft.next_fast_len(int(looks.lengths[rows].max()) + LAGS, real=True)
+        every = np.zeros((len(rows), *joined.shape[1:], length))
+        for part, begin, end in zip(every, old + looks.begins[rows], old + looks.ends[rows], strict=True):
+            before = min(begin, LAGS)
+            part[:, :, LAGS - before : LAGS + end - begin] = np.moveaxis(joined[begin - before : end], 0, 2)
+        late = every.copy()
+        late[..., :LAGS] = 0.0
+        spectrum = np.einsum("tcsf,tcsf->tcf", scipy.fft.rfft(late), scipy.fft.rfft(every).conj())
+        found[rows] = scipy.fft.irfft(spectrum, length)[..., 1 : LAGS + 1].transpose(0, 2, 1)
+    return found
+
+
+def lag_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
+    """(..., columns, LAGS, K) logarithms, from sums (..., LAGS, columns)."""
+    return coefficient_evidence(score.swapaxes(-1, -2), information.swapaxes(-1, -2))
 
 
 class LongLags(Departure):
@@ -119,9 +144,9 @@ class LongLags(Departure):
         self._agents, self._together = np.flatnonzero(law.noisy), bool(law.apart and law.noisy.sum() > 1)
         self.sums = LagSums(len(self._agents), law.replicas)
 
-    def add(self, block: Block) -> None:
+    def add(self, block: Block) -> FloatArray:
         """Add the innovations of a block."""
-        self.sums.add(block.white[:, self._agents])
+        return self._evidence(*self.sums.add(block.white[:, self._agents], block.looks))
 
     def merge(self, other: Self) -> None:
         """Add the sums of other runs."""
@@ -145,10 +170,15 @@ class LongLags(Departure):
 
     def evidence(self) -> FloatArray:
         """(100 (agents + 1), K): lags of each agent, and of all together."""
-        found = self.sums.evidence()
+        return self._evidence(self.sums.score, self.sums.information)
+
+    def _evidence(self, score: FloatArray, information: FloatArray) -> FloatArray:
+        """(..., 100 (agents + 1), K), from sums (..., LAGS, agents)."""
         if self._together:
-            found = np.concatenate([found, self.sums.pooled().evidence()])
-        return found.reshape(-1, found.shape[-1])
+            both = score, information
+            score, information = (np.append(each, each.sum(axis=-1, keepdims=True), axis=-1) for each in both)
+        found = lag_evidence(score, information)
+        return found.reshape(*found.shape[:-3], -1, found.shape[-1])
 
     def questions(self) -> list[Question]:
         """A lag of an agent, or of all."""

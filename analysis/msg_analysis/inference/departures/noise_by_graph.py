@@ -22,9 +22,9 @@ from typing import Self
 import numpy as np
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Question
+from msg_analysis.inference.evidence.mixture_evidence import variance_evidence
 from msg_analysis.inference.statistics.distributions import log_chi2_below, log_chi2_tail
-from msg_analysis.inference.statistics.mixture_evidence import variance_evidence
-from msg_analysis.types import FloatArray
+from msg_analysis.types import FloatArray, IntArray
 
 
 class NoiseByGraph(Departure):
@@ -41,14 +41,15 @@ class NoiseByGraph(Departure):
         self._graphs = n
         self.samples, self.squares = np.zeros((n, m), np.int64), np.zeros((n, m))
 
-    def add(self, block: Block) -> None:
+    def add(self, block: Block) -> FloatArray:
         """Every agent by the graph that it used."""
-        replicas = block.white.shape[2]
-        squares = (block.white**2).sum(axis=2)
-        for graph in range(self._graphs):
-            there = block.reception.graphs == graph
-            self.samples[graph] += there.sum(axis=0) * replicas
-            self.squares[graph] += (squares * there).sum(axis=0)
+        size, looks = (block.white**2).sum(axis=2), block.looks
+        there = [block.reception.graphs == graph for graph in range(self._graphs)]
+        samples = np.stack([looks.counts(each) for each in there], axis=1) * block.white.shape[2]  # (T, n, m)
+        squares = np.stack([looks.sums(size * each) for each in there], axis=1)
+        samples, squares = self.samples + samples.cumsum(axis=0), self.squares + squares.cumsum(axis=0)
+        self.samples, self.squares = samples[-1], squares[-1]
+        return self._evidence(samples, squares)
 
     def merge(self, other: Self) -> None:
         """Sums of independent numbers."""
@@ -57,7 +58,7 @@ class NoiseByGraph(Departure):
 
     def finding(self) -> Finding | None:
         """The graph and the agent, or all agents, whose variance is furthest from that of the law."""
-        samples, squares = self._cells()
+        samples, squares = self._rows(self.samples.astype(float)), self._rows(self.squares)
         cells = [
             (min(log_chi2_tail(s, n), log_chi2_below(s, n)), row)
             for row, (n, s) in enumerate(zip(samples.tolist(), squares.tolist(), strict=True))
@@ -80,25 +81,28 @@ class NoiseByGraph(Departure):
 
     def evidence(self) -> FloatArray:
         """(cells, K)."""
-        samples, squares = self._cells()
-        return variance_evidence(samples, squares) if self._graphs > 1 else np.empty((0, 1))
+        return self._evidence(self.samples, self.squares)
+
+    def _evidence(self, samples: IntArray, squares: FloatArray) -> FloatArray:
+        """(..., cells, K), from sums (..., n, m)."""
+        if self._graphs < 2:
+            return np.empty((*samples.shape[:-2], 0, 1))
+        return variance_evidence(self._rows(samples.astype(float)), self._rows(squares))
 
     def questions(self) -> list[Question]:
         """Noise of an agent, or of all, in a graph."""
-        cells = [self._cell(row) for row in range(len(self._cells()[0]))]
+        cells = [self._cell(row) for row in range(len(self._rows(self.squares)))]
         return [
             (f"noise of {'all agents' if agent is None else f'agent {agent + 1}'} in graph {{}}", (graph,))
             for graph, agent in cells
         ]
 
-    def _cells(self) -> tuple[FloatArray, FloatArray]:
-        """Numbers and sums of squares of every cell: graph by graph the agents, then all of them."""
-        return self._rows(self.samples.astype(float)), self._rows(self.squares)
-
     def _rows(self, sums: FloatArray) -> FloatArray:
-        """Sums (n, m) cell by cell."""
-        each = sums[:, self._agents]
-        return np.asarray((np.column_stack([each, each.sum(axis=1)]) if self._together else each).ravel())
+        """(..., cells): sums (..., n, m) of every cell, graph by graph the agents, then all of them."""
+        each = sums[..., self._agents]
+        if self._together:
+            each = np.concatenate([each, each.sum(axis=-1, keepdims=True)], axis=-1)
+        return each.reshape(*each.shape[:-2], -1)
 
     def _cell(self, row: int) -> tuple[int, int | None]:
         """Graph and agent of a cell."""

@@ -23,10 +23,10 @@ from typing import Self
 import numpy as np
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Place, Question
-from msg_analysis.inference.departures.long_lags import LagSums
+from msg_analysis.inference.departures.long_lags import LagSums, lag_evidence
+from msg_analysis.inference.evidence.mixture_evidence import log_mean, variance_constant, variance_evidence
+from msg_analysis.inference.evidence.windows import EndedWindows, WindowEvidence, Windows
 from msg_analysis.inference.statistics.distributions import log_chi2_below, log_chi2_tail, normal_score
-from msg_analysis.inference.statistics.mixture_evidence import log_mean, variance_constant, variance_evidence
-from msg_analysis.inference.statistics.windows import EndedWindows, WindowEvidence, Windows
 from msg_analysis.types import FloatArray, IntArray
 
 SHARE = 0.1  # of the logarithm of the p-value
@@ -66,19 +66,21 @@ class NoiseOverTime(Departure):
         self._extreme = np.stack([np.full((levels, columns), -np.inf), np.full((levels, columns), np.inf)])
         self._first, self._run = np.zeros(shape, np.int64), np.ones(shape, np.int64)
 
-    def add(self, block: Block) -> None:
+    def add(self, block: Block) -> FloatArray:
         """The windows that end in the block."""
+        looks = block.looks
         if not self._columns:
-            return
+            return np.empty((looks.count, 0, 1))
         squares = (block.white[:, self._agents] ** 2).sum(axis=2)
         if self._together:
             squares = np.column_stack([squares, squares.sum(axis=1)])
-        self._lags.add(normal_score(squares, self._numbers)[:, :, None])
+        lags = lag_evidence(*self._lags.add(normal_score(squares, self._numbers)[:, :, None], looks))
         ended = self._windows.add(squares)
         self._keep(ended)
         numbers, constant = (np.repeat(each[ended.levels], ended.counts, axis=0) for each in (self._sizes, self._known))
         mixed = log_mean(variance_evidence(numbers, ended.sums, constant), axis=-1)
-        self._evidence.add(ended.level, mixed)
+        windows = self._evidence.add(ended, mixed, looks)
+        return np.concatenate([windows, _mean_over_lags(lags)], axis=1)[:, :, None]
 
     def _keep(self, ended: EndedWindows) -> None:
         """Keep the most extreme windows, of this run."""
@@ -187,8 +189,8 @@ class NoiseOverTime(Departure):
 
     def evidence(self) -> FloatArray:
         """(2 (agents + 1), 1): windows, then lags, of each agent and of all together."""
-        lags = log_mean(np.concatenate([*self._lags.evidence().transpose(1, 2, 0)]), axis=0)
-        return np.concatenate([self._evidence.logarithms(), lags])[:, None]
+        lags = lag_evidence(self._lags.score, self._lags.information)
+        return np.concatenate([self._evidence.logarithms(), _mean_over_lags(lags)])[:, None]
 
     def questions(self) -> list[Question]:
         """Noise of an agent, or of all, over time, and next to its own."""
@@ -197,3 +199,8 @@ class NoiseOverTime(Departure):
             *((f"noise of {who} over time", ()) for who in whose),
             *((f"size of the noise of {who} and of its own earlier noise", ()) for who in whose),
         ]
+
+
+def _mean_over_lags(evidence: FloatArray) -> FloatArray:
+    """(..., columns): of evidence (..., columns, lags, K)."""
+    return log_mean(evidence.reshape(*evidence.shape[:-2], math.prod(evidence.shape[-2:])), axis=-1)

@@ -24,8 +24,9 @@ import numpy as np
 from scipy.special import xlogy
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Question
+from msg_analysis.inference.evidence.looks import Looks
+from msg_analysis.inference.evidence.mixture_evidence import proportion_constant, proportion_evidence
 from msg_analysis.inference.statistics.distributions import log_chi2_tail
-from msg_analysis.inference.statistics.mixture_evidence import proportion_constant, proportion_evidence
 from msg_analysis.model.network.markov_chain import stationary_law
 from msg_analysis.types import FloatArray, IntArray
 
@@ -54,24 +55,32 @@ class Sojourns(Departure):
         self._known = proportion_constant(self._leaving[self._tested, None])  # (G, 1, K)
         self._age = 0  # of the sojourn at the step that comes next
 
-    def add(self, block: Block) -> None:
+    def add(self, block: Block) -> FloatArray:
         """Count the steps of a block."""
-        self.count(block.graphs)
+        return self.count(block.graphs, block.looks)
 
-    def count(self, graphs: IntArray) -> None:
+    def count(self, graphs: IntArray, looks: Looks) -> FloatArray:
         """Count the steps to the second, third, ... of these graphs; the first one was the last of those before."""
-        if len(graphs) < 2:
-            return
+        shape = looks.count, *self.steps.shape
+        steps, left = self._parts(graphs, looks) if len(graphs) > 1 else np.zeros((2, *shape), np.int64)
+        steps, left = self.steps + steps.cumsum(axis=0), self.left + left.cumsum(axis=0)
+        self.steps, self.left = steps[-1], left[-1]
+        return self._evidence(steps, left)
+
+    def _parts(self, graphs: IntArray, looks: Looks) -> IntArray:
+        """(2, T, n, PARTS): steps, and those that left their graph, between the looks."""
         now, left = graphs[:-1], graphs[1:] != graphs[:-1]
         index = np.arange(len(now))
         begin = np.maximum.accumulate(np.where(np.append(True, left[:-1]), index, 0))
         age = index - begin + np.where(begin == 0, self._age, 0)
         self._age = 0 if left[-1] else int(age[-1]) + 1
+        shape = looks.count, *self.steps.shape
+        place = (looks.after(index) * shape[1] + now) * PARTS
         for graph in np.unique(now).tolist():
             at = now == graph
-            part = np.searchsorted(self._edges[graph], age[at], side="right")
-            self.steps[graph] += np.bincount(part, minlength=PARTS)
-            self.left[graph] += np.bincount(part, weights=left[at], minlength=PARTS).astype(np.int64)
+            place[at] += np.searchsorted(self._edges[graph], age[at], side="right")
+        counts = [np.bincount(which, minlength=math.prod(shape)).reshape(shape) for which in (place, place[left])]
+        return np.array(counts)
 
     def merge(self, other: Self) -> None:
         """No sojourn goes on from one run to another."""
@@ -110,14 +119,18 @@ class Sojourns(Departure):
 
     def evidence(self) -> FloatArray:
         """(G + 1, K): of each graph that is left, and of all."""
+        return self._evidence(self.steps, self.left)
+
+    def _evidence(self, steps: IntArray, left: IntArray) -> FloatArray:
+        """(..., G + 1, K), from counts (..., n, PARTS)."""
         rows = self._tested
         if not len(rows):
-            return np.empty((0, 1))
-        steps, left = _in_parts(self.steps[rows]), _in_parts(self.left[rows])  # (G, 8 + 4 + 2)
+            return np.empty((*steps.shape[:-2], 0, 1))
+        steps, left = _in_parts(steps[..., rows, :]), _in_parts(left[..., rows, :])  # (..., G, 8 + 4 + 2)
         each = proportion_evidence(left, steps, self._leaving[rows, None], self._known)
         ends = np.cumsum([PARTS // joined for joined in JOINED])
-        parts = np.hstack([group.sum(axis=1) for group in np.split(each, ends[:-1], axis=1)])
-        return np.vstack([parts, parts.sum(axis=0)])
+        parts = np.concatenate([group.sum(axis=-2) for group in np.split(each, ends[:-1], axis=-2)], axis=-1)
+        return np.concatenate([parts, parts.sum(axis=-2, keepdims=True)], axis=-2)
 
     def questions(self) -> list[Question]:
         """Sojourns in a graph, and all."""
@@ -129,8 +142,8 @@ class Sojourns(Departure):
 
 
 def _in_parts(counts: IntArray) -> IntArray:
-    """(G, 8 + 4 + 2): counts (G, 8) of the parts, and of each ``JOINED`` number of them."""
-    return np.hstack([counts.reshape(len(counts), -1, joined).sum(axis=2) for joined in JOINED])
+    """(..., 8 + 4 + 2): counts (..., 8) of the parts, and of each ``JOINED`` number of them."""
+    return np.concatenate([counts.reshape(*counts.shape[:-1], -1, each).sum(axis=-1) for each in JOINED], axis=-1)
 
 
 def _edges(leaving: float) -> IntArray:

@@ -22,8 +22,8 @@ from typing import Self
 import numpy as np
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Question
+from msg_analysis.inference.evidence.mixture_evidence import coefficient_evidence
 from msg_analysis.inference.statistics.distributions import log_normal_tail
-from msg_analysis.inference.statistics.mixture_evidence import coefficient_evidence
 from msg_analysis.types import FloatArray
 
 MIN_SAMPLES = 100  # fewest steps of all replicas for the normal law of a score
@@ -45,12 +45,14 @@ class StaleValues(Departure):
         self._used[law.links[:, 0], law.links[:, 1]] = True
         self.score, self.information, self.samples = np.zeros((m, m)), np.zeros((m, m)), 0
 
-    def add(self, block: Block) -> None:
+    def add(self, block: Block) -> FloatArray:
         """Scores and information of all links."""
-        heard = block.reception
+        heard, looks = block.reception, block.looks
         steps, agents, neighbours = heard.used.shape
         if not len(self._links):
-            return
+            return np.empty((looks.count, 0, 1))
+        score, information = np.zeros((2, looks.count, agents, agents))
+        look = looks.after(np.arange(steps))
         self.samples += steps * block.white.shape[2]
         receivers = np.broadcast_to(np.arange(agents), (steps, agents))
         for d in range(neighbours):
@@ -60,8 +62,11 @@ class StaleValues(Departure):
             sender, newest = senders[at, who], used[at, who]
             older = heard.published[newest - 1, sender] - heard.published[newest, sender]
             part = (heard.weights[at, who, d] / block.scale[at, who])[:, None] * older
-            np.add.at(self.score, (who, sender), (part * block.white[at, who]).sum(axis=1))
-            np.add.at(self.information, (who, sender), (part**2).sum(axis=1))
+            np.add.at(score, (look[at], who, sender), (part * block.white[at, who]).sum(axis=1))
+            np.add.at(information, (look[at], who, sender), (part**2).sum(axis=1))
+        score, information = self.score + score.cumsum(axis=0), self.information + information.cumsum(axis=0)
+        self.score, self.information = score[-1], information[-1]
+        return self._evidence(score, information)
 
     def merge(self, other: Self) -> None:
         """Sums over steps."""
@@ -97,10 +102,14 @@ class StaleValues(Departure):
 
     def evidence(self) -> FloatArray:
         """(links + 1, K): of each link, and of all together."""
-        score, information = (each[self._links[:, 0], self._links[:, 1]] for each in (self.score, self.information))
+        return self._evidence(self.score, self.information)
+
+    def _evidence(self, *sums: FloatArray) -> FloatArray:
+        """(..., links + 1, K), from score and information (..., m, m)."""
+        rows = [each[..., self._links[:, 0], self._links[:, 1]] for each in sums]
         if self._together:
-            score, information = np.append(score, score.sum()), np.append(information, information.sum())
-        return coefficient_evidence(score, information)
+            rows = [np.concatenate([each, each.sum(axis=-1, keepdims=True)], axis=-1) for each in rows]
+        return coefficient_evidence(*rows)
 
     def questions(self) -> list[Question]:
         """A link, or all."""

@@ -21,7 +21,7 @@ from typing import Self
 import numpy as np
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Place, Question
-from msg_analysis.inference.statistics.event_evidence import EventEvidence
+from msg_analysis.inference.evidence.event_evidence import EventEvidence
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 ROUNDINGS = 4.0  # of the largest state, in the computation of a state, at most
@@ -46,18 +46,22 @@ class StandingStill(Departure):
         self._longest: tuple[int, int, Place] | None = None  # steps, agent, place
         self._runs = 1
 
-    def add(self, block: Block) -> None:
+    def add(self, block: Block) -> FloatArray:
         """Look at the steps of a block."""
+        looks = block.looks
+        if not len(self._agents):
+            return np.empty((looks.count, 0, 1))
         before, after = block.reception.states, block.after
         still: BoolArray = (after[:, self._agents] == before[:, self._agents]).all(axis=2)
         at, which = np.nonzero(still)
         size = np.spacing(np.abs(before[at]).max(axis=1))  # (s, R)
         chance = ROUNDINGS * (size / block.scale[at, self._agents[which]][:, None] + EPSILON)
-        self._evidence.add(still.size, -np.log(np.minimum(chance, 1.0)).sum(axis=1))
+        seen, logarithms = looks.lengths * len(self._agents), -np.log(np.minimum(chance, 1.0)).sum(axis=1)
         for place in np.unique(which).tolist():
             self._stretches(place, block.first, block.first + at[which == place])
         moved = ~still[-1]
         self._since[moved] = -1
+        return self._evidence.add(seen, logarithms, looks.after(at))[:, None, None]
 
     def _stretches(self, place: int, first: int, steps: IntArray) -> None:
         """The longest stretch of an agent that stood still in ``steps`` from ``first`` on, ascending."""

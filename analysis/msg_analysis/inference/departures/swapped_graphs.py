@@ -21,8 +21,8 @@ from typing import Self
 import numpy as np
 
 from msg_analysis.inference.departures.departure import Block, Departure, Finding, Law, Place, Question
-from msg_analysis.inference.statistics.mixture_evidence import log_mean
-from msg_analysis.inference.statistics.windows import WindowEvidence, Windows
+from msg_analysis.inference.evidence.mixture_evidence import log_mean
+from msg_analysis.inference.evidence.windows import WindowEvidence, Windows
 from msg_analysis.types import FloatArray, IntArray
 
 MOST_GRAPHS = 20  # of a law for which this is tested
@@ -47,10 +47,10 @@ class SwappedGraphs(Departure):
         self._evidence = WindowEvidence(self._windows, len(self._pairs))
         self._best, self._pair, self._place, self._runs = -np.inf, 0, Place(0, 0), 1
 
-    def add(self, block: Block) -> None:
+    def add(self, block: Block) -> FloatArray:
         """The windows that end in the block."""
         if not len(self._pairs):
-            return
+            return np.empty((block.looks.count, 0, 1))
         logged, modes = _log_density(block.white, block.scale), block.reception.modes
         density = np.empty((len(logged), self._step.modes))
         for graph, deviation in enumerate(self._deviation):
@@ -61,13 +61,14 @@ class SwappedGraphs(Departure):
         swapped = np.where(modes[:, None] == second, density[:, first], swapped)
         ended = self._windows.add(swapped - logged[:, None])
         level = ended.level
-        self._evidence.add(level, ended.sums)
+        evidence = self._evidence.add(ended, ended.sums, block.looks)
         values = ended.sums - np.log(self._windows.planned[level])[:, None]
         at, pair = np.unravel_index(int(np.argmax(values)), values.shape)
         if values[at, pair] > self._best:
             start = int(ended.first[at]) + 1
             self._best, self._pair = float(values[at, pair]), int(pair)
             self._place = Place(start, start + (1 << int(level[at])) - 1)
+        return evidence[:, :, None]
 
     def merge(self, other: Self) -> None:
         """No window goes over from one run to another."""

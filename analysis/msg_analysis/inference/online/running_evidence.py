@@ -28,10 +28,11 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.large_arrays import BLOCK_NUMBERS
+from msg_analysis.inference.evidence.mixture_evidence import log_mean
 from msg_analysis.inference.observed.observation import Observation, bounded
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
-from msg_analysis.inference.sequential.watched_evidence import LARGEST_LOGARITHM, question_words
-from msg_analysis.inference.statistics.mixture_evidence import log_mean
+from msg_analysis.inference.sequential.law_questions import question_words
+from msg_analysis.inference.sequential.watched_evidence import LARGEST_LOGARITHM
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.system import packed_symmetric

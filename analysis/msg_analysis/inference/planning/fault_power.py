@@ -33,7 +33,8 @@ import scipy.linalg
 
 from msg_analysis.inference.hypothesis_tests.gain_regression import MAX_REGRESSORS, regressors
 from msg_analysis.inference.observed.heard_values import NO_NOISE
-from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, kind_weights
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.sequential.law_questions import kind_weights
 from msg_analysis.inference.statistics.distributions import (
     chi2_quantile,
     needed_noncentrality,

@@ -27,7 +27,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from msg_analysis.inference.errors.time_means import Value, forms_of, values_of
-from msg_analysis.inference.statistics.mixture_evidence import log_sum
+from msg_analysis.inference.evidence.mixture_evidence import log_sum
 from msg_analysis.theory.moments import mode_potential
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.system import packed_symmetric
@@ -41,7 +41,7 @@ MOST_SHARE = 0.5  # of the rate beyond which the mean is infinite
 
 
 class ErrorMartingale:
-    """Sums over steps of the logarithm of the martingale, for every rate (L,).
+    """Steps of the logarithm of the martingale, for every rate (L,).
 
     ValueError for a system with lost messages, whose next state is not normal given this one.
     """
@@ -57,7 +57,6 @@ class ErrorMartingale:
         self._system, self._replicas = system, replicas
         self.variance = _typical_variance(prediction, replicas, values, trace)
         self.rates = self._choose_rates()
-        self.total = np.zeros(len(self.rates))
         self.numbers = packed_symmetric.size(system.dimension) + 1
         self._value = np.concatenate([packed_symmetric.pack(self._forms), self._kappa[:, None]], axis=1)  # (n, p + 1)
         # (n, n, L, p + 1): log E[exp(l f(next)) | next graph j] = means[g, j, l] @ (s, 1)
@@ -65,18 +64,15 @@ class ErrorMartingale:
         with np.errstate(divide="ignore"):
             self._log_law = np.log(system.chain)
 
-    def add(self, modes: IntArray, following: IntArray, a: FloatArray, b: FloatArray) -> None:
-        """Add steps: their graphs and the next ones (k,), and (s, 1) before and after them, (k, p + 1) each."""
+    def steps(self, modes: IntArray, following: IntArray, a: FloatArray, b: FloatArray) -> FloatArray:
+        """(k, L): of steps with these graphs and next ones (k,), and (s, 1) before and after them, (k, p + 1) each."""
+        found = np.empty((len(modes), len(self.rates)))
         for mode in np.unique(modes).tolist():
             at = np.flatnonzero(modes == mode)
             reached = (self._value[following[at]] * b[at]).sum(axis=1)
             means = np.einsum("jlp,kp->klj", self._means[mode], a[at], optimize=True)
-            expected = log_sum(means + self._log_law[mode], axis=2)
-            self.total += self.rates * reached.sum() - expected.sum(axis=0)
-
-    def merge(self, other: ErrorMartingale) -> None:
-        """Add the sums of another run of the same experiment, with another seed."""
-        self.total += other.total
+            found[at] = reached[:, None] * self.rates - log_sum(means + self._log_law[mode], axis=2)
+        return found
 
     def _choose_rates(self) -> FloatArray:
         """(L,); none where nothing is random."""

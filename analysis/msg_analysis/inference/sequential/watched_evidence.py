@@ -23,12 +23,15 @@ from typing import Any
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS
 from msg_analysis.inference.departures.departure import Finding
+from msg_analysis.inference.evidence.looks import Looks
+from msg_analysis.inference.evidence.mixture_evidence import log_mean
 from msg_analysis.inference.observed.heard_values import HeardValues
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.sequential.evidence_sums import EvidenceSums, Question
+from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
+from msg_analysis.inference.sequential.law_questions import question_words
 from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
-from msg_analysis.inference.statistics.mixture_evidence import log_mean
 from msg_analysis.types import FloatArray, IntArray
 
 LARGEST_LOGARITHM = 700.0  # evidence beyond is not shown as a number: floating point ends there
@@ -69,6 +72,7 @@ class Watch:
         self._sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
         self._logarithms = np.empty(len(looks))
         self._looked = 0
+        self._most = max(1, BLOCK_NUMBERS // self._sums.numbers_per_look)  # looks in one pass
 
     @property
     def numbers_per_step(self) -> int:
@@ -81,13 +85,16 @@ class Watch:
         """Add the steps first..last-1; ``heard`` as of ``EvidenceSums.add``."""
         begin = first
         while first < last:
-            until = min(int(self._looks[self._looked]), last)
+            ends = self._looks[self._looked : self._looked + self._most]
+            ends = ends[ends <= last]
+            looked = self._looked + len(ends)
+            if len(ends) < self._most and (not len(ends) or ends[-1] < last):
+                ends = np.append(ends, last)
+            until = int(ends[-1])
             known = heard and (heard[0].part(first - begin, until - begin), heard[1][first - begin : until - begin])
-            self._sums.add(self._observation, first, until, known)
-            if until == self._looks[self._looked]:
-                self._logarithms[self._looked] = self._sums.evidence()
-                self._looked += 1
-            first = until
+            found = self._sums.look(self._observation, first, until, Looks(ends - first), known)
+            self._logarithms[self._looked : looked] = found[: looked - self._looked]
+            first, self._looked = until, looked
 
     def result(self) -> WatchedEvidence:
         """After all steps."""
@@ -175,22 +182,3 @@ def any_time_evidence(
         questions=sorted(questions, key=lambda entry: -entry[1]),
         half_width=half_width,
     )
-
-
-def question_words(question: Question, graphs: Sequence[str]) -> str:
-    """What is asked, with agents by number and graphs by name."""
-    agent = None if question.agent is None else question.agent + 1
-    other = None if question.other is None else question.other + 1
-    if question.kind == "gain":
-        return f"gain of leader {agent}" if agent == other else f"gain of the link from agent {other} to agent {agent}"
-    if question.kind == "loss":
-        return f"losses from agent {other} to agent {agent}"
-    if question.kind == "switching":
-        return "switching" if question.graph is None else f"switching away from {graphs[question.graph]}"
-    return {
-        "noise": f"noise of agent {agent}",
-        "gains": "all gains",
-        "pair": f"common noise of agents {agent} and {other}",
-        "broadcast": f"broadcast noise of agent {agent}",
-        "system error": "system error",
-    }[question.kind]

@@ -20,8 +20,7 @@ import math
 
 import numpy as np
 
-from msg_analysis.inference.statistics.mixture_evidence import log_sum
-from msg_analysis.types import FloatArray
+from msg_analysis.types import FloatArray, IntArray
 
 
 class EventEvidence:
@@ -34,11 +33,18 @@ class EventEvidence:
         self.planned = planned
         self._seen, self._ended, self._others = 0, -np.inf, 0.0
 
-    def add(self, seen: int, logarithms: FloatArray) -> None:
-        """So many more events, and the evidence (e,) of those of them where it is not 0."""
-        self._seen += seen
-        if len(logarithms):
-            self._ended = float(np.logaddexp(self._ended, log_sum(logarithms, 0) - math.log(self.planned)))
+    def add(self, seen: IntArray, logarithms: FloatArray, looks: IntArray) -> FloatArray:
+        """The evidence after each of T looks, (T,).
+
+        ``seen`` (T,): events between each look and the one before it; ``logarithms`` (e,): evidence of those of them
+        where it is not 0, and the ``looks`` (e,) that come next.
+        """
+        ended = np.full(len(seen), -np.inf)
+        np.logaddexp.at(ended, looks, logarithms - math.log(self.planned))
+        ended = np.logaddexp.accumulate(np.append(self._ended, ended))[1:]
+        number = self._seen + np.cumsum(seen)
+        self._seen, self._ended = int(number[-1]), float(ended[-1])
+        return self._after(number, ended)
 
     def merge(self, other: EventEvidence) -> None:
         """With that of other runs."""
@@ -46,7 +52,11 @@ class EventEvidence:
 
     def logarithm(self) -> float:
         """Of the evidence so far."""
-        rest = max(0.0, 1.0 - self._seen / self.planned)
+        return float(self._after(np.array(self._seen), np.array(self._ended)))
+
+    def _after(self, seen: IntArray, ended: FloatArray) -> FloatArray:
+        """Of so many events, and the log of the sum over them."""
+        rest = np.maximum(0.0, 1.0 - seen / self.planned)
         with np.errstate(divide="ignore"):
-            mean = np.logaddexp(self._ended, np.log(rest))
-        return float(self._others + np.logaddexp(0.0, mean) - math.log(2.0))
+            mean = np.logaddexp(ended, np.log(rest))
+        return np.asarray(self._others + np.logaddexp(0.0, mean) - math.log(2.0))

@@ -101,28 +101,28 @@ def row_evidence(counts: FloatArray | IntArray, law: FloatArray) -> FloatArray:
     Parameters
     ----------
     counts
-        (n, n) transitions
+        (..., n, n) transitions
     law
         (n, n) P
 
     Returns
     -------
     FloatArray
-        (n, K) of each row; alpha is ``ROW_STRENGTHS`` over the probability of a change
+        (..., n, K) of each row; alpha is ``ROW_STRENGTHS`` over the probability of a change
     """
     n = len(law)
     leaving = 1.0 - np.diag(law)
-    found = np.zeros((n, len(ROW_STRENGTHS)))
+    seen = np.asarray(counts)
+    found = np.zeros((*seen.shape[:-1], len(ROW_STRENGTHS)))
     for g in range(n):
-        possible = law[g] > 0.0
-        if counts[g][~possible].any():
-            found[g] = np.inf
-        elif leaving[g] > 0.0:
-            p, c = law[g][possible], np.asarray(counts[g])[possible]
+        possible, row = law[g] > 0.0, seen[..., g, :]
+        if leaving[g] > 0.0:
+            p, c = law[g][possible], row[..., None, possible]
             alpha = np.array(ROW_STRENGTHS)[:, None] / leaving[g]
             prior = alpha * p
-            found[g] = (gammaln(prior + c) - gammaln(prior) - c * np.log(p)).sum(axis=1)
-            found[g] -= (gammaln(alpha + c.sum()) - gammaln(alpha))[:, 0]
+            each = (gammaln(prior + c) - gammaln(prior) - c * np.log(p)).sum(axis=-1)
+            found[..., g, :] = each - (gammaln(alpha[:, 0] + c.sum(axis=-1)) - gammaln(alpha[:, 0]))
+        found[row[..., ~possible].any(axis=-1), g] = np.inf
     return found
 
 
@@ -169,14 +169,20 @@ def log_mean(logarithms: FloatArray, axis: int = 0) -> FloatArray:
 
 
 def log_means(parts: Sequence[FloatArray]) -> FloatArray:
-    """(P,): log of the mean of the evidence of each part, arrays of any shape but not empty; all of them in one go."""
-    sizes = np.array([part.size for part in parts])
-    begins, joined = np.cumsum(sizes) - sizes, np.concatenate([part.ravel() for part in parts])
-    largest = np.maximum.reduceat(joined, begins)
+    """(T, P): logs of the means of P parts (T, ...), each over all but its first axis, none empty; all in one go."""
+    sizes = np.array([part[0].size for part in parts])
+    joined = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+    return np.asarray(log_sums(joined.T, np.cumsum(sizes) - sizes).T - np.log(sizes))
+
+
+def log_sums(logarithms: FloatArray, begins: IntArray) -> FloatArray:
+    """(P, ...): log(sum(exp(...))) of stretches of the first axis, none empty, which begin there, ascending from 0."""
+    largest = np.maximum.reduceat(logarithms, begins, axis=0)
     finite = np.where(np.isfinite(largest), largest, 0.0)
+    sizes = np.diff(begins, append=len(logarithms))
     with np.errstate(invalid="ignore", divide="ignore", under="ignore", over="ignore"):
-        total = np.log(np.add.reduceat(np.exp(joined - np.repeat(finite, sizes)), begins) / sizes)
-    return np.asarray(finite + total)
+        shifted = np.exp(logarithms - np.repeat(finite, sizes, axis=0))
+        return np.asarray(finite + np.log(np.add.reduceat(shifted, begins, axis=0)))
 
 
 def log_sum(logarithms: FloatArray, axis: int) -> FloatArray:

@@ -20,7 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.inference.statistics.mixture_evidence import log_sum
+from msg_analysis.inference.evidence.looks import Looks
+from msg_analysis.inference.evidence.mixture_evidence import log_sums
 from msg_analysis.types import FloatArray, IntArray
 
 
@@ -80,10 +81,10 @@ class Windows:
         """(levels,) windows that have ended."""
         return np.array([self.steps, *(max(count - 1, 0) for count in self._cells[:-1])])
 
-    def begun(self) -> IntArray:
-        """(levels,) windows that have begun, or ended."""
+    def begun(self, steps: IntArray) -> IntArray:
+        """(..., levels): windows that have begun, or ended, after so many steps (...)."""
         half = 1 << np.maximum(np.arange(self.levels) - 1, 0)
-        return np.asarray(np.minimum(-(-self.steps // half), self.planned))
+        return np.asarray(np.minimum(-(-steps[..., None] // half), self.planned))
 
 
 class WindowEvidence:
@@ -97,11 +98,17 @@ class WindowEvidence:
         self._windows = windows
         self._ended, self._others = np.full(columns, -np.inf), np.zeros(columns)
 
-    def add(self, levels: IntArray, logarithms: FloatArray) -> None:
-        """Evidence (w, K) of windows that ended, of 2^levels (w,) steps."""
-        if len(logarithms):
-            shares = np.log(self._windows.planned[levels] * float(self._windows.levels))
-            self._ended = np.logaddexp(self._ended, log_sum(logarithms - shares[:, None], 0))
+    def add(self, ended: EndedWindows, logarithms: FloatArray, looks: Looks) -> FloatArray:
+        """Evidence (w, K) of windows that ended in the newest steps, a block with these looks: (T, K) after each."""
+        levels, begun = ended.level, self._windows.steps - int(looks.ends[-1])
+        look = looks.after(ended.first + (1 << levels) - 1 - begun)
+        order = np.argsort(look, kind="stable")
+        shares = np.log(self._windows.planned[levels] * float(self._windows.levels))
+        begins = np.searchsorted(look[order], np.arange(looks.count))  # a window of one step ends in every step
+        each = log_sums((logarithms - shares[:, None])[order], begins)
+        total = np.logaddexp.accumulate(np.vstack([self._ended, each]), axis=0)[1:]
+        self._ended = total[-1]
+        return self._after(begun + looks.ends, total)
 
     def merge(self, other: WindowEvidence) -> None:
         """With that of other runs."""
@@ -109,6 +116,10 @@ class WindowEvidence:
 
     def logarithms(self) -> FloatArray:
         """(K,) of the evidence so far."""
-        rest = float((1.0 - self._windows.begun() / self._windows.planned).mean())
+        return self._after(np.array(self._windows.steps), self._ended)
+
+    def _after(self, steps: IntArray, ended: FloatArray) -> FloatArray:
+        """(..., K): after so many steps (...), from the logs (..., K) of the sum over the windows that ended."""
+        rest = (1.0 - self._windows.begun(steps) / self._windows.planned).mean(axis=-1)
         with np.errstate(divide="ignore"):
-            return np.asarray(self._others + np.logaddexp(self._ended, np.log(rest)))
+            return np.asarray(self._others + np.logaddexp(ended, np.log(rest)[..., None]))
