@@ -25,6 +25,9 @@ LOCAL := --no-index --no-deps --no-build-isolation
 # Some container images set it. Every process of a network, and every worker of the tests, would compile all modules.
 unexport PYTHONDONTWRITEBYTECODE
 
+# With --jobs, what is started here would look for other jobs of this make, and build with one core.
+unexport MAKEFLAGS MFLAGS
+
 .PHONY: help setup demo wheels wheels-test test test-fast test-ros stress fuzz lint lint-container format bench calibrate docs colcon colcon-test container lock clean
 
 help: ## Say what can be made
