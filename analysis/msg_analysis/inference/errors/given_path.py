@@ -147,8 +147,8 @@ def _expected_sum(which: IntArray, matrices: FloatArray, noise: FloatArray, star
     for kind in which.tolist():
         total += moment
         matrix, transposed, added = steps[kind]
-        np.matmul(matrix, moment, out=room)
-        np.matmul(room, transposed, out=moment)
+        matrix.dot(moment, out=room)  # of small matrices half as long as matmul
+        room.dot(transposed, out=moment)
         moment += added
     return total
 
@@ -159,10 +159,9 @@ def _backwards(
     """Sum of packed y y^T (p,), sum of Cov(D | now) (q, q), and of every step the system error and its Var(D | now)."""
     which, matrices, noise = kinds
     steps, q, d = len(which), len(forms), matrices.shape[1]
-    lifted = packed_symmetric.unpack(forms, d)
+    lifted = packed_symmetric.unpack(forms, d).transpose(1, 0, 2).copy()
     seen, covariance = np.zeros(forms.shape[1]), np.zeros((q, q))
     series, variances = np.empty(steps), np.zeros(steps)
-    transposed, room = [matrix.T for matrix in matrices], np.empty_like(lifted)
     length = max(1, BLOCK_NUMBERS // max(q * d**2, observation.states[0].size))
     dual = lifted  # Y(last + 1) of the block
     for first in reversed(range(0, steps, length)):
@@ -174,22 +173,35 @@ def _backwards(
         last = min(last, steps - 1)  # the noise of the last step is in no error
         if last <= first:
             continue
-        duals = np.empty((last - first + 1, q, d, d))  # of the steps from first - 1 on
-        duals[-1] = dual
-        for k, kind in zip(range(last - first, 0, -1), which[first:last][::-1].tolist(), strict=True):
-            np.matmul(transposed[kind], duals[k], out=room)
-            np.matmul(room, matrices[kind], out=duals[k - 1])
-            duals[k - 1] += lifted
+        duals = _duals(which[first:last], matrices, lifted, dual)
         dual, duals = duals[0].copy(), duals[1:]
         matrix, added = matrices[which[first:last]], noise[which[first:last]]
         now = packed_symmetric.unpack(found[: last - first], d)
         spread = (2.0 * added + 4.0 * matrix @ now @ matrix.transpose(0, 2, 1)) / observation.replicas
-        left, right = duals @ added[:, None], spread[:, None] @ duals
-        covariance += left.transpose(1, 0, 2, 3).reshape(q, -1) @ right.transpose(1, 0, 2, 3).reshape(q, -1).T
-        total = np.tensordot(duals, trace, axes=(1, 0))
+        left = (duals.reshape(-1, d * q, d) @ added).reshape(duals.shape)
+        right = (spread @ duals.reshape(-1, d, q * d)).reshape(duals.shape)
+        covariance += left.transpose(0, 1, 3, 2).reshape(-1, q).T @ right.transpose(0, 1, 3, 2).reshape(-1, q)
+        total = trace @ duals
         variances[first:last] = np.einsum("kij,kij->k", total @ added, spread @ total)
         observation.release()
     return seen, covariance, series, variances
+
+
+def _duals(which: IntArray, matrices: FloatArray, forms: FloatArray, after: FloatArray) -> FloatArray:
+    """(b + 1, d, q, d): Y of b steps and ``after`` the last of them; so a product is one for all forms (d, q, d)."""
+    d, q = forms.shape[:2]
+    duals = np.empty((len(which) + 1, *forms.shape))
+    duals[-1] = after
+    flat, room = forms.reshape(-1, d), np.empty((d, q * d))
+    moved = room.reshape(-1, d)
+    steps = [(matrix.T, matrix) for matrix in matrices]
+    later, earlier = duals.reshape(-1, d, q * d)[:0:-1], duals.reshape(-1, d * q, d)[-2::-1]
+    for kind, old, new in zip(which[::-1].tolist(), later, earlier, strict=True):
+        transposed, matrix = steps[kind]
+        transposed.dot(old, out=room)  # of small matrices half as long as matmul
+        moved.dot(matrix, out=new)
+        new += flat
+    return duals
 
 
 def steps_of_path(observation: Observation) -> tuple[IntArray, FloatArray, FloatArray] | None:
