@@ -34,6 +34,7 @@ from msg_analysis.theory.system.jump_system import JumpSystem
 from msg_analysis.types import FloatArray
 
 MARGIN = 8.0  # of the estimated effect of rounding, see docs/accuracy.md
+MAX_KEPT = 1_000_000  # numbers of adjoint solutions that a solver keeps, at most
 MAX_FALLBACK = 1000  # unknowns up to which equations that do not converge are solved densely
 
 
@@ -76,6 +77,7 @@ class MomentSolver:
                 "give those of a system with the same graphs and agents"
             )
         self._report: SolverReport | None = None
+        self._duals: dict[bytes, FloatArray] = {}
         self._solver: DenseSolver | IterativeSolver
         if method == "dense" or unknowns == 0:
             self._solver = DenseSolver(system)
@@ -119,7 +121,7 @@ class MomentSolver:
         return moments
 
     def dual(self, forms: FloatArray) -> FloatArray:
-        """(q, n, d, d): the adjoint solutions Y of q quadratic forms H at once.
+        """(q, n, d, d): the adjoint solutions Y of q quadratic forms H at once; read-only where they are kept.
 
             continuous: Z_i^T Y_i + Y_i Z_i - sum_j Gamma_ij Y_j = H,     E[y^T H y] = sum_i pi_i tr(Y_i Q_i)
             discrete:   Y_i = H + K_i^*[sum_j P_ij Y_j],                  E[y^T H y] = sum_ij pi_i P_ij tr(Y_j N_i)
@@ -134,6 +136,19 @@ class MomentSolver:
         InputError
             as ``steady``
         """
+        size = forms.size * self._system.modes
+        if size > MAX_KEPT:
+            return self._new_dual(forms)
+        key = forms.tobytes()
+        found = self._duals.get(key)  # every comparison of a run with the same prediction asks for the same forms
+        if found is None:
+            found = self._new_dual(forms)
+            if sum(kept.size for kept in self._duals.values()) + size <= MAX_KEPT:
+                found.setflags(write=False)
+                self._duals[key] = found
+        return found
+
+    def _new_dual(self, forms: FloatArray) -> FloatArray:
         try:
             return self._solver.dual(forms)
         except InputError:

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
 from msg_analysis.model.network.markov_chain import stationary_law
+from msg_analysis.theory import moments
 from msg_analysis.theory.moments import MomentSolver, mode_potential, transient_mean
 from msg_analysis.theory.solvers import dense
 from msg_analysis.theory.system.jump_system import JumpSystem, held
@@ -238,3 +239,17 @@ def test_too_large_says_the_size(monkeypatch):
     system, _, _ = consensus(np.random.default_rng(8), 4, 2)
     with pytest.raises(InputError, match="2 graphs of 4 agents give 12 coupled unknowns"):
         MomentSolver(system, method="dense")
+
+
+def test_adjoint_solutions_are_kept_while_they_are_small(monkeypatch):
+    system, _, _ = consensus(np.random.default_rng(8), 4, 2)
+    solver = MomentSolver(system)
+    one, other = np.eye(3)[None], np.diag([1.0, 2.0, 3.0])[None]
+    first, second = solver.dual(one), solver.dual(other)
+    assert solver.dual(one.copy()) is first
+    assert not first.flags.writeable
+    monkeypatch.setattr(moments, "MAX_KEPT", first.size + second.size)
+    third = solver.dual(one + other)
+    assert solver.dual(other) is second
+    assert solver.dual(one + other) is not third
+    np.testing.assert_allclose(third, first + second, rtol=1e-12)
