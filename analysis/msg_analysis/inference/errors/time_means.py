@@ -355,7 +355,7 @@ def packed_moments(deviations: FloatArray, system: JumpSystem, largest: float) -
 
     ``largest`` is the size of the largest state of the run.
     """
-    y = without_rounding(np.einsum("kmr,md->krd", deviations, system.frame, optimize=True), system, largest)
+    y = without_rounding(deviations.transpose(0, 2, 1) @ system.frame, system, largest)
     return packed_symmetric.pack(y.transpose(0, 2, 1) @ y / deviations.shape[2])
 
 

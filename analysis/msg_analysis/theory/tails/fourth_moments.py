@@ -130,11 +130,12 @@ def advance(steps: RandomSteps, stack: FloatArray) -> FloatArray:
     ``stack`` are S_i (n, d, d, d, d) = E[y y y y; mode i].
     """
     after = np.empty_like(stack)
+    embedding = steps.embedding
     for mode, stages in enumerate(steps.stages):
-        tensor = _along_all_axes(steps.embedding, stack[mode])
+        tensor = stack[mode] if embedding is None else _along_all_axes(embedding, stack[mode])
         for stage in stages:
             tensor = _through(stage, tensor)
-        after[mode] = _along_all_axes(steps.embedding.T, tensor)
+        after[mode] = tensor if embedding is None else _along_all_axes(embedding.T, tensor)
     return np.asarray(np.tensordot(steps.chain, after, axes=(0, 0)))
 
 
@@ -195,17 +196,18 @@ def _affordable(step: StepModel, system: JumpSystem, work: float) -> RandomSteps
     if system.modes * float(system.dimension) ** 5 > work:
         return None
     steps = random_steps(step, system)
-    size = len(steps.embedding)
+    size = len(steps.stages[0][0].matrix)
     stages = [stage for stages in steps.stages for stage in stages]
     needed = sum(4.0 * size + 2.0 * len(stage.losses) for stage in stages) * float(size) ** 4
     return steps if needed <= work else None
 
 
 def _along_all_axes(matrix: FloatArray, tensor: FloatArray) -> FloatArray:
-    """(r, r, r, r): sum_efgh M_ae M_bf M_cg M_dh S_efgh."""
+    """(r, r, r, r): sum_efgh M_ae M_bf M_cg M_dh S_efgh; each product takes the first axis and adds the last."""
+    r, k = matrix.shape
     for _ in range(4):
-        tensor = np.tensordot(tensor, matrix, axes=(0, 1))
-    return tensor
+        tensor = tensor.reshape(k, -1).T @ matrix.T
+    return tensor.reshape(r, r, r, r)
 
 
 def _symmetric(tensor: FloatArray) -> FloatArray:

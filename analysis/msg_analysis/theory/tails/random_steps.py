@@ -47,12 +47,14 @@ class RandomSteps:
 
     chain: FloatArray  # (n, n) P
     stages: list[list[Stage]]  # of each mode
-    embedding: FloatArray  # (k, d) with orthonormal columns: z = embedding @ y before, y = embedding^T z after
+    # (k, d) with orthonormal columns: z = embedding @ y before, y = embedding^T z after; None: z is y
+    embedding: FloatArray | None
 
     @property
     def shape(self) -> tuple[int, int]:
         """Modes n, and dimension d."""
-        return len(self.chain), self.embedding.shape[1]
+        k = len(self.stages[0][0].matrix)
+        return len(self.chain), k if self.embedding is None else self.embedding.shape[1]
 
 
 def random_steps(step: StepModel, system: JumpSystem) -> RandomSteps:
@@ -84,7 +86,7 @@ def random_steps(step: StepModel, system: JumpSystem) -> RandomSteps:
         i, j = np.nonzero(possible)
         into = step.nominal[mode][possible][:, None] * lift[i]
         stages.append([Stage(matrix, into, lift[older + j] - lift[i], step.losses[possible])])
-    return RandomSteps(system.chain, stages, np.eye(system.dimension))
+    return RandomSteps(system.chain, stages, None)
 
 
 def _stage(move: Move, size: int) -> Stage:
