@@ -154,21 +154,31 @@ def logged_autocovariance(observation: Observation, lags: IntArray | None = None
     d = system.dimension
     steps = min(observation.steps, int(MOST_NUMBERS / max(1, len(chosen) * d * max(d, replicas))))
     chosen = chosen[chosen < steps]
-    which, matrices, noise = kinds[0][:steps], kinds[1], kinds[2]
+    kinds = kinds[0][:steps], kinds[1], kinds[2]
+    which, matrices, noise = kinds
     y, product = _coordinates(observation, steps)
     seen = y if product is None else y @ product
     along = matrices[which]  # (N, d, d) W_k
-    windows = [_windows(along, lag) for lag in chosen.tolist()]
-    forms = np.zeros((len(chosen), steps + 1, d, d))
-    measured, expected, counts = np.empty(len(chosen)), np.empty(len(chosen)), steps + 1 - chosen
-    for place, (lag, window) in enumerate(zip(chosen.tolist(), windows, strict=True)):
+    forms = np.zeros((steps + 1, d, len(chosen), d))
+    left = np.zeros((len(chosen), steps, replicas, d))  # (W_k+l-1 ... W_k+1)^T C^T C y(k), what leaves a_j with k
+    measured, counts = np.empty(len(chosen)), steps + 1 - chosen
+    for place, lag in enumerate(chosen.tolist()):
+        if lag:
+            window = _windows(along[1:], lag - 1)  # from k + 1 on
+            left[place, : len(window)] = seen[: len(window)] @ window
+            window = window @ along[: len(window)]
+        else:
+            window = np.broadcast_to(np.eye(d), (steps + 1, d, d))
         form = window if product is None else product @ window
-        forms[place, : len(window)] = (form + form.transpose(0, 2, 1)) / 2.0
+        forms[: len(window), :, place] = (form + form.transpose(0, 2, 1)) / 2.0
         measured[place] = (seen[: len(window)] * y[lag:]).sum() / replicas
     moments = _moments(which, matrices, noise, y[0].T @ y[0] / replicas)
-    for place, form in enumerate(forms):
-        expected[place] = np.einsum("kab,kab->", form, moments)
-    covariance = _covariance(which, matrices, noise, forms, (y, seen), chosen)
+    expected = np.einsum("kalb,kab->l", forms, moments)
+    felt = np.zeros_like(left)  # a_j + 1: at first what enters it
+    for place, lag in enumerate(chosen.tolist()):
+        if lag:
+            felt[place, lag - 1 :] = seen[: steps - lag + 1]
+    covariance = _covariance(kinds, y, forms, felt, left)
     chi2, dof = quadratic_form(measured - expected, covariance)
     found: Spectrum = spectrum(observation.prediction, chosen, np.empty(0))
     return LoggedAutocovariance(
@@ -224,44 +234,53 @@ def _moments(which: IntArray, matrices: FloatArray, noise: FloatArray, start: Fl
     """(N + 1, d, d) M(0..N) given the path."""
     found = np.empty((len(which) + 1, *start.shape))
     found[0] = start
-    for k, kind in enumerate(which.tolist()):
-        found[k + 1] = matrices[kind] @ found[k] @ matrices[kind].T + noise[kind]
+    room = np.empty_like(start)
+    steps = [(matrix, matrix.T, added) for matrix, added in zip(matrices, noise, strict=True)]
+    for kind, before, after in zip(which.tolist(), found, found[1:], strict=False):
+        matrix, transposed, added = steps[kind]
+        matrix.dot(before, out=room)
+        room.dot(transposed, out=after)
+        after += added
     return found
 
 
 def _covariance(
-    which: IntArray,
-    matrices: FloatArray,
-    noise: FloatArray,
+    kinds: tuple[IntArray, FloatArray, FloatArray],
+    y: FloatArray,
     forms: FloatArray,
-    coordinates: tuple[FloatArray, FloatArray],
-    lags: IntArray,
+    felt: FloatArray,
+    left: FloatArray,
 ) -> FloatArray:
-    """(L, L): sum of Cov(D_j | past); ``forms`` (L, N + 1, d, d) H, which are overwritten; y, C^T C y (N + 1, R, d)."""
-    y, seen = coordinates
-    steps, replicas, number = len(which), y.shape[1], len(lags)
-    along = matrices[which]
-    left = np.zeros((number, steps, *y.shape[1:]))  # (W_k+l-1 ... W_k+1)^T C^T C y(k), what leaves a_j with k
-    felt = np.zeros_like(left)  # a_j + 1: at first what enters it
-    for place, lag in enumerate(lags.tolist()):
-        if lag:
-            window = _windows(along[1:], lag - 1)[:steps]  # from k + 1 on
-            left[place, : len(window)] = seen[: len(window)] @ window
-            felt[place, lag - 1 :] = seen[: steps - lag + 1]
+    """(L, L): sum of Cov(D_j | past).
+
+    ``forms`` (N + 1, d, L, d) H, and what enters (``felt``) and leaves (``left``) a_j, (L, N, R, d); the first two
+    are overwritten. In H the lags are an inner axis, so that a product of its recursion is one for all of them.
+    """
+    which, matrices, noise = kinds
+    number, steps, replicas, d = felt.shape
+    duals, columns = forms.reshape(-1, d * number, d), forms.reshape(-1, d, number * d)
+    wide, room, rest = np.empty(columns.shape[1:]), np.empty(duals.shape[1:]), np.empty((number, replicas, d))
+    tall, flat = wide.reshape(-1, d), rest.reshape(-1, d)
     transposed = [matrix.T for matrix in matrices]
-    kinds = which.tolist()
+    kinds_of_steps = which.tolist()
     for j in range(steps - 2, -1, -1):
-        following = kinds[j + 1]
-        felt[:, j] += (felt[:, j + 1] - left[:, j + 1]) @ matrices[following]
-        forms[:, j + 1] += transposed[following] @ forms[:, j + 2] @ matrices[following]  # now Y(j + 1)
+        kind = kinds_of_steps[j + 1]
+        matrix = matrices[kind]
+        np.subtract(felt[:, j + 1], left[:, j + 1], out=rest)
+        felt[:, j] += flat.dot(matrix).reshape(rest.shape)
+        transposed[kind].dot(columns[j + 2], out=wide)
+        tall.dot(matrix, out=room)
+        duals[j + 1] += room  # now Y(j + 1)
     total = np.zeros((number, number))
-    length = max(1, BLOCK_NUMBERS // forms[:, 0].size)
+    length = max(1, BLOCK_NUMBERS // forms[0].size)
     for first in range(0, steps, length):
         part = slice(first, min(first + length, steps))
-        duals, added = forms[:, part.start + 1 : part.stop + 1], noise[which[part]]
-        spread = duals @ added
-        total += 2.0 / replicas * (_rows(spread) @ _rows(spread.transpose(0, 1, 3, 2)).T)
-        slope = 2.0 * (y[part] @ along[part].transpose(0, 2, 1)) @ duals + felt[:, part]
+        later = slice(part.start + 1, part.stop + 1)
+        added, along = noise[which[part]], matrices[which[part]]
+        spread = (duals[later] @ added).reshape(-1, d, number, d)
+        total += 2.0 / replicas * (_rows(spread.transpose(2, 0, 1, 3)) @ _rows(spread.transpose(2, 0, 3, 1)).T)
+        slope = (2.0 * y[part] @ along.transpose(0, 2, 1)) @ forms[later].transpose(2, 0, 1, 3)
+        slope += felt[:, part]
         total += _rows(slope @ added) @ _rows(slope).T / replicas**2
     return (total + total.T) / 2.0
 
