@@ -215,4 +215,4 @@ def _forward(periods: Periods, start: FloatArray) -> tuple[FloatArray, list[tupl
 
 def _next(periods: Periods, number: int, moment: FloatArray) -> FloatArray:
     period = periods[number]
-    return np.asarray(period.matrix @ moment @ period.matrix.T + period.noise)
+    return np.asarray(period.matrix.dot(moment).dot(period.matrix.T) + period.noise)  # dot: see ``given_path``

@@ -25,6 +25,8 @@ matrices are computed once for each pattern.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,6 +50,15 @@ class Period:
     noise: FloatArray  # (S', S') covariance
 
 
+class _Law(NamedTuple):
+    """How an agent steps under a graph, as plain numbers."""
+
+    own: float  # weight of its own value
+    inputs: list[tuple[int, float]]  # its neighbours and their weights
+    shared: list[tuple[int, float]]  # the sources of noise that others feel too, and their gains
+    variance: float  # of the rest of its noise
+
+
 class Periods:
     """The periods K = 1..N-1 of a run in real time, from sampling time K-1 to K.
 
@@ -63,6 +74,7 @@ class Periods:
         self._numbers = np.full((step.agents, step.agents), -1)
         self._numbers[links[:, 0], links[:, 1]] = 3 * step.agents + np.arange(len(links))
         self._shared = _shared_sources(step)
+        self._law = lru_cache(maxsize=None)(self._law_of)
         graphs, used, made = observation.timers.graphs, observation.timers.used, observation.timers.made
         steps, m = graphs.shape
         self._observation, self._newest = observation, newest_steps(observation)[:steps]
@@ -198,28 +210,37 @@ class Periods:
             self._cache[key] = found
         return self._cache[key]
 
+    def _law_of(self, graph: int, agent: int) -> _Law:
+        tables, gain = neighbour_tables(self._step), self._step.noise_gain[graph, agent]
+        senders = tables.senders[graph, agent, : tables.count[graph, agent]].tolist()
+        weights = neighbour_weights(self._step)[graph, agent].tolist()
+        shared = np.flatnonzero(self._shared & (gain != 0.0)).tolist()
+        return _Law(
+            float(self._step.nominal[graph, agent, agent]),
+            list(zip(senders, weights, strict=False)),
+            [(which, float(gain[which])) for which in shared],
+            float((gain[~self._shared] ** 2).sum()),
+        )
+
     def _compile(self, events: IntArray, before: IntArray, after: IntArray) -> Period:
         """Event by event; values are kept as long as they are used."""
         step, m = self._step, self._step.agents
-        tables, weights, most = neighbour_tables(step), neighbour_weights(step), step.most_neighbours
-        live = _Live(m + len(before), m)
+        most = neighbour_tables(step).senders.shape[2]
         sources = range(m, 2 * m)
         owners = self._owners.tolist()
         # Values by agent and step from the newest one at the beginning; noise by source and step from the end.
-        for j in range(m):
-            live.start((j, 0))
-        for entry, offset in before.tolist():
-            live.start((entry, offset - 1 if entry in sources else offset))
+        known = [(j, 0) for j in range(m)]
+        known += [(entry, offset - 1 if entry in sources else offset) for entry, offset in before.tolist()]
+        live = _Live(known, m)
         made = [0] * m
         rows: list[tuple[_Key, dict[_Key, float], float]] = []
         published = 2 * m if step.broadcast else 0
         for agent, graph, lag, own, *heard in events.tolist():
-            mine = agent, own
-            terms = {mine: float(step.nominal[graph, agent, agent])}
+            mine, law = (agent, own), self._law(graph, agent)
+            terms = {mine: law.own}
             variance = 0.0
-            for d in range(int(tables.count[graph, agent])):
-                sender, weight, again = int(tables.senders[graph, agent, d]), float(weights[graph, agent, d]), 0
-                key = mine
+            for d, (sender, weight) in enumerate(law.inputs):
+                key, again = mine, 0
                 if heard[d] != _OWN:
                     key, again = (published + sender, heard[d]), heard[most + d]
                     if again:
@@ -230,11 +251,10 @@ class Periods:
                     else:
                         variance += (weight * step.link) ** 2
                 terms[key] = terms.get(key, 0.0) + weight
-            gain = step.noise_gain[graph, agent]
-            for which in np.flatnonzero(self._shared & (gain != 0.0)).tolist():
-                terms[m + which, lag] = float(gain[which])
+            for which, gain in law.shared:
+                terms[m + which, lag] = gain
             made[agent] = own + 1
-            rows.append(((agent, own + 1), terms, variance + float((gain[~self._shared] ** 2).sum())))
+            rows.append(((agent, own + 1), terms, variance + law.variance))
             if published:
                 rows.append(((published + agent, own + 1), {(agent, own + 1): 1.0}, step.broadcast**2))
         stacked = [(j, made[j]) for j in range(m)]
@@ -258,17 +278,12 @@ class _Live:
     Keys are (entry, step), see ``Periods``; noise sources are numbers of variance 1, new where not known yet.
     """
 
-    def __init__(self, entries: int, agents: int) -> None:
-        self._agents = agents
-        self._matrix = np.zeros((2 * entries, entries))
+    def __init__(self, stack: list[_Key], agents: int) -> None:
+        self._agents, entries = agents, len(stack)
+        self._matrix = np.eye(2 * entries, entries)
         self._noise = np.zeros((2 * entries, 2 * entries))
-        self._place: dict[_Key, int] = {}
-        self._free = list(range(2 * entries))[::-1]
-
-    def start(self, key: _Key) -> None:
-        """Add the next entry of the stack."""
-        place = self._new(key)
-        self._matrix[place, len(self._place) - 1] = 1.0
+        self._place = {key: place for place, key in enumerate(stack)}
+        self._free = list(range(entries, 2 * entries))[::-1]
 
     def add(self, key: _Key, terms: dict[_Key, float], variance: float) -> None:
         """Add a combination of others, plus noise of its own."""
@@ -289,7 +304,7 @@ class _Live:
     def take(self, keys: list[_Key]) -> Period:
         """The period that ends with this stack."""
         rows = [self._find(key) for key in keys]
-        return Period(self._matrix[rows], self._noise[np.ix_(rows, rows)])
+        return Period(self._matrix[rows], self._noise[rows][:, rows].copy())
 
     def _find(self, key: _Key) -> int:
         if key not in self._place and self._agents <= key[0] < 2 * self._agents:
