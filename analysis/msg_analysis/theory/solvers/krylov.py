@@ -119,7 +119,8 @@ def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, m
     most = max(5, min(most, MAX_BASIS, int(MAX_BASIS_BYTES / right.nbytes)))
     basis = np.empty((q, min(most + 1, 16), length), dtype=right.dtype)
     triangle = np.zeros((q, most, most))
-    cosines, sines, target = np.zeros((q, most)), np.zeros((q, most)), np.zeros((q, most + 1))
+    target = np.zeros((q, most + 1))
+    turned = np.ones((q, 1, 1))  # product of all Givens rotations, which make the Hessenberg matrix a triangle
     norm = np.linalg.norm(right.reshape(q, -1), axis=1)
     basis[:, 0] = right.reshape(q, -1) / np.where(norm > 0.0, norm, 1.0)[:, None]
     target[:, 0] = norm
@@ -139,17 +140,17 @@ def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, m
         size = np.linalg.norm(vector, axis=1)
         column[:, used + 1] = size
         basis[:, used + 1] = vector / np.where(size > 0.0, size, 1.0)[:, None]
-        for k in range(used):
-            upper, lower = column[:, k].copy(), column[:, k + 1]
-            column[:, k] = cosines[:, k] * upper + sines[:, k] * lower
-            column[:, k + 1] = cosines[:, k] * lower - sines[:, k] * upper
-        pivot = np.hypot(column[:, used], column[:, used + 1])
+        column[:, : used + 1] = (turned @ column[:, : used + 1, None])[:, :, 0]
+        pivot = np.hypot(column[:, used], size)
         safe = np.where(pivot > 0.0, pivot, 1.0)
-        cosines[:, used], sines[:, used] = column[:, used] / safe, column[:, used + 1] / safe
-        column[:, used] = safe
-        triangle[:, : used + 1, used] = column[:, : used + 1]
-        target[:, used + 1] = -sines[:, used] * target[:, used]
-        target[:, used] *= cosines[:, used]
+        cosine, sine = column[:, used] / safe, size / safe
+        triangle[:, :used, used], triangle[:, used, used] = column[:, :used], safe
+        target[:, used + 1] = -sine * target[:, used]
+        target[:, used] *= cosine
+        last, before, turned = turned[:, used], turned, np.zeros((q, used + 2, used + 2))
+        turned[:, :used, : used + 1] = before[:, :used]
+        turned[:, used, : used + 1], turned[:, used, used + 1] = cosine[:, None] * last, sine
+        turned[:, used + 1, : used + 1], turned[:, used + 1, used + 1] = -sine[:, None] * last, cosine
         used += 1
         if (np.abs(target[:, used]) <= tolerance * norm).all():
             break

@@ -21,6 +21,7 @@ them always, others if they are well conditioned, else the complex Schur form (B
 from __future__ import annotations
 
 import copy
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -103,6 +104,7 @@ class LocalSolves:
     def single(self) -> LocalSolves:
         """The same in single precision."""
         other = copy.copy(self)
+        other.__dict__.pop("_null_factors", None)  # of these eigenvectors
         other.drift, other.leaving = single(self.drift), single(self.leaving)
         if self.eigenvectors is not None:
             other.eigenvectors = Eigenvectors(*[single(part) for part in self.eigenvectors])
@@ -153,15 +155,22 @@ class LocalSolves:
 
     def without_null(self, matrices: FloatArray) -> FloatArray:
         """(..., k, d, d) without the directions in which D is zero but for rounding."""
-        if self.eigenvectors is None or not self._null.any():
+        if self._null_factors is None:
             return matrices
+        left, right = self._null_factors
+        return np.asarray(matrices - (left @ (right @ matrices)).real)
+
+    @cached_property
+    def _null_factors(self) -> tuple[AnyArray, AnyArray] | None:
+        """(k, d, z) and (k, z, d), whose product is the projection on the directions in which D is zero; None: none."""
+        if self.eigenvectors is None or not self._null.any():
+            return None
         _, vectors, inverse = self.eigenvectors
         keep = int(self._null.sum(axis=1).max())
         order = np.argsort(~self._null, axis=1, kind="stable")[:, :keep]  # padded where there are fewer
         used = np.take_along_axis(self._null, order, axis=1)
         left = np.take_along_axis(vectors, order[:, None, :], axis=2) * used[:, None, :]
-        right = np.take_along_axis(inverse, order[:, :, None], axis=1)
-        return np.asarray(matrices - (left @ (right @ matrices)).real)
+        return left, np.take_along_axis(inverse, order[:, :, None], axis=1)
 
 
 def _separated(drift: FloatArray) -> FloatArray:
