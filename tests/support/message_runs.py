@@ -38,6 +38,7 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
     record = new_record(experiment)
     m, steps, dt, replicas = law.agents, law.steps, law.step_length, law.run.replicas
     noise, real_time = law.noise, law.run.pace == "realtime"
+    holds, delay = noise.holds, noise.delay
     gains = law.leader_gains
     laplacians = [np.diag(g.adjacency.sum(axis=1)) - g.adjacency for g in law.graph_list]
     weights = np.eye(m) - dt * (np.stack(laplacians) + np.diag(gains))
@@ -80,11 +81,13 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
     used = np.full((steps, m, most), -1, dtype=np.int64)
     gone = np.zeros((steps, m, most), dtype=bool)
     newest = dict.fromkeys(links, 0)
+    # As plain numbers for the loop, which reads them one by one.
+    path, rows, is_lost = modes.tolist(), weights.tolist(), {link: one.tolist() for link, one in lost.items()}
     order = np.lexsort((np.tile(np.arange(m), steps), np.repeat(np.arange(steps), m), due.ravel()))
     gives = [law.reference * (1.0 - w.sum(axis=1)) for w in weights]  # the reference to each agent
     for k, i in np.column_stack(np.unravel_index(order, (steps, m))).tolist():
-        mode, own = modes[k], states[k, i]
-        w = weights[mode, i]
+        mode, own = path[k], states[k, i]
+        w = rows[mode][i]
         total = own * w[i] + gives[mode][i]
         for d, j in enumerate(senders[mode][i]):
             n = k
@@ -92,12 +95,12 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
                 while newest[i, j] < steps and _there(newest[i, j] + 1, made[k + 1, i], made[:, j], arrives[i, j]):
                     newest[i, j] += 1
                 n = newest[i, j]
-            s = max(0, n - noise.delay)
-            gone[k, i, d] = lost[i, j][s]
-            if noise.holds:
-                while lost[i, j][s]:
+            s = max(0, n - delay)
+            gone[k, i, d] = is_lost[i, j][s]
+            if holds:
+                while is_lost[i, j][s]:
                     s -= 1
-            elif lost[i, j][s]:
+            elif is_lost[i, j][s]:
                 s = -1
             used[k, i, d] = s
             total = total + w[j] * (own if s < 0 else published[s, j] + drawn[i, j][s])

@@ -74,7 +74,9 @@ class TimeMeans:
             return True
         if self.switches < MIN_SWITCHES or len(self.system_variances) < PARTS:
             return False
-        parts = np.array([part.sum() for part in np.array_split(self.system_variances, PARTS)])
+        size, more = divmod(len(self.system_variances), PARTS)
+        lengths = np.where(np.arange(PARTS) < more, size + 1, size)
+        parts = np.add.reduceat(self.system_variances, lengths.cumsum() - lengths)
         total = float(parts.sum())
         return total > 0.0 and float((parts / total).std(ddof=1)) * math.sqrt(PARTS) <= MAX_SPREAD
 

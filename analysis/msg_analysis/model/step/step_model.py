@@ -85,7 +85,7 @@ class Wiring:
     @property
     def most_neighbours(self) -> int:
         """Largest number D of neighbours that any agent has in any graph."""
-        return int(self.links.sum(axis=2, where=~np.eye(self.agents, dtype=bool)).max())
+        return _most_neighbours(self)
 
     def listens(self) -> BoolArray:
         """(m, m): whether agent i uses the state of agent j != i in any graph."""
@@ -140,6 +140,11 @@ class StepMatrices:
 
     weights: FloatArray  # (n, m, m) W_g when nothing is lost: ``StepModel.nominal``
     noise_gain: FloatArray  # (n, m, m) B_g
+
+
+@lru_cache(maxsize=4)
+def _most_neighbours(wiring: Wiring) -> int:
+    return int(wiring.links.sum(axis=2, where=~np.eye(wiring.agents, dtype=bool)).max())
 
 
 @lru_cache(maxsize=16)
