@@ -136,13 +136,15 @@ def _by_arnoldi(system: JumpSystem, _: np.random.Generator | None) -> float | No
     def inverse(packed: FloatArray) -> FloatArray:
         moments = packed_symmetric.unpack(packed.reshape(shape), system.dimension)
         noise = moments / system.stationary[:, None, None]
-        return packed_symmetric.pack(IterativeSolver(replace(system, noise=noise)).steady()).ravel()
+        return packed_symmetric.pack(solver.steady(noise)).ravel()
 
     size = math.prod(shape)
-    step = forward if system.time == "discrete" else inverse
-    operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=step, dtype=float)
     start = packed_symmetric.pack(np.broadcast_to(np.eye(system.dimension), system.matrices.shape)).ravel()
     try:
+        step = forward
+        if system.time == "continuous":
+            step, solver = inverse, IterativeSolver(system)
+        operator = scipy.sparse.linalg.LinearOperator((size, size), matvec=step, dtype=float)
         values = scipy.sparse.linalg.eigs(operator, k=1, v0=start, tol=1e-9, maxiter=1000, return_eigenvectors=False)
     except (scipy.sparse.linalg.ArpackNoConvergence, InputError):
         return None

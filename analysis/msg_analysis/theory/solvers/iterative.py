@@ -63,10 +63,10 @@ class IterativeSolver:
         self._guess = guess
         self.report: SolverReport | None = None
 
-    def steady(self) -> FloatArray:
-        """See ``MomentSolver.steady``."""
+    def steady(self, noise: FloatArray | None = None) -> FloatArray:
+        """See ``MomentSolver.steady``; ``noise``: (n, d, d), another one than that of the system."""
         system = self._equations.system
-        right = system.noise[None]
+        right = (system.noise if noise is None else noise)[None]
         if system.time == "discrete":
             right = self._equations.after_jump(right)
         weights = system.stationary[:, None, None]
