@@ -167,11 +167,22 @@ def test_agents_by_name(browser: Any, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def disagrees(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def kinds(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Any], Path]:
+    """The report of a comparison and run, by the function that makes them."""
+
+    @functools.cache
+    def made(make: Any) -> Path:
+        path = tmp_path_factory.mktemp("kinds") / "report.html"
+        write_report(*make(), path)
+        return path
+
+    return made
+
+
+@pytest.fixture
+def disagrees(kinds: Callable[[Any], Path]) -> Path:
     """The report of a run that disagrees."""
-    path = tmp_path_factory.mktemp("disagrees") / "report.html"
-    write_report(*_disagreeing(), path)
-    return path
+    return kinds(_disagreeing)
 
 
 def test_screens_of_all_kinds(browser: Any, disagrees: Path) -> None:
@@ -417,10 +428,8 @@ def _tracking() -> tuple[Any, Trajectory]:
         (_tracking, ["the leader, agent 2, is held at the reference 3", "Probabilities"]),
     ],
 )
-def test_every_kind(browser: Any, tmp_path: Path, make: Any, words: list[str]) -> None:
-    comparison, trajectory = make()
-    path = tmp_path / "report.html"
-    write_report(comparison, trajectory, path)
+def test_every_kind(browser: Any, kinds: Callable[[Any], Path], make: Any, words: list[str]) -> None:
+    path = kinds(make)
     page, log = _open(browser, path)
     _check(page, log, path)
     text = page.inner_text("body")
