@@ -279,21 +279,31 @@ class _Live:
     """
 
     def __init__(self, stack: list[_Key], agents: int) -> None:
-        self._agents, entries = agents, len(stack)
-        self._matrix = np.eye(2 * entries, entries)
-        self._noise = np.zeros((2 * entries, 2 * entries))
+        self._agents, self._entries = agents, len(stack)
+        entries = self._entries
+        # Of every value its combination of the stack, and after it the covariance of its noise with that of the others.
+        self._rows = np.eye(2 * entries, 3 * entries)
+        self._rows[entries:] = 0.0
+        self._noise = self._rows[:, entries:]
         self._place = {key: place for place, key in enumerate(stack)}
         self._free = list(range(entries, 2 * entries))[::-1]
 
     def add(self, key: _Key, terms: dict[_Key, float], variance: float) -> None:
         """Add a combination of others, plus noise of its own."""
-        rows, weights = [self._find(used) for used in terms], np.array(list(terms.values()))
-        matrix, noise = weights @ self._matrix[rows], weights @ self._noise[rows]
-        own = float(noise[rows] @ weights) + variance
+        rows = [self._find(used) for used in terms]
+        if len(rows) == 1:  # what is sent or received, as often as not
+            (row,), (weight,) = rows, terms.values()
+            found = weight * self._rows[row]
+            own = weight * found[self._entries + row]
+        else:
+            weights = np.array(list(terms.values()))
+            found = weights @ self._rows[rows]
+            own = found[self._entries :][rows] @ weights
         place = self._new(key)  # may make the arrays larger
-        self._matrix[place] = matrix
-        self._noise[place, : len(noise)] = self._noise[: len(noise), place] = noise
-        self._noise[place, place] = own
+        noise = found[self._entries :]
+        self._rows[place, : len(found)] = found
+        self._noise[: len(noise), place] = noise
+        self._noise[place, place] = own + variance
 
     def drop(self, keys: list[_Key]) -> None:
         """Drop values that are no longer used."""
@@ -304,20 +314,21 @@ class _Live:
     def take(self, keys: list[_Key]) -> Period:
         """The period that ends with this stack."""
         rows = [self._find(key) for key in keys]
-        return Period(self._matrix[rows], self._noise[rows][:, rows].copy())
+        found = self._rows[rows]
+        return Period(found[:, : self._entries].copy(), found[:, self._entries :][:, rows].copy())
 
     def _find(self, key: _Key) -> int:
         if key not in self._place and self._agents <= key[0] < 2 * self._agents:
             place = self._new(key)
-            self._matrix[place] = self._noise[place] = self._noise[:, place] = 0.0
+            self._rows[place] = self._noise[:, place] = 0.0
             self._noise[place, place] = 1.0
         return self._place[key]
 
     def _new(self, key: _Key) -> int:
         if not self._free:
-            size = len(self._matrix)
-            self._matrix = np.pad(self._matrix, ((0, size), (0, 0)))
-            self._noise = np.pad(self._noise, ((0, size), (0, size)))
+            size = len(self._rows)
+            self._rows = np.pad(self._rows, ((0, size), (0, size)))
+            self._noise = self._rows[:, self._entries :]
             self._free = list(range(2 * size))[: size - 1 : -1]
         self._place[key] = self._free.pop()
         return self._place[key]
