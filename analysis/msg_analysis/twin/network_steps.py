@@ -29,17 +29,27 @@ from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
+def law_of_all(experiment: ValidExperiment, model: StepModel) -> ManySteps:
+    """The steps of all agents under every graph."""
+    lead = ahead(experiment).astype(np.bool_)
+    holds = model.listens() if experiment.noise.holds else None
+    return ManySteps([_rounds(model, mode, lead, holds) for mode in range(model.modes)])
+
+
 def states(
-    experiment: ValidExperiment, model: StepModel, modes: IntArray, start: FloatArray, first: int = 0
+    experiment: ValidExperiment,
+    model: StepModel,
+    modes: IntArray,
+    start: FloatArray,
+    first: int = 0,
+    law: ManySteps | None = None,
 ) -> Iterator[FloatArray]:
     """x(first + 1), x(first + 2), ..., from x(first) under the graphs ``modes`` from there on, in blocks (k, m, R).
 
-    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative.
+    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``law``: as of ``law_of_all``.
     """
     air = AirReception(experiment, model, start, first) if experiment.noise.steps_only else None
-    lead = ahead(experiment).astype(np.bool_)
-    holds = model.listens() if experiment.noise.holds else None
-    law = ManySteps([_rounds(model, mode, lead, holds) for mode in range(model.modes)])
+    law = law or law_of_all(experiment, model)
     past = np.repeat(start[None], experiment.noise.delay + 1, axis=0)  # before the start the states are those of it
     for begin, now, drives in _blocks(experiment, model, modes, first):
         made = law.advance(now, past, drives, air.block(begin, len(now)) if air else None)

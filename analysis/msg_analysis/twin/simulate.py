@@ -25,7 +25,7 @@ from msg_analysis.model.arithmetic.payload import from_payload, to_payload
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.protocol_binding import AgentProtocol
 from msg_analysis.model.run.agent_law import ProtocolLaw
-from msg_analysis.model.run.graph_path import mode_path
+from msg_analysis.model.run.graph_path import mode_path, sojourns
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.model.step.air_reception import add_broadcast_noise, ahead, lost_values, used_steps
@@ -41,8 +41,7 @@ KEY_SIZE = 32  # bytes
 def new_record(experiment: ValidExperiment, run: uuid.UUID | None = None) -> RunRecord:
     """Everything that a new run of an experiment starts from; ``run``: its id, a new random one if not given."""
     model = build_model(experiment)
-    modes = mode_path(experiment, model.initial)
-    start = draw_start(experiment, model, int(modes[0]))
+    start = draw_start(experiment, model, next(sojourns(experiment, model.initial)).mode)
     if experiment.protocol and not isinstance(model, StepModel):
         start = np.array([AgentProtocol(experiment.protocol, i).start(x).ravel() for i, x in enumerate(start)])
     matrices = None

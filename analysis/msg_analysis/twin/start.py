@@ -25,13 +25,14 @@ from __future__ import annotations
 import numpy as np
 
 from msg_analysis.errors import InputError
+from msg_analysis.model.arithmetic.many_steps import ManySteps
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.model.arithmetic.update_law import weighted_sum
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.problems import problem
 from msg_analysis.model.run.graph_path import past_modes
 from msg_analysis.model.step.step_model import StepModel, Wiring
-from msg_analysis.twin.network_steps import states
+from msg_analysis.twin.network_steps import law_of_all, states
 from msg_analysis.types import FloatArray
 
 TOLERANCE = 2.0**-10
@@ -64,9 +65,9 @@ def draw_start(experiment: ValidExperiment, model: Wiring, first_mode: int) -> F
 def _from_the_past(experiment: ValidExperiment, model: StepModel, first_mode: int) -> FloatArray | None:
     """x(0) at the end of a past that is long enough; None where that would take too long."""
     size = experiment.agents * experiment.run.replicas
-    steps, before = STEPS_PER_BLOCK, None
+    steps, before, law = STEPS_PER_BLOCK, None, law_of_all(experiment, model)
     while steps <= MAX_PAST and steps * size <= MAX_NUMBERS:
-        start, floor = _end_of_the_past(experiment, model, first_mode, steps)
+        start, floor = _end_of_the_past(experiment, model, law, first_mode, steps)
         if before is not None and _same(start - before, start - model.reference, floor):
             return start
         before, steps = start, 2 * steps
@@ -74,14 +75,14 @@ def _from_the_past(experiment: ValidExperiment, model: StepModel, first_mode: in
 
 
 def _end_of_the_past(
-    experiment: ValidExperiment, model: StepModel, first_mode: int, steps: int
+    experiment: ValidExperiment, model: StepModel, law: ManySteps, first_mode: int, steps: int
 ) -> tuple[FloatArray, float]:
     """x(0) of a past of so many steps that begins at the reference, and the size of its rounding errors.
 
     In consensus only differences between agents are stationary: their average is put to 0.
     """
     state = np.full((experiment.agents, experiment.run.replicas), model.reference)
-    for block in states(experiment, model, past_modes(experiment, first_mode, steps), state, -steps):
+    for block in states(experiment, model, past_modes(experiment, first_mode, steps), state, -steps, law):
         state = block[-1]
     rounding = 2.0**-40 * float(np.abs(state).max())
     if experiment.problem == "consensus":
