@@ -29,6 +29,7 @@ from msg_analysis.types import AnyArray
 
 LARGE = 2**27  # bytes from which an array is in a file
 BLOCK_NUMBERS = 2_000_000  # numbers of a large array that are looked at together: 16 MB
+SMALL_BLOCK = 200_000  # the same where there are several such arrays: they stay in the caches, and memory is used again
 
 
 def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:

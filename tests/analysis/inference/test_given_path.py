@@ -136,7 +136,7 @@ def test_many_kinds_of_losses_are_left_out(monkeypatch):
 def test_blocks_change_nothing(monkeypatch):
     observation = observe(CASES["air"])
     whole = means_given_path(observation)
-    monkeypatch.setattr(module, "BLOCK_NUMBERS", 50)
+    monkeypatch.setattr(module, "SMALL_BLOCK", 50)
     split = means_given_path(observation)
     for field in dataclasses.fields(whole):
         np.testing.assert_allclose(getattr(split, field.name), getattr(whole, field.name), rtol=1e-11)

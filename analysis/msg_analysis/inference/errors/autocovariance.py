@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.intervals import HALF_WIDTH_95
-from msg_analysis.common.large_arrays import BLOCK_NUMBERS
+from msg_analysis.common.large_arrays import SMALL_BLOCK
 from msg_analysis.inference.errors.given_path import steps_of_path
 from msg_analysis.inference.errors.time_means import without_rounding
 from msg_analysis.inference.observed.observation import Observation
@@ -272,7 +272,7 @@ def _covariance(
         tall.dot(matrix, out=room)
         duals[j + 1] += room  # now Y(j + 1)
     total = np.zeros((number, number))
-    length = max(1, BLOCK_NUMBERS // forms[0].size)
+    length = max(1, SMALL_BLOCK // max(forms[0].size, felt[:, 0].size))
     for first in range(0, steps, length):
         part = slice(first, min(first + length, steps))
         later = slice(part.start + 1, part.stop + 1)

@@ -35,7 +35,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import BLOCK_NUMBERS
+from msg_analysis.common.large_arrays import SMALL_BLOCK
 from msg_analysis.common.long_work import tell
 from msg_analysis.inference.errors.estimates import Estimate, estimate
 from msg_analysis.inference.errors.time_means import TimeMeans, forms_of, moments, without_rounding
@@ -162,7 +162,7 @@ def _backwards(
     lifted = packed_symmetric.unpack(forms, d).transpose(1, 0, 2).copy()
     seen, covariance = np.zeros(forms.shape[1]), np.zeros((q, q))
     series, variances = np.empty(steps), np.zeros(steps)
-    length = max(1, BLOCK_NUMBERS // max(q * d**2, observation.states[0].size))
+    length = max(1, SMALL_BLOCK // max(q * d**2, observation.states[0].size))
     dual = lifted  # Y(last + 1) of the block
     for first in reversed(range(0, steps, length)):
         last = min(first + length, steps)
