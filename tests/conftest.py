@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import gc
 import os
 import signal
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +27,12 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 # All that is imported and collected stays to the end: the collector of garbage need not look through it each time.
 gc.disable()
 OBJECTS_BETWEEN_COLLECTIONS = 20_000  # Python's 700 are for smaller programs
+
+# Arrays of one test are made in the memory of those before it, which the C library would give back to the system.
+if sys.platform == "linux":
+    M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3  # of <malloc.h>
+    for option, size in ((M_TRIM_THRESHOLD, 2**28), (M_TOP_PAD, 2**26), (M_MMAP_THRESHOLD, 2**25)):
+        getattr(ctypes.CDLL(None), "mallopt", lambda *_: 0)(option, size)
 
 INTEGRATION = Path(__file__).parent / "integration"
 
