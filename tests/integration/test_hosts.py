@@ -207,7 +207,8 @@ def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
 @pytest.mark.parametrize("pace", ["lockstep", "realtime"])
 def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> None:
     """A lease of 5 s instead of a minute; it is cut off for 12 s, so that both sides have given each other up."""
-    prepare(lan, 250 if pace == "lockstep" else 30, run={"pace": pace})
+    run = {} if pace == "lockstep" else {"dt": 0.1, "replicas": 32}  # fewer and larger messages: soon seen in the bag
+    prepare(lan, 250 if pace == "lockstep" else 30, run={"pace": pace, **run})
     command = [str(PROGRAM), "host", str(lan.run_file), str(lan.hosts_file), "--profile"]
     profile = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     short, count = re.subn(r"(<leaseDuration>\s*<sec>)60", r"\g<1>5", profile)
@@ -215,7 +216,7 @@ def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> 
     file = lan.network.directory / "short.xml"
     file.write_text(short)
     setting = dict.fromkeys(PROFILE_VARIABLES, str(file)) | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
-    hosts = lan.start_all("--patience", "60", **dict.fromkeys(NAMES, setting))
+    hosts = lan.start_all("--no-analyse", "--patience", "60", **dict.fromkeys(NAMES, setting))
     lan.network.wait_until_moving("base")
     assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
     lan.plug("left", "down", cable=True)
@@ -226,7 +227,7 @@ def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> 
 
 def test_clocks_of_one_machine_agree(lan: Lan) -> None:
     """The clocks of these hosts are one clock: 0 is in every interval, and nobody is warned."""
-    prepare(lan, 10, run={"pace": "realtime"})
+    prepare(lan, 5, run={"pace": "realtime"})
     texts = ended(lan.start_all("--no-analyse"), 0)
     clocks = json.loads(texts["base"][0])["clocks"]
     assert [entry["node"] for entry in clocks] == [f"agent_{i}" for i in range(1, 6)]
@@ -239,7 +240,7 @@ def test_a_clock_that_is_ahead_is_found(lan: Lan) -> None:
     """That of the left host is 200 ms ahead of the others, by a library; dt / speed is 50 ms."""
     clock = SetClock(lan.network.directory)
     clock.set_ahead(0.2)
-    prepare(lan, 10, run={"pace": "realtime"})
+    prepare(lan, 5, run={"pace": "realtime"})
     texts = ended(lan.start_all("--no-analyse", left=clock.environment), 0)
     for entry in json.loads(texts["base"][0])["clocks"]:
         low, high = entry["ahead_ms"]

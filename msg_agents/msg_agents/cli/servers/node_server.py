@@ -28,11 +28,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 MODULES = (
+    "importlib.readers",  # by the recorder: the definitions of messages
     "msg_agents.cli.main",
     "msg_agents.nodes.agents.agent_group",
     "msg_agents.nodes.node_process",
     "msg_agents.nodes.recorder",
     "msg_agents.nodes.switcher",
+    "numpy.ma",  # by the recorder: ``numpy.unique``
     "numpy.random",
     "rclpy.experimental.events_executor",
     "setproctitle",
