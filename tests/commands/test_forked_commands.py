@@ -44,3 +44,15 @@ def test_nodes_have_no_other_such_variables(profile: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize("name", ["LANG", "LD_PRELOAD", "OPENBLAS_CORETYPE", "PYTHONPATH", "PYTHONWARNINGS"])
 def test_what_is_read_at_a_start(name: str) -> None:
     assert forked_commands.read_at_start({name: "x", "ROS_DOMAIN_ID": "7"}) == {name: "x"}
+
+
+def test_packages_that_can_be_found_later(tmp_path: Path) -> None:
+    """Not those that hide what has been imported, and not what Python imports at its start."""
+    (tmp_path / "laws_of_a_test.py").touch()
+    variables = {"PYTHONPATH": os.pathsep.join([str(tmp_path), "/nowhere"])}
+    assert forked_commands.packages_of({}, sys.path) == []
+    assert forked_commands.packages_of(variables, sys.path) == [str(tmp_path), "/nowhere"]
+    for name in ("rclpy", "numpy.py", "sys.py", "sitecustomize.py"):
+        (tmp_path / name).touch()
+        assert forked_commands.packages_of(variables, sys.path) == [], name
+        (tmp_path / name).unlink()

@@ -2,8 +2,8 @@
 
 Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis``, the fork server of a network and the
 nodes of tests (``python -P -c CODE``), if nothing is asked for but streams, a directory, a session, a function of this
-folder that is called first, a network namespace (``ip netns exec``), and variables that are read after the imports. It
-executes all else as ever. A forked process is a child of the process that asked, has the title of its command, and its
+folder that is called first, a network namespace (``ip netns exec``), variables that are read after the imports, and
+a PYTHONPATH with other packages. It executes all else as ever. A forked process is a child of the process that asked, has the title of its command, and its
 mark can be read in its environment, as after exec.
 """
 
@@ -14,6 +14,7 @@ import ctypes
 import fcntl
 import functools
 import importlib
+import importlib.machinery
 import io
 import json
 import os
@@ -92,6 +93,16 @@ def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
     return {name: value for name, value in environment.items() if not READ_LATER.fullmatch(name)}
 
 
+def packages_of(environment: Mapping[str, str], path: Sequence[str]) -> list[str]:
+    """The folders in PYTHONPATH, if it makes no difference when they are found: none of their modules is on ``path``."""
+    folders = [Path(folder) for folder in environment.get("PYTHONPATH", "").split(os.pathsep) if folder]
+    names = {file.name.partition(".")[0] for folder in folders if folder.is_dir() for file in folder.iterdir()}
+    known = {"sitecustomize", "usercustomize", *sys.builtin_module_names}  # Python imports the first two at its start
+    if any(name in known or importlib.machinery.PathFinder.find_spec(name, path) for name in names):
+        return []
+    return list(map(str, folders))
+
+
 def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Sequence[Any]) -> dict[str, Any] | None:
     """What the arguments of ``_fork_exec`` ask for; None if it is not known how to fork that."""
     command = [os.fsdecode(word) for word in words]
@@ -129,7 +140,7 @@ class _Forker:
 
     def __init__(self) -> None:
         self._control: socket.socket | None = None
-        self._whole = dict(os.environ)  # as it is before any test changes it
+        self._whole, self._path = dict(os.environ), list(sys.path)  # as they are before any test changes them
         self._environment = read_at_start(self._whole)
 
     def fork_exec(self, *arguments: Any) -> int:
@@ -138,9 +149,13 @@ class _Forker:
             return _fork_exec(*arguments)  # type: ignore[misc]
         if self._control is None:
             self._control = self._start()
+        request["packages"] = packages_of(request["environment"], self._path)
+        at_start = read_at_start(request["environment"])
+        if request["packages"]:
+            del at_start["PYTHONPATH"]
         descriptors = descriptors_of(request, arguments)
         message = json.dumps([[request, list(range(len(descriptors)))]]).encode()
-        if len(message) > LONGEST or read_at_start(request["environment"]) != self._environment:
+        if len(message) > LONGEST or at_start != self._environment:
             return _fork_exec(*arguments)  # type: ignore[misc]
         socket.send_fds(self._control, [message], descriptors)
         pid = int(self._control.recv(LONGEST))
@@ -183,6 +198,7 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
     os.chdir(request["directory"])
     os.environ.clear()
     os.environ.update(request["environment"])
+    sys.path[:0] = request["packages"]
     _write_mark(request["environment"].get(MARK, ""))
     free = [fcntl.fcntl(descriptor, fcntl.F_DUPFD, FREE) for descriptor in descriptors]
     for descriptor in descriptors:
