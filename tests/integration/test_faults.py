@@ -21,7 +21,7 @@ PAUSE = 10.0  # s
 
 def test_stopped_recorder(network: Any, repetition: int, rng: random.Random) -> None:
     """At full speed everybody waits for it in the end, and nothing is lost."""
-    file = network.file(run={"duration": 600, "processes": 2})
+    file = network.file(run={"duration": 400, "processes": 2})
     run = network.record(file, "--json")
     network.wait_until_moving()
     time.sleep(rng.uniform(0.0, 1.0))

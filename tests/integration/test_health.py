@@ -45,7 +45,7 @@ def test_a_stopped_agent_is_named(network: Any) -> None:
     """On /diagnostics, in the log of its neighbour, and to the user; then all goes on as if nothing had been."""
     heard = network.directory / "heard"
     with free_domain() as domain, heard.open("w") as output:
-        file = network.file(run={"duration": 600, "processes": "one_per_agent"})
+        file = network.file(run={"duration": 300, "processes": "one_per_agent"})
         run = network.record(file, "--domain", str(domain), "--json")
         monitor = subprocess.Popen([sys.executable, "-P", "-c", MONITOR], env=node_environment(domain), stdout=output)
         try:

@@ -131,7 +131,9 @@ def killed_and_back(network: Any, run: subprocess.Popen[str], chance: random.Ran
 def test_killed_agents_hold_again_what_they_held(network: Any, processes: Any) -> None:
     """Bursts of 200 messages: an agent that comes back needs values from long before it was killed."""
     held = MESSAGES["all"] | {"delay": 2, "loss": 0.5, "burst": 200}
-    file = network.file(noise={"process": 1.0, **held}, run={"duration": 400, "replicas": 16, "processes": processes})
+    duration = 250 if processes == "one_per_agent" else 400  # the more processes, the slower
+    run = {"duration": duration, "replicas": 16, "processes": processes}
+    file = network.file(noise={"process": 1.0, **held}, run=run)
     trajectory = killed_and_back(network, network.record(file, "--restarts", "4", "--json"), random.Random(1), 2)
     assert_equal(trajectory)
     assert trajectory.used is not None

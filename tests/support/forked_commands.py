@@ -226,8 +226,16 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
     sys.argv = command
     if command[1:2] in (["run"], ["host"], ["doctor"]):
         leave_one_waiting(serve_waiting, request["kept"])
+    if command[1:2] == ["sweep"]:
+        importlib.import_module("forked_workers").install()
     place, name = PROGRAMS[Path(command[0]).name]
     return lambda: sys.exit(getattr(importlib.import_module(place), name)())
+
+
+def _prepare_for(request: dict[str, Any]) -> None:
+    """Seldom used, so the server imports it when it is."""
+    if request["command"][1:2] == ["sweep"]:
+        importlib.import_module("forked_workers").prepare()
 
 
 def _enter(namespace: str) -> None:
@@ -275,7 +283,7 @@ def main() -> None:
         importlib.import_module(name)
     importlib.import_module(NODE_SERVER).prepare()
     show_stacks_when_asked()
-    serve(socket.socket(fileno=int(sys.argv[1])), run)
+    serve(socket.socket(fileno=int(sys.argv[1])), run, _prepare_for)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,8 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+import forked_workers
+
 PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.cli.main"}
 PREPARED = (
     *PROGRAMS.values(),
@@ -95,6 +97,8 @@ def child(program: str, arguments: list[str], kind: str, stdout: int, stderr: in
         sys.stdout = None  # type: ignore[assignment]  # as Python has it at its start
     else:
         os.dup2(stdout, 1)
+    if arguments[:1] == ["sweep"]:
+        forked_workers.install()
     try:
         importlib.import_module(PROGRAMS[program]).main(arguments, prog_name=program)
     except SystemExit as end:
@@ -159,6 +163,8 @@ def main() -> None:
         os.environ.update(request["environment"])
         for name in request["prepared"]:
             importlib.import_module(name)
+        if any(arguments[:1] == ["sweep"] for _, arguments, _ in request["jobs"]):
+            forked_workers.prepare()
         print(json.dumps([run(*job) for job in request["jobs"]]), file=answers, flush=True)
 
 
