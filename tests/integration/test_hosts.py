@@ -158,7 +158,7 @@ def whole(lan: Lan, texts: dict[str, tuple[str, str]]) -> None:
 
 def test_three_hosts(lan: Lan) -> None:
     """The demo network across them equals the twin to the last bit, and agrees with the prediction."""
-    prepare(lan, 100)
+    prepare(lan, 50)
     texts = ended(lan.start_all(), 0)
     whole(lan, texts)
     assert json.loads(texts["base"][0])["verdict"] == "agrees"

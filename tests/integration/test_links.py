@@ -18,7 +18,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.check import check
 
-LOCKSTEP: dict[str, Any] = {"duration": 40, "replicas": 4}  # 800 steps
+LOCKSTEP: dict[str, Any] = {"duration": 20, "replicas": 4}  # 400 steps: more than one block of noise
 REALTIME: dict[str, Any] = {"pace": "realtime", "speed": 5, "dt": 0.05, "duration": 20}  # 100 steps a second for 4 s
 UNDISTURBED = REALTIME | {"duration": 10}  # where nobody is killed in the middle
 BY_LINK = {"default": 0.1, "edges": [[2, 3, 0.7]], "arcs": [[1, 2, 0.4]]}

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import forked_workers
 import pytest
 import yaml
 
@@ -172,21 +173,23 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
     code = [
         "from functools import partial",
         "from pathlib import Path",
+        "import sys",
+        f"sys.path.append({str(Path(forked_workers.__file__).parent)!r})",
+        "import forked_workers",
         "from msg_analysis.cli.main import main",
         "from msg_analysis.paper import emulation, examples",
         "from msg_analysis.paper.emulation import Run",
         f"emulation.runs_of = lambda number: [run for run in {runs} if run.example == number]",
         "examples.EXAMPLES |= {k: partial(example, 5) for k, example in examples.EXAMPLES.items()}  # coarse curves",
-        "if __name__ == '__main__':",
-        "    for _ in range(2):  # the second time, nothing runs",
-        "        try:",
-        f"            main({arguments!r})",
-        "        except SystemExit as end:",
-        f"            points = Path({str(figures / 'emulation/points.jsonl')!r}).read_text()",
-        "            print('ended', end.code, points.count('\\n'))",
+        "forked_workers.install()",
+        "for _ in range(2):  # the second time, nothing runs",
+        "    try:",
+        f"        main({arguments!r})",
+        "    except SystemExit as end:",
+        f"        points = Path({str(figures / 'emulation/points.jsonl')!r}).read_text()",
+        "        print('ended', end.code, points.count('\\n'))",
     ]
-    (network.directory / "short.py").write_text("\n".join(code))
-    command = [sys.executable, network.directory / "short.py"]
+    command = [sys.executable, "-P", "-c", "\n".join(code)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert result.returncode == 0, result.stderr
     first, second, rest = result.stdout.split("ended 0 2\n")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import CUT, FAINT, Log, chromium
+from browser import CUT, FAINT, Log
 from terminal import Terminal
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
@@ -69,7 +69,8 @@ def test_panel_and_ctrl_c(network: Any, terminal: Any) -> None:
 def test_json_on_a_terminal_is_json_elsewhere(network: Any, terminal: Any) -> None:
     """The panel goes to stderr: stdout is one object."""
     out = network.directory / "result"
-    command = f"exec {PROGRAM} run {network.file()} --out {network.directory / 'runs'} --json > {out}"
+    options = f"--out {network.directory / 'runs'} --json --write-report never"
+    command = f"exec {PROGRAM} run {network.file()} {options} > {out}"
     screen = terminal("sh", "-c", command)
     assert screen.read_to_the_end() in (0, 1)
     assert json.loads(out.read_text())["steps"] == 300
@@ -79,9 +80,10 @@ def test_json_on_a_terminal_is_json_elsewhere(network: Any, terminal: Any) -> No
 
 
 @pytest.fixture
-def page(network: Any) -> Iterator[Any]:
-    with chromium() as browser:
-        yield browser.new_page()
+def page(browser: Any) -> Iterator[Any]:
+    """In a window of its own."""
+    with browser.new_context() as window:
+        yield window.new_page()
 
 
 def _address(process: subprocess.Popen[str]) -> str:

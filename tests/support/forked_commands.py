@@ -2,9 +2,9 @@
 
 Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis``, the fork server of a network and the
 nodes of tests (``python -P -c CODE``), if nothing is asked for but streams, a directory, a session, a function of this
-folder that is called first, a network namespace (``ip netns exec``), variables that are read after the imports, and
-a PYTHONPATH with other packages. It executes all else as ever. A forked process is a child of the process that asked, has the title of its command, and its
-mark can be read in its environment, as after exec.
+folder that is called first, a network namespace (``ip netns exec``), a PYTHONPATH to other packages, and variables that
+are read after the imports. It executes all else as ever. A forked process is a child of the process that asked, has the
+title of its command, and its mark can be read in its environment, as after exec.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def read_at_start(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def packages_of(environment: Mapping[str, str], path: Sequence[str]) -> list[str]:
-    """The folders in PYTHONPATH, if it makes no difference when they are found: none of their modules is on ``path``."""
+    """The folders in PYTHONPATH, if these can be found late: none of their modules is on ``path``."""
     folders = [Path(folder) for folder in environment.get("PYTHONPATH", "").split(os.pathsep) if folder]
     names = {file.name.partition(".")[0] for folder in folders if folder.is_dir() for file in folder.iterdir()}
     known = {"sitecustomize", "usercustomize", *sys.builtin_module_names}  # Python imports the first two at its start

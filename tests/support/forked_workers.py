@@ -1,4 +1,4 @@
-"""The workers of a sweep are forked from the process of the sweep, where that was forked from one that has imported all.
+"""The workers of a sweep are forked from the process of the sweep, if that was forked from one that has imported all.
 
 Multiprocessing would execute a server for them, which imports all again.
 """
@@ -13,6 +13,7 @@ import os
 import signal
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from msg_agents.processes.fork_server import run_and_end
 
@@ -38,12 +39,16 @@ def install() -> None:
 def _fork(_: object, arguments: Sequence[str], kept: Sequence[int]) -> int:
     """Fork a process that does what ``python -c`` would do, with these descriptors and the standard ones."""
     pid = os.fork()
-    if pid:
-        return pid
+    if not pid:
+        _run(arguments[-1], kept)
+    return pid
+
+
+def _run(code: str, kept: Sequence[int]) -> NoReturn:
     for descriptor in {int(file.name) for file in Path("/proc/self/fd").iterdir()} - {0, 1, 2, *kept}:
         with contextlib.suppress(OSError):  # that by which they were listed is closed
             os.close(descriptor)
     for number in signal.valid_signals() - {signal.SIGINT}:
         if callable(signal.getsignal(number)):
             signal.signal(number, signal.SIG_DFL)
-    run_and_end(functools.partial(exec, arguments[-1], {}))
+    run_and_end(functools.partial(exec, code, {}))
