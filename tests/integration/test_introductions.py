@@ -52,7 +52,8 @@ def surroundings(kind: str, domain: int) -> dict[str, str]:
 @pytest.mark.parametrize("first", [True, False], ids=["before the run", "during the run"])
 def test_a_visitor_sees_every_process(network: Any, domain: int, kind: str, first: bool) -> None:
     """Of a run in which no process knows more than half of the others."""
-    file = network.file(graphs={"line": {"path": [1, 2, 3, 4, 5]}, "none": {"edges": []}}, run={"duration": 2000})
+    graphs = {"line": {"path": [1, 2, 3, 4, 5]}, "none": {"edges": []}}
+    file = network.file(graphs=graphs, run={"duration": 2000, "replicas": 32})  # large states are soon seen in the bag
     with ExitStack() as stack:
         visitors = [stack.enter_context(visit(surroundings(kind, domain)))] if first else []
         for visitor in visitors:

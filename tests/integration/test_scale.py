@@ -89,7 +89,8 @@ def test_who_reads_batches(
         "/agent_1/state": sorted(f"agent_{i}" for i in of_first),
         "/agent_24/state": sorted(f"agent_{i}" for i in of_last),
     }
-    run = network.record(network.file(**experiment, run={"duration": 10_000, "processes": 3}), "--domain", str(domain))
+    large = {"duration": 1000, "processes": 3, "replicas": 16}  # so that they are soon seen in the bag
+    run = network.record(network.file(**experiment, run=large), "--domain", str(domain))
     network.wait_until_moving()
     assert_endpoints({topic: [[name, "RELIABLE"] for name in names] for topic, names in readers.items()}, {}, domain)
     run.terminate()
@@ -109,7 +110,7 @@ def test_processes_keep_to_one_core_each(network: Any, pin: bool) -> None:
     cores = os.sched_getaffinity(0)
     if not 2 <= len(cores) <= 5:
         pytest.skip(f"this machine: {len(cores)} cores: nothing to pin 6 processes to")
-    file = network.file(run={"duration": 500})
+    file = network.file(run={"duration": 500, "replicas": 64})
     run = network.record(file, *([] if pin else ["--no-pin"]))
     network.wait_until_moving()
     kept = {process.agent: cores_of(process.pid) for process in network.processes("agent")}
