@@ -19,7 +19,8 @@ from msg_agents.channel.namespaces import open_hosts
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.errors import NotAvailableError
 
-ENDLESS = {"duration": 1000, "replicas": 64}  # 20,000 steps: no test waits for them; of states that are soon seen in the bag
+# 20,000 steps: no test waits for them; of states that are soon seen in the bag
+ENDLESS = {"duration": 1000, "replicas": 64}
 LEVEL = 1e-6  # false-alarm rate of the test of a loss; the losses have a fixed seed, the numbers of packets do not
 MARK_OF_TESTS = b"MSG_AGENTS_TEST="
 PROGRAM = Path(sys.executable).with_name("msg-agents")
