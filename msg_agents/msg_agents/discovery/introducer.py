@@ -67,6 +67,14 @@ def write_introduction(descriptor: int, name: str, prefix: bytes) -> None:
     os.close(descriptor)
 
 
+def _pipe(opened: contextlib.ExitStack) -> tuple[int, int]:
+    """A new pipe, which is closed with the others."""
+    ends = os.pipe()
+    for end in ends:
+        opened.callback(os.close, end)
+    return ends
+
+
 @dataclass(slots=True)
 class _Known:
     announcement: Announcement
@@ -78,7 +86,8 @@ class _Known:
 class Introducer:
     """A thread that introduces processes to each other; to be used with ``with``, which takes a port for visitors.
 
-    ``descriptor``: where processes write their introductions (``write_introduction``). OSError: no port is left.
+    ``descriptor``: where processes write their introductions (``write_introduction``). OSError: no port is left, or no
+    descriptor.
     """
 
     def __init__(self, domain: int) -> None:
@@ -89,17 +98,19 @@ class Introducer:
         self._own_prefix: bytes | None = None  # once the machine is known
         self._announced = float("-inf")  # when this program last announced itself [s]
         self._thread = threading.Thread(target=self._serve, daemon=True, name="introducer")
+        self._opened = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
-        try:
+        with contextlib.ExitStack() as opened:
+            self._socket = opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
             self._bind()
-        except OSError:
-            self._socket.close()
-            raise
-        self._reports, self.descriptor = os.pipe()
-        self._stop, self._stopped = os.pipe()
+            self._reports, self.descriptor = _pipe(opened)
+            self._stop, self._stopped = _pipe(opened)
+            self._selector = opened.enter_context(selectors.DefaultSelector())
+            for source in (self._socket, self._reports, self._stop):
+                self._selector.register(source, selectors.EVENT_READ)
+            self._opened = opened.pop_all()
         self._thread.start()
         return self
 
@@ -120,31 +131,26 @@ class Introducer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        os.close(self._stopped)
+        os.write(self._stopped, b".")
         self._thread.join()
-        for descriptor in (self._reports, self.descriptor, self._stop):
-            os.close(descriptor)
-        self._socket.close()
+        self._opened.close()
 
     def _serve(self) -> None:
         rest = b""
-        with selectors.DefaultSelector() as selector:
-            for source in (self._socket, self._reports, self._stop):
-                selector.register(source, selectors.EVENT_READ)
-            while True:
-                ready = [key.fileobj for key, _ in selector.select(timeout=PERIOD)]
-                if self._stop in ready:
-                    self._leave()
-                    return
-                if self._socket in ready:
-                    with contextlib.suppress(OSError):
-                        self._hear(self._socket.recv(LARGEST))
-                if self._reports in ready:
-                    *lines, rest = (rest + os.read(self._reports, LARGEST)).split(b"\n")
-                    for line in lines:
-                        self._read_report(line.decode(errors="replace"))
-                if time.monotonic() >= self._announced + PERIOD:
-                    self._announce()
+        while True:
+            ready = [key.fileobj for key, _ in self._selector.select(timeout=PERIOD)]
+            if self._stop in ready:
+                self._leave()
+                return
+            if self._socket in ready:
+                with contextlib.suppress(OSError):
+                    self._hear(self._socket.recv(LARGEST))
+            if self._reports in ready:
+                *lines, rest = (rest + os.read(self._reports, LARGEST)).split(b"\n")
+                for line in lines:
+                    self._read_report(line.decode(errors="replace"))
+            if time.monotonic() >= self._announced + PERIOD:
+                self._announce()
 
     def _announce(self) -> None:
         """Make visitors announce themselves to this program."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -270,3 +272,28 @@ def test_without_a_port_it_does_not_start(domain: int) -> None:
             pass
     with Introducer(domain):
         pass
+
+
+def test_with_few_descriptors_it_starts_or_does_not(domain: int) -> None:
+    """In a process of its own: as many descriptors as it has, and one more each time."""
+    code = f"""
+import os, resource
+from {Introducer.__module__} import Introducer
+most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+used = len(os.listdir("/proc/self/fd")) - 1
+for spare in range(20):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (used + spare, most))
+    try:
+        with Introducer({domain}):
+            print("started")
+    except OSError as error:
+        print(error.strerror)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (100, most))
+    assert len(os.listdir("/proc/self/fd")) - 1 == used
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (result.stderr, result.returncode) == ("", 0)
+    lines = result.stdout.splitlines()
+    few = lines.count("Too many open files")
+    assert 0 < few < 20
+    assert lines == ["Too many open files"] * few + ["started"] * (20 - few)
