@@ -5,7 +5,8 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
-from msg_analysis.bags.playback import Playback
+from mcap.reader import make_reader
+
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.online.running_errors import LiveEstimate
@@ -17,9 +18,13 @@ from msg_analysis.wire.receiving import state_frame
 
 
 def messages_of(bag: Path) -> list[tuple[str, bytes]]:
-    """(topic, message) of a bag, in the order of time."""
-    played = Playback(bag)
-    return [(message.topic, message.data) for message in played.messages(played.topics)]
+    """(topic, message) of a bag in one file, in the order of time."""
+    (file,) = bag.glob("*.mcap")
+    with file.open("rb") as stream:
+        # Ordered here: by the library, it takes three times as long.
+        records = list(make_reader(stream).iter_messages(log_time_order=False))
+    records.sort(key=lambda record: record[2].log_time)
+    return [(channel.topic, message.data) for _, channel, message in records]
 
 
 def watch(live: LiveEstimate, messages: list[tuple[str, bytes]], *, disorder: float = 0.0, every: int = 200) -> None:

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import sys
 import time
@@ -44,8 +45,9 @@ def exit_after(seconds: int) -> None:
     library = ctypes.CDLL(None, use_errno=True)
     if not hasattr(library, "timer_create"):
         return
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):  # there is none, or nobody reads it any more
+            stream.flush()
     function = ctypes.cast(library._exit, ctypes.c_void_p)
     event = _Event(notify=SIGEV_THREAD, function=function.value)  # its value, 0, is what _exit is called with
     timer = ctypes.c_void_p()

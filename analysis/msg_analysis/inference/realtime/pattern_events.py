@@ -25,7 +25,6 @@ matrices are computed once for each pattern.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -74,7 +73,7 @@ class Periods:
         self._numbers = np.full((step.agents, step.agents), -1)
         self._numbers[links[:, 0], links[:, 1]] = 3 * step.agents + np.arange(len(links))
         self._shared = _shared_sources(step)
-        self._law = lru_cache(maxsize=None)(self._law_of)
+        self._laws: dict[tuple[int, int], _Law] = {}  # by graph and agent
         graphs, used, made = observation.timers.graphs, observation.timers.used, observation.timers.made
         steps, m = graphs.shape
         self._observation, self._newest = observation, newest_steps(observation)[:steps]
@@ -210,7 +209,13 @@ class Periods:
             self._cache[key] = found
         return self._cache[key]
 
-    def _law_of(self, graph: int, agent: int) -> _Law:
+    def _law(self, graph: int, agent: int) -> _Law:
+        found = self._laws.get((graph, agent))
+        if found is None:
+            found = self._laws[graph, agent] = self._new_law(graph, agent)
+        return found
+
+    def _new_law(self, graph: int, agent: int) -> _Law:
         tables, gain = neighbour_tables(self._step), self._step.noise_gain[graph, agent]
         senders = tables.senders[graph, agent, : tables.count[graph, agent]].tolist()
         weights = neighbour_weights(self._step)[graph, agent].tolist()

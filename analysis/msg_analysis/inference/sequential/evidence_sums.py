@@ -277,28 +277,16 @@ class EvidenceSums:
         scale: FloatArray,
         lost: BoolArray | None,
     ) -> None:
-        """Noise, gains, pairs and losses by what was heard."""
+        """Noise, pairs, and of gains and losses the regressors, over the standard deviation of the noise."""
         parts.samples += looks.counts(np.where(np.isinf(scale), 0, white.shape[2]))
         parts.squares += looks.sums((white**2).sum(axis=2))
-        self._add_links(parts, looks, reception, white, scale[:, :, None], lost if len(self._asked.lossy) else None)
         if len(self._asked.pairs):
             for look, (begin, end) in enumerate(zip(looks.begins.tolist(), looks.ends.tolist(), strict=True)):
                 flat = white[begin:end].transpose(1, 0, 2).reshape(len(white[0]), -1)
                 products = flat @ flat.T
                 parts.pair_score[look] += products
                 parts.pair_information[look] += np.diag(products)[None, :]
-
-    def _add_links(
-        self,
-        parts: RunningSums,
-        looks: Looks,
-        reception: HeardValues,
-        white: FloatArray,
-        scale: FloatArray,
-        lost: BoolArray | None,
-    ) -> None:
-        """Scores of the gains; regressors and innovations over the standard deviation of the noise."""
-        step = self._step
+        step, scale = self._step, scale[:, :, None]
         agents, every = np.arange(step.agents), np.arange(len(white))
         count = neighbour_tables(step).count[reception.graphs, agents]  # (b, m)
         pull = (step.nominal.sum(axis=2) - 1.0)[reception.graphs, agents]
@@ -316,7 +304,7 @@ class EvidenceSums:
             place = (receivers + reception.senders[:, :, d])[there]  # in one dimension: many times as fast
             np.add.at(parts.link_score.reshape(-1), place, (part * white).sum(axis=2)[there])
             np.add.at(parts.link_information.reshape(-1), place, (part**2).sum(axis=2)[there])
-            if lost is not None:
+            if lost is not None and len(self._asked.lossy):
                 np.add.at(parts.messages.reshape(-1), place, 1)
                 np.add.at(parts.lost.reshape(-1), place, lost[:, :, d][there])
         if self._asked.common:
