@@ -46,7 +46,6 @@ NODES = ("agent", "recorder", "switcher")  # commands that take a run record
 
 def main() -> None:
     """Import all, and serve."""
-    gc.disable()  # nothing that is imported goes again: a tenth of the time
     prepare()
     from msg_agents.processes.fork_server import EARLY, await_run
 
@@ -57,6 +56,7 @@ def main() -> None:
 
 def prepare() -> None:
     """Import all that nodes need."""
+    gc.disable()  # until this process serves; nothing that is imported goes again: a tenth of the time
     os.environ["SPT_NOENV"] = "1"  # titles must leave the environment readable: by it, processes of a run are found
     from msg_agents.processes.environment import tolerate_warnings
 

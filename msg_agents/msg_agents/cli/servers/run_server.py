@@ -26,6 +26,8 @@ import socket
 import sys
 from typing import Any
 
+from msg_analysis.cli.entry_point import collect_garbage_seldom
+
 MODULES = (
     "msg_agents.running.runner",
     "msg_agents.watching.run_view",
@@ -40,6 +42,7 @@ def main() -> None:
     from msg_agents.cli.servers.node_server import prepare
     from msg_agents.processes.fork_server import serve
 
+    collect_garbage_seldom()
     prepare()
     for name in MODULES:
         importlib.import_module(name)
