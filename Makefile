@@ -53,10 +53,11 @@ $(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_
 	$(BIN)/python -m compileall -q analysis/msg_analysis msg_agents/msg_agents
 	@touch $@
 
-# What is not compiled here, Python compiles when it is first needed: for a demo, that is less.
+# What is not compiled here, Python compiles when it is first needed: for a demo, that is less. A quarter are tests of
+# packages, which nobody needs.
 $(VENV)/.compiled: $(VENV)/.locked
 	@echo "Compiling all packages (half a minute, once)" >&2
-	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null 2>&1 || true  # some have templates, which are no modules
+	@$(BIN)/python -m compileall -q -j 0 -x '/tests?/' $(VENV)/lib >/dev/null 2>&1 || true  # some have templates, which are no modules
 	@touch $@
 
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report
