@@ -36,6 +36,11 @@ def law_of_all(experiment: ValidExperiment, model: StepModel) -> ManySteps:
     return ManySteps([_rounds(model, mode, lead, holds) for mode in range(model.modes)])
 
 
+def noise_of_all(experiment: ValidExperiment, model: StepModel, *, kept: bool = False) -> ProcessNoise:
+    """The process noise of all agents; ``kept`` as of ``ProcessNoise``."""
+    return ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas, kept=kept)
+
+
 def states(
     experiment: ValidExperiment,
     model: StepModel,
@@ -43,15 +48,17 @@ def states(
     start: FloatArray,
     first: int = 0,
     law: ManySteps | None = None,
+    noise: ProcessNoise | None = None,
 ) -> Iterator[FloatArray]:
     """x(first + 1), x(first + 2), ..., from x(first) under the graphs ``modes`` from there on, in blocks (k, m, R).
 
-    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``law``: as of ``law_of_all``.
+    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``law``: as of ``law_of_all``, ``noise``: as of
+    ``noise_of_all``.
     """
     air = AirReception(experiment, model, start, first) if experiment.noise.steps_only else None
-    law = law or law_of_all(experiment, model)
+    law, noise = law or law_of_all(experiment, model), noise or noise_of_all(experiment, model)
     past = np.repeat(start[None], experiment.noise.delay + 1, axis=0)  # before the start the states are those of it
-    for begin, now, drives in _blocks(experiment, model, modes, first):
+    for begin, now, drives in _blocks(noise, model, modes, first):
         made = law.advance(now, past, drives, air.block(begin, len(now)) if air else None)
         yield made
         past = np.concatenate([past, made])[-len(past) :]
@@ -61,16 +68,15 @@ Block = tuple[int, IntArray, FloatArray]
 """First step, graphs (k,), and for every step (k, m, R) the noise of all agents plus what the reference adds."""
 
 
-def _blocks(experiment: ValidExperiment, model: StepModel, modes: IntArray, first: int) -> Iterator[Block]:
+def _blocks(noise: ProcessNoise, model: StepModel, modes: IntArray, first: int) -> Iterator[Block]:
     """A path of graphs in blocks of STEPS_PER_BLOCK steps, the last one shorter."""
-    noise = ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas)
     for begin in range(0, len(modes), STEPS_PER_BLOCK):
         now, number = modes[begin : begin + STEPS_PER_BLOCK], (first + begin) // STEPS_PER_BLOCK
-        drives, steps = np.empty((len(now), model.agents, experiment.run.replicas)), np.arange(len(now))
+        drives, steps = np.empty((len(now), model.agents, noise.replicas)), np.arange(len(now))
         for i in range(model.agents):
-            of_modes = noise.block(i, number)
+            of_modes = noise.block(i, number, len(now))
             alike = all(each is of_modes[0] for each in of_modes)
-            drives[:, i] = of_modes[0][: len(now)] if alike else np.stack(of_modes)[now, steps]
+            drives[:, i] = of_modes[0] if alike else np.stack(of_modes)[now, steps]
             drives[:, i] += model.offsets[now, i][:, None]
         yield first + begin, now, drives
 

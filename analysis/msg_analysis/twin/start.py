@@ -31,8 +31,9 @@ from msg_analysis.model.arithmetic.update_law import weighted_sum
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.problems import problem
 from msg_analysis.model.run.graph_path import past_modes
+from msg_analysis.model.step.process_noise import ProcessNoise
 from msg_analysis.model.step.step_model import StepModel, Wiring
-from msg_analysis.twin.network_steps import law_of_all, states
+from msg_analysis.twin.network_steps import law_of_all, noise_of_all, states
 from msg_analysis.types import FloatArray
 
 TOLERANCE = 2.0**-10
@@ -66,8 +67,9 @@ def _from_the_past(experiment: ValidExperiment, model: StepModel, first_mode: in
     """x(0) at the end of a past that is long enough; None where that would take too long."""
     size = experiment.agents * experiment.run.replicas
     steps, before, law = STEPS_PER_BLOCK, None, law_of_all(experiment, model)
+    noise = noise_of_all(experiment, model, kept=True)  # the past that is twice as long ends with the same steps
     while steps <= MAX_PAST and steps * size <= MAX_NUMBERS:
-        start, floor = _end_of_the_past(experiment, model, law, first_mode, steps)
+        start, floor = _end_of_the_past(experiment, model, law, noise, first_mode, steps)
         if before is not None and _same(start - before, start - model.reference, floor):
             return start
         before, steps = start, 2 * steps
@@ -75,14 +77,14 @@ def _from_the_past(experiment: ValidExperiment, model: StepModel, first_mode: in
 
 
 def _end_of_the_past(
-    experiment: ValidExperiment, model: StepModel, law: ManySteps, first_mode: int, steps: int
+    experiment: ValidExperiment, model: StepModel, law: ManySteps, noise: ProcessNoise, first_mode: int, steps: int
 ) -> tuple[FloatArray, float]:
     """x(0) of a past of so many steps that begins at the reference, and the size of its rounding errors.
 
     In consensus only differences between agents are stationary: their average is put to 0.
     """
     state = np.full((experiment.agents, experiment.run.replicas), model.reference)
-    for block in states(experiment, model, past_modes(experiment, first_mode, steps), state, -steps, law):
+    for block in states(experiment, model, past_modes(experiment, first_mode, steps), state, -steps, law, noise):
         state = block[-1]
     rounding = 2.0**-40 * float(np.abs(state).max())
     if experiment.problem == "consensus":

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import json
+from bisect import bisect_right
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
@@ -115,10 +118,10 @@ def test_the_evidence_of_windows_is_their_mean(seen: int) -> None:
 
 
 def chain(transition: list[list[float]], steps: int, seed: int) -> np.ndarray:
-    random, up_to = np.random.default_rng(seed).random(steps), np.cumsum(transition, axis=1)
+    random, up_to = np.random.default_rng(seed).random(steps), np.cumsum(transition, axis=1)[:, :-1].tolist()
     path = [0]
     for chance in random[1:].tolist():
-        path.append(int(np.searchsorted(up_to[path[-1], :-1], chance, side="right")))
+        path.append(bisect_right(up_to[path[-1]], chance))
     return np.array(path)
 
 
@@ -128,21 +131,26 @@ SLOW = [[0.95, 0.05], [0.05, 0.95]]
 
 def sojourns(transition: list[list[float]], steps: int) -> Sojourns:
     """Sums of the law of an experiment in discrete time."""
+    return Sojourns(law_of(json.dumps(transition), steps))
+
+
+@functools.cache
+def law_of(transition: str, steps: int) -> Law:
     graphs = {"a": {"path": [1, 2, 3]}, "b": {"complete": True}, "c": {"star": {"center": 1}}}
     law = ValidExperiment.parse(
         {
             "name": "chain",
             "time": "discrete",
             "agents": 3,
-            "graphs": {name: graphs[name] for name in list(graphs)[: len(transition)]},
-            "switching": {"transition": transition},
+            "graphs": {name: graphs[name] for name in list(graphs)[: len(json.loads(transition))]},
+            "switching": {"transition": json.loads(transition)},
             "noise": {"process": 1.0},
             "run": {"duration": steps},
         }
     )
     prediction = predict(law)
     noisy = np.ones(3, dtype=np.bool_)
-    return Sojourns(Law(prediction.step, steps, 1, noisy, True, np.empty((0, 2), np.int64), True))
+    return Law(prediction.step, steps, 1, noisy, True, np.empty((0, 2), np.int64), True)
 
 
 def test_sojourns_are_counted_as_by_a_loop() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.model.arithmetic import many_steps
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.agent_law import agent_law
+from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.air import LOST
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
@@ -61,11 +63,17 @@ def experiment(law: str, air: str, pace: str = "lockstep", **run: Any) -> ValidE
     return ValidExperiment.parse(document | {"switching": chain, "noise": noise, "run": times | run})
 
 
+@functools.cache
+def run(law: str, air: str, pace: str = "lockstep") -> Trajectory:
+    """Of the twin; made once for all tests that only look at it."""
+    return simulate(experiment(law, air, pace))
+
+
 @pytest.mark.parametrize("air", AIRS)
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("pace", PACES)
 def test_equals_loops_over_numbers_to_the_last_bit(pace: str, law: str, air: str) -> None:
-    assert_by_hand(simulate(experiment(law, air, pace)))
+    assert_by_hand(run(law, air, pace))
 
 
 @pytest.mark.parametrize("air", ["all", "late and lost", "bursts, hold"])
@@ -81,7 +89,7 @@ def test_a_past_ends_where_the_run_begins(pace: str) -> None:
     what = experiment("consensus", "all", pace, start="stationary")
     trajectory = simulate(what)
     assert_by_hand(trajectory)
-    assert not np.array_equal(trajectory.states[0], simulate(experiment("consensus", "plain", pace)).states[0])
+    assert not np.array_equal(trajectory.states[0], run("consensus", "plain", pace).states[0])
 
 
 @pytest.mark.parametrize("law", ["consensus", "integral_action"])
@@ -89,7 +97,7 @@ def test_a_past_ends_where_the_run_begins(pace: str) -> None:
 @pytest.mark.parametrize("resumed", [0, 1, 255, 256, 300])
 def test_agents_alone_equal_the_whole(law: str, air: str, resumed: int) -> None:
     """Also those that go on from some step, and know nothing of what was before."""
-    trajectory = simulate(experiment(law, air))
+    trajectory = run(law, air)
     published = trajectory.states if trajectory.published is None else trajectory.published
     delay = trajectory.record.experiment.noise.delay
     for i in range(4):
@@ -117,7 +125,7 @@ def test_agents_alone_equal_the_whole(law: str, air: str, resumed: int) -> None:
 @pytest.mark.parametrize("pace", PACES)
 def test_bags_keep_all_of_it(pace: str, law: str, air: str, tmp_path: Any) -> None:
     """Written, read and checked."""
-    twin = simulate(experiment(law, air, pace))
+    twin = run(law, air, pace)
     write_trajectory(twin, tmp_path / "bag")
     read = read_bag(tmp_path / "bag")
     outcome = check(read)

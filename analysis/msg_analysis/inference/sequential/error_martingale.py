@@ -90,15 +90,13 @@ class ErrorMartingale:
         """(L, p + 1): see ``_means``."""
         system, d, r = self._system, self._system.dimension, self._replicas
         root, step = _root(system.noise[mode]), system.matrices[mode]
-        rows = np.empty((len(self.rates), packed_symmetric.size(d) + 1))
-        for row, rate in zip(rows, self.rates, strict=True):
-            form = rate / r * self._forms[following]
-            left = np.eye(d) - 2.0 * root @ form @ root
-            seen = form @ root
-            tilted = form + 2.0 * seen @ np.linalg.solve(left, seen.T)
-            row[:-1] = r * packed_symmetric.pack(step.T @ ((tilted + tilted.T) / 2.0) @ step)
-            row[-1] = rate * self._kappa[following] - 0.5 * r * np.linalg.slogdet(left)[1]
-        return rows
+        form = (self.rates / r)[:, None, None] * self._forms[following]  # (L, d, d)
+        seen = form @ root
+        left = np.eye(d) - 2.0 * root @ seen
+        tilted = form + 2.0 * seen @ np.linalg.solve(left, seen.transpose(0, 2, 1))
+        tilted = (tilted + tilted.transpose(0, 2, 1)) / 2.0
+        constants = self.rates * self._kappa[following] - 0.5 * r * np.linalg.slogdet(left)[1]
+        return np.column_stack([r * packed_symmetric.pack(step.T @ tilted @ step), constants])
 
 
 def _typical_variance(prediction: Prediction, replicas: int, values: Sequence[Value], trace: FloatArray) -> float:

@@ -51,20 +51,28 @@ class Air:
         self.delay, self.holds = noise.delay, noise.holds
         self.start = start
         self._seed = experiment.run.seed
-        self._shape = (STEPS_PER_BLOCK, experiment.run.replicas)
+        self._replicas = experiment.run.replicas
         self._losses = Losses(experiment)
         # Of each link, the block whose sources were found last, and the last one of them.
         self._ends: dict[tuple[int, int], tuple[int, int]] = {}
         # The step that an agent makes and the step of the state that it publishes may be in two blocks.
         self._broadcast_block = lru_cache(maxsize=2)(self.broadcast_noise)
 
-    def broadcast_noise(self, agent: int, block: int) -> FloatArray:
-        """(STEPS_PER_BLOCK, replicas): b of an agent (index from 0) in a block of steps (number from 0)."""
-        return self.broadcast * normals(self._seed, Stream.BROADCAST, agent, block, self._shape)
+    def broadcast_noise(self, agent: int, block: int, until: int | None = None) -> FloatArray:
+        """(STEPS_PER_BLOCK, replicas): b of an agent (index from 0) in a block of steps (number from 0).
 
-    def link_noise(self, receiver: int, sender: int, block: int) -> FloatArray:
-        """(STEPS_PER_BLOCK, replicas): l of the messages from sender to receiver (indices from 0) in a block."""
-        return self.link * normals(self._seed, Stream.LINK, link_number(receiver, sender), block, self._shape)
+        Where steps from ``until`` on do not matter, only those before.
+        """
+        return self.broadcast * normals(self._seed, Stream.BROADCAST, agent, block, self._shape(block, until))
+
+    def link_noise(self, receiver: int, sender: int, block: int, until: int | None = None) -> FloatArray:
+        """The same of l of the messages from sender to receiver (indices from 0)."""
+        link = link_number(receiver, sender)
+        return self.link * normals(self._seed, Stream.LINK, link, block, self._shape(block, until))
+
+    def _shape(self, block: int, until: int | None) -> tuple[int, int]:
+        steps = STEPS_PER_BLOCK if until is None else min(STEPS_PER_BLOCK, until - block * STEPS_PER_BLOCK)
+        return steps, self._replicas
 
     def losses(self, receiver: int, sender: int, block: int) -> BoolArray:
         """(STEPS_PER_BLOCK,): which messages from sender to receiver (indices from 0) are lost in a block."""

@@ -86,13 +86,13 @@ class AirReception:
         )
 
     def _broadcast(self, steps: IntArray) -> FloatArray:
-        noise = self._air.broadcast_noise
+        noise = partial(self._air.broadcast_noise, until=int(steps[-1]) + 1)
         return np.stack([_of_steps(partial(noise, i), steps) for i in range(self._agents)])
 
     def _link(self, steps: IntArray) -> FloatArray:
-        air, shape = self._air, (len(self._pairs), len(steps), self._replicas)
-        noises = [_of_steps(partial(air.link_noise, i, j), steps) for i, j in self._pairs]
-        return np.array(noises).reshape(shape)  # there may be no link
+        noise = partial(self._air.link_noise, until=int(steps[-1]) + 1)
+        noises = [_of_steps(partial(noise, i, j), steps) for i, j in self._pairs]
+        return np.array(noises).reshape(len(self._pairs), len(steps), self._replicas)  # there may be no link
 
 
 def _of_steps(block: Callable[[int], Array], steps: IntArray) -> Array:
@@ -112,7 +112,7 @@ def add_broadcast_noise(experiment: ValidExperiment, states: FloatArray) -> Floa
     for first in range(0, len(states), STEPS_PER_BLOCK):
         now = states[first : first + STEPS_PER_BLOCK]
         for i in range(states.shape[1]):
-            noise = air.broadcast_noise(i, first // STEPS_PER_BLOCK)[: len(now)]
+            noise = air.broadcast_noise(i, first // STEPS_PER_BLOCK, first + len(now))
             published[first : first + len(now), i] = now[:, i] + noise
     return published
 
