@@ -52,8 +52,8 @@ def states(
 ) -> Iterator[FloatArray]:
     """x(first + 1), x(first + 2), ..., from x(first) under the graphs ``modes`` from there on, in blocks (k, m, R).
 
-    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``law``: as of ``law_of_all``, ``noise``: as of
-    ``noise_of_all``.
+    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``law`` and ``noise``: as of
+    ``law_of_all`` and ``noise_of_all``.
     """
     air = AirReception(experiment, model, start, first) if experiment.noise.steps_only else None
     law, noise = law or law_of_all(experiment, model), noise or noise_of_all(experiment, model)
