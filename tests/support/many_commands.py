@@ -31,13 +31,14 @@ PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.c
 PREPARED = (
     *PROGRAMS.values(),
     "msg_analysis.api",
-    "msg_analysis.paper.figures",
     "msg_analysis.report.terminal.comparison_text",
-    "pyarrow.csv",
-    "pyarrow.parquet",
     "msg_analysis.twin.check",
-    "scipy.stats",
 )
+BY_COMMAND = {  # what takes long to import, and no other command needs
+    "export": ("pyarrow.csv", "pyarrow.parquet"),
+    "figures": ("msg_analysis.paper.figures",),
+    "spectrum": ("scipy.signal",),
+}
 MEMORY = 1 << 30  # bytes
 LONGEST = 60  # s of a job
 
@@ -47,7 +48,7 @@ def outcomes(
 ) -> list[list[Any]]:
     """Exit code, stdout, stderr of each job, with this folder to work in and additions to the environment.
 
-    ``prepared``: more modules that are to be imported before.
+    ``prepared``: more modules that are to be imported before; ``forked_workers.NEEDED`` for sweeps that begin.
     """
     server = _server()
     assert server.stdin is not None
@@ -150,8 +151,6 @@ def main() -> None:
     requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
     with Path(os.devnull).open() as nothing:
         os.dup2(nothing.fileno(), 0)
-    matplotlib = importlib.import_module("matplotlib")
-    matplotlib.use("Agg")
     for name in PREPARED:
         importlib.import_module(name)
     gc.collect()
@@ -160,11 +159,10 @@ def main() -> None:
         request = json.loads(line)
         os.chdir(request["folder"])
         os.environ.clear()
-        os.environ.update(request["environment"])
-        for name in request["prepared"]:
+        os.environ.update({"MPLBACKEND": "agg", **request["environment"]})
+        commands = {arguments[0] for _, arguments, _ in request["jobs"]}
+        for name in (*request["prepared"], *(name for command in commands for name in BY_COMMAND.get(command, ()))):
             importlib.import_module(name)
-        if any(arguments[:1] == ["sweep"] for _, arguments, _ in request["jobs"]):
-            forked_workers.prepare()
         print(json.dumps([run(*job) for job in request["jobs"]]), file=answers, flush=True)
 
 
