@@ -70,13 +70,15 @@ def run(
     used = np.full((steps, m, model.most_neighbours), -1)
     made = np.zeros((steps + 1, m), dtype=np.int64)
     blocks: dict[tuple[int, int], list[np.ndarray]] = {}
+    # As plain numbers and lists, which are read one by one.
+    weights, offsets = model.nominal.tolist(), model.offsets.tolist()
+    senders = [[model.neighbours(g, i).tolist() for i in range(m)] for g in range(model.modes)]
 
     switches = [0, *np.flatnonzero(np.diff(modes) != 0) + 1]
     # What agent i has of agent j, and the newest sojourn that it has.
-    has = np.full((m, m), -1)
-    graph = np.full(m, modes[0])
-    newest_switch = np.zeros(m, dtype=np.int64)
-    done = np.zeros(m, dtype=np.int64)
+    has = [[-1] * m for _ in range(m)]
+    graph = [int(modes[0])] * m
+    newest_switch, done = [0] * m, [0] * m
     # time [periods], tie-breaker, what happens
     events: list[tuple[float, int, str, tuple[int, ...]]] = []
     count = 0
@@ -98,23 +100,23 @@ def run(
         if kind == "graph":
             i, k = what
             if k > newest_switch[i]:
-                newest_switch[i], graph[i] = k, modes[k]
+                newest_switch[i], graph[i] = k, int(modes[k])
         elif kind == "state":
             i, j, s = what
-            has[i, j] = max(has[i, j], s)
+            has[i][j] = max(has[i][j], s)
         else:
             (i,) = what
             while done[i] < steps and done[i] + phase[i] <= now:
-                k, g = int(done[i]), int(graph[i])
+                k, g = done[i], graph[i]
                 key = i, k // STEPS_PER_BLOCK
                 if key not in blocks:
                     blocks[key] = noise.block(*key)
-                x = model.nominal[g, i, i] * states[k, i] + model.offsets[g, i]
+                x = weights[g][i][i] * states[k, i] + offsets[g][i]
                 x = x + blocks[key][g][k % STEPS_PER_BLOCK]
-                for d, j in enumerate(model.neighbours(g, i).tolist()):
-                    used[k, i, d] = has[i, j]
-                    value = states[k, i] if has[i, j] < 0 else states[has[i, j], j]  # nothing heard of it yet
-                    x = x + model.nominal[g, i, j] * value
+                for d, j in enumerate(senders[g][i]):
+                    used[k, i, d] = s = has[i][j]
+                    value = states[k, i] if s < 0 else states[s, j]  # nothing heard of it yet
+                    x = x + weights[g][i][j] * value
                 states[k + 1, i], agent_modes[k + 1, i] = x, g
                 made[k + 1, i] = round(now * experiment.step_length * 1e9)
                 done[i] += 1

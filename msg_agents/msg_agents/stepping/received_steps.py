@@ -94,6 +94,9 @@ class ReceivedSteps:
         size = len(self._marks)
         step = max(self.row, row - size) + RESEND_LIMIT + 1
         end = min(row + RESEND_LIMIT, self._last) + 1
+        if end - step == 1:  # in order, one after the other
+            self._marks[step % size] = 0
+            step = end
         while step < end:
             slot = step % size
             count = min(end - step, size - slot)

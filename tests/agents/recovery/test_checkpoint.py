@@ -57,26 +57,33 @@ def test_another_size_is_another_run(tmp_path: Path) -> None:
         Checkpoint(tmp_path / "states", 208)
 
 
-WRITER = """
-import sys
+WRITERS = """
+import os, sys
 from pathlib import Path
 from msg_agents.recovery.checkpoint import Checkpoint
-ring = Checkpoint(Path(sys.argv[1]), 8000)
-for step in range(10**9):
-    ring.write(step, step.to_bytes(8, "little") * 1000)
-    if step == 5000:
-        print("under way", flush=True)
+for file in sys.argv[1:]:
+    writer = os.fork()
+    if writer:
+        print("ended by", os.WTERMSIG(os.waitpid(writer, 0)[1]), flush=True)
+        continue
+    ring = Checkpoint(Path(file), 8000)
+    for step in range(10**9):
+        ring.write(step, step.to_bytes(8, "little") * 1000)
+        if step == 5000:
+            print(os.getpid(), flush=True)
 """
 
 
 def test_killed_in_the_middle_of_it(tmp_path: Path) -> None:
     """Whenever it happens, what is read is whole and without a gap."""
-    for attempt in range(10):
-        file = tmp_path / f"states_{attempt}"
-        with subprocess.Popen([sys.executable, "-c", WRITER, str(file)], stdout=subprocess.PIPE) as process:
-            assert process.stdout is not None
-            process.stdout.readline()
-            os.kill(process.pid, signal.SIGKILL)
+    files = [tmp_path / f"states_{attempt}" for attempt in range(10)]
+    command = [sys.executable, "-P", "-c", WRITERS, *map(str, files)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for _ in files:
+            os.kill(int(process.stdout.readline()), signal.SIGKILL)
+            assert process.stdout.readline() == f"ended by {signal.SIGKILL:d}\n"
+    for file in files:
         found = Checkpoint(file, 8000).read()
         steps = [step for step, _ in found]
         assert steps == list(range(steps[0], steps[0] + len(steps)))

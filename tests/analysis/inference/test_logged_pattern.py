@@ -70,15 +70,17 @@ def written_out(observation):
     seen = observation.states - step.reference
     noise, period = np.zeros((steps * m, replicas)), np.zeros(steps * m)
     mean[0], gain[0] = observation.start - step.reference, 0.0
+    known = {(0, i) for i in range(m)}
+    neighbours_of = [[step.neighbours(g, i).tolist() for i in range(m)] for g in range(step.modes)]
     waiting = [(k, i) for k in range(steps) for i in range(m)]
     while waiting:
         left = []
         for k, i in waiting:
             g = timers.graphs[k, i]
-            neighbours = step.neighbours(g, i)
-            uses = [(timers.used[k, i, d], j) for d, j in enumerate(neighbours)]
+            neighbours = neighbours_of[g][i]
+            uses = [(int(timers.used[k, i, d]), j) for d, j in enumerate(neighbours)]
             uses = [(k, i) if s < 0 else (s, j) for s, j in uses]
-            if np.isnan(gain[k, i]).any() or any(np.isnan(gain[use]).any() for use in uses):
+            if (k, i) not in known or not known.issuperset(uses):
                 left.append((k, i))
                 continue
             row = step.nominal[g, i]
@@ -89,6 +91,7 @@ def written_out(observation):
                 row[j] * gain[use] for j, use in zip(neighbours, uses, strict=True)
             )
             gain[k + 1, i, k * m : (k + 1) * m] += step.noise_gain[g, i]
+            known.add((k + 1, i))
             rest = seen[k + 1, i] - row[i] * seen[k, i]
             rest = rest - sum(row[j] * seen[use] for j, use in zip(neighbours, uses, strict=True))
             noise[k * m + i] = rest / (step.noise_gain[g, i, i] or 1.0)
