@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import uuid
+from bisect import bisect_right
 from pathlib import Path
 
 import numpy as np
@@ -135,29 +136,33 @@ def test_differences_that_are_only_rounding_are_no_evidence():
 
 
 def simulate_air(experiment, seed):
-    """A run with noise on the air and lost messages, message by message, from the experiment file alone."""
+    """A run with noise on the air and lost messages, from the experiment file alone."""
     random = np.random.default_rng(seed)
     m, dt, noise, replicas = experiment.agents, experiment.run.dt, experiment.noise, experiment.run.replicas
     adjacency = [graph.adjacency for graph in experiment.graph_list]
     neighbours = [[np.flatnonzero(row) for row in a] for a in adjacency]
     chain = experiment.chain
-    up_to = np.cumsum(scipy.linalg.expm(dt * chain.matrix), axis=1)
+    up_to = np.cumsum(scipy.linalg.expm(dt * chain.matrix), axis=1)[:, :-1].tolist()
     modes = [int(random.choice(chain.modes, p=chain.stationary))]
     for chance in random.random(experiment.steps - 1).tolist():
-        modes.append(int(np.searchsorted(up_to[modes[-1], :-1], chance, side="right")))
-    states, published = np.zeros((2, experiment.steps + 1, m, replicas))
-    lost = np.zeros((experiment.steps, m, max(int((a > 0).sum(axis=1).max()) for a in adjacency)), dtype=bool)
+        modes.append(bisect_right(up_to[modes[-1]], chance))
+    steps, pull = experiment.steps, np.stack(adjacency)[modes]
+    states = np.zeros((steps + 1, m, replicas))
+    added = noise.broadcast * random.standard_normal(states.shape)
+    arrived = random.random((steps, m, m)) >= noise.loss.default
+    weights = dt * pull * arrived
+    heard = added[:-1, None] + noise.link * random.standard_normal((steps, m, m, replicas))
+    process = experiment.noise_gain[modes] @ random.standard_normal((steps, m, replicas))
+    # What a step adds, whatever the states are, and what these are multiplied by.
+    drive = (weights[:, :, :, None] * heard).sum(axis=2) + np.sqrt(dt) * process
+    step = np.eye(m) + weights - weights.sum(axis=2)[:, :, None] * np.eye(m)
+    for k in range(steps):
+        states[k + 1] = step[k] @ states[k] + drive[k]
+    published = states + added
+    lost = np.zeros((steps, m, max(int((a > 0).sum(axis=1).max()) for a in adjacency)), dtype=bool)
     for k, g in enumerate(modes):
-        x = states[k]
-        sent = published[k] = x + noise.broadcast * random.standard_normal(x.shape)
-        heard = sent[None] + noise.link * random.standard_normal((m, m, replicas))
-        arrived = random.random((m, m)) >= noise.loss.default
-        pull = (adjacency[g][:, :, None] * arrived[:, :, None] * (heard - x[:, None])).sum(axis=1)
-        process = experiment.noise_gain[g] @ random.standard_normal(x.shape)
-        states[k + 1] = x + dt * pull + np.sqrt(dt) * process
         for i, links in enumerate(neighbours[g]):
-            lost[k, i, : len(links)] = ~arrived[i, links]
-    published[-1] = states[-1] + noise.broadcast * random.standard_normal(x.shape)
+            lost[k, i, : len(links)] = ~arrived[k, i, links]
     record = RunRecord(uuid.UUID(int=seed), experiment, states[0])
     count = 2 * states[:, :, 0].size
     complete = Completeness(count, count, 0)

@@ -19,7 +19,7 @@ from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 
 NETWORKS = 6000
-STEPS = 120
+STEPS = 90  # what is then left of the start at 0 is below a tenth of a percent: a twentieth of a standard error
 DT = 0.3
 CORRELATED = [
     [1.0, 0.0, 0.0, 0.0, 0.5],

@@ -109,7 +109,7 @@ def _products(joined: FloatArray, old: int, looks: Looks) -> FloatArray:
 
     ``joined`` (old + b, columns, samples): the numbers, after ``old`` earlier ones.
     """
-    found = np.empty((looks.count, LAGS, joined.shape[1]))
+    found, columns = np.empty((looks.count, LAGS, joined.shape[1])), joined.transpose(1, 2, 0)
     # By Fourier transforms so long that no two products overlap; stretches of about the same length together.
     classes = np.frexp(looks.lengths + LAGS)[1]
     for each in np.unique(classes):
@@ -118,7 +118,7 @@ def _products(joined: FloatArray, old: int, looks: Looks) -> FloatArray:
         every = np.zeros((len(rows), *joined.shape[1:], length))
         for part, begin, end in zip(every, old + looks.begins[rows], old + looks.ends[rows], strict=True):
             before = min(begin, LAGS)
-            part[:, :, LAGS - before : LAGS + end - begin] = np.moveaxis(joined[begin - before : end], 0, 2)
+            part[:, :, LAGS - before : LAGS + end - begin] = columns[:, :, begin - before : end]
         late = every.copy()
         late[..., :LAGS] = 0.0
         spectrum = np.einsum("tcsf,tcsf->tcf", scipy.fft.rfft(late), scipy.fft.rfft(every).conj())

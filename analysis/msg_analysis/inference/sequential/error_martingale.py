@@ -23,12 +23,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from msg_analysis.inference.errors.time_means import Value, forms_of, values_of
 from msg_analysis.inference.evidence.mixture_evidence import log_sum
-from msg_analysis.theory.moments import mode_potential
+from msg_analysis.theory.moments import MomentSolver, mode_potential
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.types import FloatArray, IntArray
@@ -45,6 +47,16 @@ class ErrorMartingale:
 
     ValueError for a system with lost messages, whose next state is not normal given this one.
     """
+
+    _known: ClassVar[WeakKeyDictionary[MomentSolver, dict[int, ErrorMartingale]]] = WeakKeyDictionary()
+
+    @classmethod
+    def of(cls, prediction: Prediction, replicas: int) -> ErrorMartingale:
+        """Made once for all runs with this prediction."""
+        known = cls._known.setdefault(prediction.solver, {})
+        if replicas not in known:
+            known[replicas] = cls(prediction, replicas)
+        return known[replicas]
 
     def __init__(self, prediction: Prediction, replicas: int) -> None:
         system = prediction.system

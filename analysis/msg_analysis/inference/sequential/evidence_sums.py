@@ -70,7 +70,7 @@ class EvidenceSums:
         first, second = np.triu_indices(m, 1)
         paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
         independent_losses = step.burst is None and not real_time
-        self.error = ErrorMartingale(prediction, replicas) if self.plain else None
+        self.error = ErrorMartingale.of(prediction, replicas) if self.plain else None
         self._asked = LawQuestions(
             transition=step.transition,
             losses=step.losses,
@@ -326,7 +326,10 @@ class EvidenceSums:
         """What a row of ``families`` is about."""
         return self._asked.question(kind, row)
 
-    def evidence(self) -> float:
-        """Log of the evidence against the whole law: the weighted mean over the kinds of the mean over questions."""
-        families = {kind: logarithms[None] for kind, logarithms in self.families().items()}
+    def evidence(self, families: dict[str, FloatArray] | None = None) -> float:
+        """Log of the evidence against the whole law: the weighted mean over the kinds of the mean over questions.
+
+        ``families``: where they are known.
+        """
+        families = {kind: logarithms[None] for kind, logarithms in (families or self.families()).items()}
         return float(self._asked.log_evidence(self.total, families)[0])

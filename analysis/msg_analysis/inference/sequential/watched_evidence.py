@@ -163,8 +163,8 @@ def any_time_evidence(
         time = np.asarray(watched.steps * watched.dt, dtype=float)
         over = np.flatnonzero(watched.logarithms >= math.log(threshold))
         crossed = float(time[over[0]]) if len(over) else None
-    questions = []
-    for kind, logarithms in sums.families().items():
+    questions, families = [], sums.families()
+    for kind, logarithms in families.items():
         each = log_mean(logarithms, axis=1)
         best = int(np.argmax(each))
         words = sums.departures.question(kind, best, graphs) if sums.departures else None
@@ -175,7 +175,7 @@ def any_time_evidence(
         half_width = float(simultaneous_half_width(variance, sums.error.variance * planned)) / steps
     return AnyTimeEvidence(
         threshold=threshold,
-        log_evidence=sums.evidence(),
+        log_evidence=sums.evidence(families),
         crossed=crossed,
         time=time,
         log_curve=watched.logarithms,
