@@ -19,6 +19,8 @@ from click.testing import CliRunner
 
 pytest.importorskip("rclpy")
 
+import forked_commands
+
 from msg_agents.cli.main import main
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.model.experiment.experiment import ValidExperiment
@@ -52,6 +54,12 @@ def execute(*arguments: str | Path, directory: Path | None = None) -> subprocess
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1"}
     command = [str(PROGRAM), *(str(argument) for argument in arguments)]
     return subprocess.run(command, env=environment, cwd=directory, capture_output=True, text=True, timeout=60)
+
+
+def fork(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """In a process that is forked from one that has imported all."""
+    with forked_commands.installed():
+        return execute(*arguments)
 
 
 def refused(process: subprocess.CompletedProcess[str], *words: str) -> None:
@@ -128,7 +136,7 @@ def test_a_place_where_no_bag_can_be_made(experiment: Path, out: str, reason: st
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    refused(execute("run", tmp_path / "nowhere.yaml"), "nowhere.yaml")
+    refused(fork("run", tmp_path / "nowhere.yaml"), "nowhere.yaml")
     refused(call("run", tmp_path), str(tmp_path))
     (tmp_path / "binary").write_bytes(bytes(range(256)))
     refused(call("run", tmp_path / "binary"), "binary")
@@ -211,7 +219,7 @@ def test_unknown_agents(run_file: Path, numbers: list[str], words: list[str]) ->
 def test_the_recorder_never_overwrites(tmp_path: Path, run_file: Path) -> None:
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "mine").write_text("mine")
-    refused(execute("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
+    refused(fork("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
     assert [file.name for file in (tmp_path / "bag").iterdir()] == ["mine"]
 
 
@@ -228,7 +236,7 @@ def test_check(tmp_path: Path) -> None:
     process = call("check", tmp_path / "bad")
     assert process.returncode == 1
     assert "first: agent 2 at step 40" in process.stdout
-    process = execute("check", tmp_path / "bad", "--json")
+    process = fork("check", tmp_path / "bad", "--json")
     assert process.returncode == 1
     found = json.loads(process.stdout)
     assert (found["equal"], found["compared"], found["missing"]) == (False, 303, 0)
