@@ -31,8 +31,19 @@ PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.c
 PREPARED = (
     *PROGRAMS.values(),
     "msg_analysis.api",
+    "msg_analysis.cli.progress",
+    "msg_analysis.common.text.safe_console",
+    "msg_analysis.report.documents.info",
+    "msg_analysis.report.documents.transient_and_facts",
+    "msg_analysis.report.terminal.bag_text",
     "msg_analysis.report.terminal.comparison_text",
+    "msg_analysis.report.terminal.experiment_text",
+    "msg_analysis.report.terminal.runs_text",
+    "msg_analysis.report.terminal.theory_text",
     "msg_analysis.twin.check",
+    "rich._emoji_codes",
+    "rich.progress",
+    "threadpoolctl",
 )
 BY_COMMAND = {  # what takes long to import, and no other command needs
     "export": ("pyarrow.csv", "pyarrow.parquet"),
