@@ -13,6 +13,7 @@ import contextlib
 import ctypes
 import fcntl
 import functools
+import gc
 import importlib
 import importlib.machinery
 import io
@@ -49,14 +50,23 @@ PREPARED = (
     "msg_agents.doctor.examination",
     "msg_agents.nodes.replay.player",
     "msg_agents.nodes.watching.live",
+    "msg_agents.cli.main",
+    "msg_agents.cli.run_result",
     "msg_agents.running.runner",
+    "msg_agents.watching.run_view",
     "msg_agents.watching.terminal_panel",
     "msg_analysis.api",
     "msg_analysis.cli.compare",
+    "msg_analysis.cli.progress",
+    "msg_analysis.cli.runs",
+    "msg_analysis.common.text.safe_console",
     "msg_analysis.report.html.report_page",
     "msg_analysis.report.terminal.comparison_text",
     "msg_analysis.twin.check",
+    "rich._emoji_codes",
+    "rich.progress",
     "scipy.stats",
+    "threadpoolctl",
 )
 READ_LATER = re.compile(
     "(ROS_|RMW_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_|PYDANTIC_|KMP_).*|NO_COLOR|COLUMNS|LINES|PYTHON(SAFEPATH|UNBUFFERED)|"
@@ -272,6 +282,17 @@ def _write_mark(mark: str) -> None:
     ctypes.memmove(start + place, mark.encode(), LENGTH_OF_MARK)
 
 
+def _use_libraries() -> None:
+    """What they find out at their first use, such as the properties of figures, is then known to all that is forked."""
+    from msg_analysis.api import Experiment
+    from msg_analysis.report.html.report_page import render
+
+    comparison = Experiment.load("line_ring").simulate(duration=10).compare()
+    render(comparison, comparison.trajectory)
+    del comparison
+    gc.collect()
+
+
 def main() -> None:
     """The server."""
     from setproctitle import setproctitle
@@ -282,6 +303,7 @@ def main() -> None:
     for name in PREPARED:
         importlib.import_module(name)
     importlib.import_module(NODE_SERVER).prepare()
+    _use_libraries()
     show_stacks_when_asked()
     serve(socket.socket(fileno=int(sys.argv[1])), run, _prepare_for)
 
