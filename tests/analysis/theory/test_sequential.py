@@ -1,5 +1,6 @@
 """The sequential law: agents one after the other in every period."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -138,7 +139,8 @@ def test_a_run_goes_on_from_its_past(case):
 def many_pasts(time):
     """(2, 1000, 400): graphs of 1,000 pasts of each g(0); of the chain only, which all cases but one share."""
     what = CASES["discrete" if time == "discrete" else "consensus"]
-    seeded = [what.with_run(seed=seed) for seed in range(1000)]
+    specs = [what.spec.model_copy(update={"run": what.run.model_copy(update={"seed": seed})}) for seed in range(1000)]
+    seeded = [dataclasses.replace(what, spec=spec) for spec in specs]  # as by ``with_run``, which checks each again
     return np.array([[past_modes(one, mode, 400) for one in seeded] for mode in range(2)])
 
 
