@@ -29,8 +29,8 @@ NOISY = """
 from msg_analysis.model.step import process_noise
 
 class Noisy(process_noise.ProcessNoise):
-    def block(self, agent, block):
-        return [noise * (1.3 if agent == 2 else 1.0) for noise in super().block(agent, block)]
+    def block(self, agent, *others):
+        return [noise * (1.3 if agent == 2 else 1.0) for noise in super().block(agent, *others)]
 
 process_noise.ProcessNoise = Noisy
 """
