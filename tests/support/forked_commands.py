@@ -1,7 +1,7 @@
 """Our own commands are forked from a process that has imported everything, instead of being executed.
 
-Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis``, the fork server of a network and the
-nodes of tests (``python -P -c CODE``), if nothing is asked for but streams, a directory, a session, a function of this
+Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis``, ``dask``, fork servers and the nodes
+of tests (``python -P -c CODE``), if nothing is asked for but streams, a directory, a session, a function of this
 folder that is called first, a network namespace (``ip netns exec``), a PYTHONPATH to other packages, and variables that
 are read after the imports. It executes all else as ever. A forked process is a child of the process that asked, has the
 title of its command, and its mark can be read in its environment, as after exec.
@@ -38,11 +38,14 @@ from msg_analysis.common.forked_processes import ALL_FORKED, LONGEST, adopt_orph
 MARK = "MSG_AGENTS_TEST"
 LENGTH_OF_MARK = 32
 NODE_SERVER = "msg_agents.cli.servers.node_server"
+RUN_SERVER = "msg_agents.cli.servers.run_server"
 OF_NODE_SERVER = ["-m", NODE_SERVER]
+OF_RUN_SERVER = ["-P", "-m", RUN_SERVER]
 OF_NODE = ["-P", "-c"]
 PROGRAMS = {
     "msg-agents": ("msg_agents.cli.entry_points", "msg_agents"),
     "msg-analysis": ("msg_analysis.cli.main", "main"),
+    "dask": ("dask.__main__", "main"),
 }
 PREPARED = (
     "msg_agents.cli.replay",
@@ -125,7 +128,8 @@ def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Seque
     first = arguments[21]
     known = first is None or (Path(first.__code__.co_filename).parent == SUPPORT and first.__qualname__.isidentifier())
     unusual = not close or new_group != -1 or identity != [None, None, None, -1] or not known
-    if unusual or not (of_ours or (command[1:3] in (OF_NODE_SERVER, OF_NODE) and command[0] == sys.executable)):
+    of_python = command[1:4] == OF_RUN_SERVER or command[1:3] in (OF_NODE_SERVER, OF_NODE)
+    if unusual or not (of_ours or (of_python and command[0] == sys.executable)):
         return None
     lines = [f"{name}={value}" for name, value in os.environ.items()] if environment is None else environment
     return {
@@ -233,6 +237,9 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
     if command[1:3] == OF_NODE_SERVER:
         sys.argv = command[2:]
         return importlib.import_module(NODE_SERVER).main  # type: ignore[no-any-return]
+    if command[1:4] == OF_RUN_SERVER:
+        sys.argv = command[3:]
+        return importlib.import_module(RUN_SERVER).main  # type: ignore[no-any-return]
     sys.argv = command
     if command[1:2] in (["run"], ["host"], ["doctor"]):
         leave_one_waiting(serve_waiting, request["kept"])
@@ -244,7 +251,7 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
 
 def _prepare_for(request: dict[str, Any]) -> None:
     """Seldom used, so the server imports it when it is."""
-    if request["command"][1:2] == ["sweep"]:
+    if Path(request["command"][0]).name == "dask" or request["command"][1:2] == ["sweep"]:
         importlib.import_module("forked_workers").prepare()
 
 

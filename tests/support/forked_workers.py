@@ -1,6 +1,6 @@
 """The workers of a sweep are forked from the process of the sweep, if that was forked from one that has imported all.
 
-Multiprocessing would execute a server for them, which imports all again.
+Multiprocessing would execute a server for them, which imports all again; and so does what forks a worker's networks.
 """
 
 from __future__ import annotations
@@ -11,18 +11,25 @@ import importlib
 import multiprocessing.util
 import os
 import signal
-from collections.abc import Sequence
+import subprocess
+import weakref
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
+
+import forked_commands
 
 from msg_agents.processes.fork_server import run_and_end
 
 NEEDED = (
-    "distributed",
+    "distributed.cli.dask_scheduler",
+    "distributed.cli.dask_worker",
     "msg_analysis.report.figures.sweep_figure",
     "msg_analysis.report.html.sweep_page",
     "msg_analysis.sweep.conduct",
 )
+
+_fork_exec = getattr(subprocess, "_fork_exec", None)  # where Popen ends; not of the public API
 
 
 def prepare() -> None:
@@ -32,8 +39,10 @@ def prepare() -> None:
 
 
 def install() -> None:
-    """In the process of a sweep, which has only one thread as yet: fork the servers of multiprocessing."""
+    """In the process of a sweep, which has only one thread as yet: fork servers of multiprocessing and of networks."""
     multiprocessing.util.spawnv_passfds = _fork  # type: ignore[attr-defined]  not of the public API
+    if _fork_exec is not None:
+        subprocess._fork_exec = _fork_run_server  # type: ignore[attr-defined]
 
 
 def _fork(_: object, arguments: Sequence[str], kept: Sequence[int]) -> int:
@@ -44,11 +53,34 @@ def _fork(_: object, arguments: Sequence[str], kept: Sequence[int]) -> int:
     return pid
 
 
+def _fork_run_server(*arguments: Any) -> int:
+    """Takes the place of ``_fork_exec``."""
+    request = forked_commands.request_of(arguments[0], arguments)
+    if request is None or request["command"][1:4] != forked_commands.OF_RUN_SERVER:
+        return _fork_exec(*arguments)  # type: ignore[misc,no-any-return]
+    pid = os.fork()
+    if not pid:
+        descriptors = list(map(os.dup, forked_commands.descriptors_of(request, arguments)))  # some are the same
+        _close_others(descriptors)
+        # Packages in PYTHONPATH have been found by this process already.
+        run_and_end(functools.partial(_run_server, request | {"packages": []}, descriptors))
+    return pid
+
+
+def _run_server(request: dict[str, Any], descriptors: list[int]) -> None:
+    weakref.finalize._registry.clear()  # type: ignore[attr-defined]  what the worker removes at its end is not ours
+    forked_commands.become(request, descriptors)()
+
+
 def _run(code: str, kept: Sequence[int]) -> NoReturn:
-    for descriptor in {int(file.name) for file in Path("/proc/self/fd").iterdir()} - {0, 1, 2, *kept}:
-        with contextlib.suppress(OSError):  # that by which they were listed is closed
-            os.close(descriptor)
+    _close_others([0, 1, 2, *kept])
     for number in signal.valid_signals() - {signal.SIGINT}:
         if callable(signal.getsignal(number)):
             signal.signal(number, signal.SIG_DFL)
     run_and_end(functools.partial(exec, code, {}))
+
+
+def _close_others(kept: Iterable[int]) -> None:
+    for descriptor in {int(file.name) for file in Path("/proc/self/fd").iterdir()} - {*kept}:
+        with contextlib.suppress(OSError):  # that by which they were listed is closed
+            os.close(descriptor)
