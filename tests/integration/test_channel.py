@@ -150,7 +150,9 @@ def test_only_active_links_carry_packets(network: Any, pace: str) -> None:
 
 
 def test_a_limited_rate(network: Any) -> None:
-    run = start(network, {"duration": 3}, "--no-analyse", "--no-fork", default={"rate_mbit": 2, "queue": 1000})
+    hosts = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}
+    limit = {"rate_mbit": 2, "queue": 1000}
+    run = start(network, {"duration": 3, "processes": 1}, "--no-analyse", "--no-fork", hosts=hosts, default=limit)
     result = network.completed(run)
     assert totals(result, "queued") > 0
     assert result["channel"]["findings"] == []

@@ -11,7 +11,8 @@ from visitor import assert_endpoints
 @pytest.mark.parametrize("delivery", [None, "best_effort", "reliable"])
 def test_readers_of_states(network: Any, domain: int, delivery: str | None) -> None:
     """Agents 2 and 5 hear agent 1. Its writer is reliable, as other readers may want it."""
-    file = network.file(run={"pace": "realtime", "speed": 10, "duration": 10_000})
+    # Few steps, and large states, which are soon seen in the bag.
+    file = network.file(run={"pace": "realtime", "duration": 1000, "replicas": 128})
     run = network.record(file, "--domain", str(domain), *(["--delivery", delivery] if delivery else []))
     network.wait_until_moving()
     heard = "RELIABLE" if delivery == "reliable" else "BEST_EFFORT"

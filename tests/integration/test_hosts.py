@@ -137,7 +137,11 @@ def ended(processes: dict[str, subprocess.Popen[str]], code: int, timeout: float
     return texts
 
 
-def whole(lan: Lan, texts: dict[str, tuple[str, str]]) -> None:
+ONE_PER_AGENT = {"left": {"agent_1", "agent_4"}, "right": {"agent_2", "agent_3", "agent_5"}}
+ONE_PER_HOST = {"left": {"agents_1_and_1_more"}, "right": {"agents_2_and_2_more"}}
+
+
+def whole(lan: Lan, texts: dict[str, tuple[str, str]], processes: dict[str, set[str]] = ONE_PER_AGENT) -> None:
     """All is there, once, and as the twin says. One bag, on the recorder's host; logs everywhere."""
     results = {name: json.loads(stdout) for name, (stdout, _) in texts.items()}
     assert all(result["failures"] == [] for result in results.values())
@@ -149,11 +153,7 @@ def whole(lan: Lan, texts: dict[str, tuple[str, str]]) -> None:
     outcome = check(trajectory)
     assert (outcome.difference, outcome.missing) == (None, 0)
     logs = {name: {log.stem for log in (lan.network.directory / name).glob("*/log/*.log")} for name in NAMES}
-    assert logs == {
-        "base": {"recorder", "switcher"},
-        "left": {"agent_1", "agent_4"},
-        "right": {"agent_2", "agent_3", "agent_5"},
-    }
+    assert logs == {"base": {"recorder", "switcher"}, **processes}
 
 
 def test_three_hosts(lan: Lan) -> None:
@@ -167,8 +167,8 @@ def test_three_hosts(lan: Lan) -> None:
 def test_hosts_of_unlike_processors(lan: Lan) -> None:
     """In discrete time, where W is an exponential, and with a start that is drawn."""
     switching = {"transition": [[0.9, 0.1], [0.4, 0.6]]}
-    prepare(lan, 500, time="discrete", switching=switching, run={"dt": 1})
-    whole(lan, ended(lan.start_all("--no-analyse", left=another_processor()), 0))
+    prepare(lan, 500, time="discrete", switching=switching, run={"dt": 1, "processes": 1})
+    whole(lan, ended(lan.start_all("--no-analyse", left=another_processor()), 0), ONE_PER_HOST)
 
 
 def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: random.Random) -> None:
@@ -240,7 +240,7 @@ def test_a_clock_that_is_ahead_is_found(lan: Lan) -> None:
     """That of the left host is 200 ms ahead of the others, by a library; dt / speed is 50 ms."""
     clock = SetClock(lan.network.directory)
     clock.set_ahead(0.2)
-    prepare(lan, 5, run={"pace": "realtime"})
+    prepare(lan, 5, run={"pace": "realtime", "processes": 1})
     texts = ended(lan.start_all("--no-analyse", left=clock.environment), 0)
     for entry in json.loads(texts["base"][0])["clocks"]:
         low, high = entry["ahead_ms"]

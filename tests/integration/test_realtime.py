@@ -222,7 +222,7 @@ def test_two_runs_at_the_same_time(network: Any) -> None:
 def test_the_clock_is_set_back(network: Any) -> None:
     """By three seconds, for all processes of the run: it says so, waits, and its log is possible."""
     clock = SetClock(network.directory)
-    run = network.record(network.file(run=REALTIME | {"duration": 15}), "--json", **clock.environment)
+    run = network.record(network.file(run=REALTIME | {"duration": 15, "processes": 2}), "--json", **clock.environment)
     network.wait_until_moving()
     clock.set_ahead(-3.0)
     stdout, stderr = run.communicate(timeout=60)

@@ -221,7 +221,8 @@ time.sleep(600)
 def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
     """Everything that cannot be, in any order, sent to a run that is under way; the intruder is killed at last."""
     # 25,000 steps: in time, the last one is more than 6,000 ahead, and the recorder refuses it as impossible.
-    file = network.file(run={"duration": 1250, "processes": 2})
+    graphs = {"line": {"path": [1, 2, 3, 4]}, "ring": {"cycle": [1, 2, 3, 4]}}
+    file = network.file(graphs=graphs, run={"duration": 1250, "processes": 2})
     with free_domain() as domain:
         options = ("--out", network.directory / "runs", "--domain", str(domain), "--json")
         run = network.start("run", file, *options)

@@ -57,10 +57,10 @@ def complete(result: RunResult) -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {},
+        {"run": {"processes": "one_per_agent"}},
         {"noise": {"process": 1.0, "loss": 0.2, "link": 0.1, "broadcast": 0.1}},
         {"noise": {"process": 1.0, "loss": 0.2, "on_loss": "hold"}},
-        {"noise": {"process": 1.0, "delay": 2}, "run": {"processes": "one_per_agent"}},
+        {"noise": {"process": 1.0, "delay": 2}},
     ],
     ids=["plain", "air", "hold", "delay"],
 )

@@ -103,7 +103,8 @@ def _follow(page: Any, address: str) -> Log:
 
 def test_page_of_a_run(network: Any, page: Any) -> None:
     """Steps, graph, states and errors come in; the end is told, with the verdict and the numbers of the comparison."""
-    run = network.start("run", network.file(), "--out", network.directory / "runs", "--json", "--web", "0")
+    file = network.file(run={"processes": 2})
+    run = network.start("run", file, "--out", network.directory / "runs", "--json", "--web", "0")
     log = Log(page)
     page.goto(address := _address(run))
     page.wait_for_selector("body[data-over=yes]")
