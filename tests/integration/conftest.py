@@ -263,7 +263,10 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network
             process.kill()
         print(last_words(network.commands))
     assert not left, "processes outlived the test"
-    assert [path for path in network.traces if path.exists()] == []
+    traces = {path for path in network.traces if path.exists()}
+    if traces:  # some names are common to all domains: a process of another test may have such a file by now
+        traces -= {path for process in Path("/proc").glob("[0-9]*") for path in _mapped(int(process.name))}
+    assert traces == set()
 
 
 @pytest.fixture
