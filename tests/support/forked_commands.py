@@ -72,7 +72,7 @@ PREPARED = (
     "threadpoolctl",
 )
 READ_LATER = re.compile(
-    "(ROS_|RMW_|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_|PYDANTIC_|KMP_).*|NO_COLOR|COLUMNS|LINES|PYTHON(SAFEPATH|UNBUFFERED)|"
+    "(ROS_|RMW_(?!IMPLEMENTATION)|FASTDDS_|FASTRTPS_|MSG_AGENTS_|PYTEST_|PYDANTIC_|KMP_).*|NO_COLOR|COLUMNS|LINES|PYTHON(SAFEPATH|UNBUFFERED)|"
     "(MKL|OMP|OPENBLAS)_NUM_THREADS"
 )
 """Names of variables that are read after the imports, or are the same for all that is forked (libraries set KMP_)."""

@@ -49,6 +49,9 @@ from msg_analysis.common.forked_processes import (
 
 PROGRAM = [sys.executable, "-m", "msg_agents.cli.servers.node_server"]  # calls ``serve``
 EARLY = "--early"  # argument of a server that is there before its run
+TRIAL = "try the middleware"  # instead of a command
+TRIAL_PATIENCE = 30.0  # s
+TRIAL_LOOK = 1e-3  # s between two looks
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
 ADOPTION = 1e-4  # s between two looks whether a forked process has its new parent
 _ending_at_once = False  # see ``ends_at_once``
@@ -83,6 +86,15 @@ class NodeServer(ForkServer):
                 for node in nodes
             ]
         )
+
+    def has_middleware(self) -> bool:
+        """Whether a forked process could use ROS 2: see ``middleware_check``."""
+        with Path(os.devnull).open("wb") as nothing:
+            trial = self.fork_nodes([NodeStart([TRIAL], {}, nothing.fileno(), None)])
+        deadline = time.monotonic() + TRIAL_PATIENCE
+        while trial and trial[0].poll() is None and time.monotonic() < deadline:
+            time.sleep(TRIAL_LOOK)
+        return bool(trial) and trial[0].poll() == 0
 
     def _start(self, control: socket.socket, output: IO[bytes]) -> Process:
         return _wake(self._environment, control, output) or super()._start(control, output)

@@ -20,7 +20,7 @@ import importlib.util
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from msg_analysis.errors import InputError
@@ -32,12 +32,8 @@ PROBE = """
 import importlib.util, os, warnings
 warnings.simplefilter("ignore")
 print(os.path.dirname(importlib.util.find_spec("rclpy").origin), flush=True)
-import rclpy
-rclpy.init()
-rclpy.shutdown()
-from rclpy.type_support import check_for_type_support
-from msg_agents_interfaces.msg import AgentState
-check_for_type_support(AgentState)
+from msg_agents.nodes.ros.middleware import use_middleware
+use_middleware()
 """
 
 
@@ -51,14 +47,15 @@ def require_rclpy() -> Path:
     return Path(found.origin).parent.resolve()
 
 
-def require_middleware(environment: Mapping[str, str]) -> None:
+def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool] = lambda: False) -> None:
     """InputError, with the variable to unset, unless rclpy and the messages can be loaded in this environment.
 
     It is tried, in a process of its own, only where a variable could lead to another ROS 2 than that of this Python.
+    ``forked``: whether a process could that was forked from one which has imported all; it saves the imports.
     """
     require_rclpy()
     present = [name for name in SUSPECTS if environment.get(name)]
-    if not present:
+    if not present or forked():
         return
     try:
         probe = subprocess.run(

@@ -28,6 +28,7 @@ from msg_agents.channel.channel_file import Channel
 from msg_agents.processes.core_pinning import place
 from msg_agents.processes.environment import RESTARTS
 from msg_agents.processes.fork_server import NodeServer
+from msg_agents.processes.middleware_check import require_middleware
 from msg_agents.processes.process_plan import (
     MOST_PROCESSES,
     MOST_UNAIDED,
@@ -163,9 +164,10 @@ def run_network(
             ) as around,
         ):
             variables = around.environment
-            if share is None and linked is None:  # other hosts and users' tools do not reach those of a channel
-                view.joined(around.domain)
             with NodeServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
+                require_middleware(variables, *([fork_server.has_middleware] if fork_server else []))
+                if share is None and linked is None:  # other hosts and users' tools do not reach those of a channel
+                    view.joined(around.domain)
                 record = replace(record or new_record(experiment), until=until)
                 run_file = folder / "run.json"
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")

@@ -26,7 +26,6 @@ from msg_agents.discovery.loopback import require_loopback
 from msg_agents.discovery.profiles import INTRODUCED_PROFILE, PROFILE_VARIABLES, domains_for
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment, other_logs, require_discovery
-from msg_agents.processes.middleware_check import require_middleware
 from msg_agents.processes.shared_memory import require_shared_memory
 
 ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files of ROS
@@ -48,7 +47,7 @@ def surroundings(
     changes: Mapping[str, str],  # of the environment
     participants: int,  # of the run
 ) -> Iterator[Surroundings]:
-    """Provide them for a run; InputError: no domain is free, there is no middleware, or processes could not meet."""
+    """Provide them for a run; InputError: no domain is free, or processes could not meet."""
     with ExitStack() as stack:
         if domain is None:
             domain = stack.enter_context(free_domain(domains_for(participants)))
@@ -63,7 +62,6 @@ def surroundings(
         require_discovery(environment)
         require_shared_memory()
         environment |= other_logs(folder / ROS_LOGS)
-        require_middleware(environment)
         yield Surroundings(domain, environment, introducer)
 
 

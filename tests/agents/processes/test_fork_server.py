@@ -19,8 +19,10 @@ from waiting import gone, participants, record_of_two, wait_for
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, early_server
+from msg_agents.processes.middleware_check import require_middleware
 from msg_analysis.common.cores import available_cores
 from msg_analysis.common.forked_processes import LONGEST_TITLE, ForkedProcess
+from msg_analysis.errors import InputError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="this machine: not Linux")
 
@@ -126,11 +128,22 @@ def test_processes_outlive_a_killed_fork_server(
     assert process.wait() == -signal.SIGKILL
 
 
+@pytest.mark.parametrize(("middleware", "usable"), [("rmw_fastrtps_cpp", True), ("rmw_none_cpp", False)])
+def test_the_middleware_is_tried(tmp_path: Path, domain: int, middleware: str, usable: bool) -> None:
+    """In a forked process; where that cannot use it, the error is that of a process which has imported nothing."""
+    environment = node_environment(domain) | {"RMW_IMPLEMENTATION": middleware}
+    with NodeServer(environment, tmp_path / "server.log") as server:
+        assert server.has_middleware() == usable
+        with contextlib.nullcontext() if usable else pytest.raises(InputError, match="rmw_none_cpp: this ROS 2 "):
+            require_middleware(environment, server.has_middleware)
+
+
 def test_a_fork_server_that_cannot_import(tmp_path: Path) -> None:
     (tmp_path / "msg_agents.py").write_text("raise ImportError('broken')")
     log = tmp_path / "server.log"
     with NodeServer(os.environ | {"PYTHONPATH": str(tmp_path)}, log) as server:
         assert server.fork_nodes([NodeStart(["agent", "--help"], {}, 1, None)]) == []
+        assert not server.has_middleware()
     assert "broken" in log.read_text()
 
 

@@ -74,10 +74,16 @@ def prepare() -> None:
 
 def serve_nodes(control: socket.socket) -> NoReturn:
     """Fork nodes; in a forked process, run the command of one."""
-    from msg_agents.processes.fork_server import begin_node, serve
+    from msg_agents.nodes.ros.middleware import use_middleware
+    from msg_agents.processes.fork_server import TRIAL, begin_node, serve
 
     def run(request: dict[str, Any], descriptors: list[int]) -> None:
-        run_command(begin_node(request, descriptors))
+        arguments = begin_node(request, descriptors)
+        if arguments == [TRIAL]:
+            _show_as(arguments)
+            use_middleware()
+        else:
+            run_command(arguments)
 
     serve(control, run, _read_record)
 
@@ -104,16 +110,23 @@ def serve_waiting(control: socket.socket) -> NoReturn:
 def run_command(arguments: list[str]) -> None:
     """Run a command of ``msg-agents`` in a forked process, which ``ps`` then shows by it."""
     import numpy as np
-    from setproctitle import setproctitle
 
     from msg_agents.cli.main import main as command
+
+    _show_as(arguments)
+    np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
+    sys.argv = ["msg-agents", *arguments]
+    command(arguments, prog_name="msg-agents")
+
+
+def _show_as(arguments: list[str]) -> None:
+    """In ``ps``, and in the names of log files of ROS."""
+    from setproctitle import setproctitle
+
     from msg_analysis.common.forked_processes import LONGEST_TITLE
 
     title = os.fsencode(f"msg-agents {' '.join(arguments)}")
     setproctitle(title[:LONGEST_TITLE].decode(errors="ignore"))
-    np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
-    sys.argv = ["msg-agents", *arguments]
-    command(arguments, prog_name="msg-agents")
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from msg_agents.doctor.qos.cells import MANY, Cell, Reader
 from msg_agents.doctor.qos.tally import CellResult, Try
 from msg_agents.doctor.qos.tries import make_tries
 from msg_agents.doctor.qos.workers import Workers
+from msg_agents.processes.middleware_check import require_middleware
 from msg_agents.running.run_folder import workshop
 from msg_agents.running.surroundings import surroundings
 from msg_analysis.common.exit_codes import ExitCode
@@ -93,6 +94,7 @@ def _measure(cells: Sequence[Cell], tries: int) -> Matrix:
         surroundings(folder, None, {}, PARTICIPANTS) as around,
         Workers(around, folder) as workers,
     ):
+        require_middleware(around.environment)
         (worker,) = workers.start("writer")
         middleware = worker.ask("identify")["middleware"]
         worker.leave()

@@ -1,0 +1,28 @@
+# Copyright 2026 msg_agents maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether this process can use ROS 2: see ``msg_agents.processes.middleware_check``."""
+
+from __future__ import annotations
+
+import rclpy
+from msg_agents_interfaces.msg import AgentState
+from rclpy.type_support import check_for_type_support
+
+
+def use_middleware() -> None:
+    """Load rclpy's middleware and the messages; raises whatever goes wrong."""
+    rclpy.init()
+    rclpy.shutdown()
+    check_for_type_support(AgentState)
