@@ -7,7 +7,7 @@ import re
 import socket
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -149,10 +149,10 @@ def test_the_announcement_of_a_real_participant() -> None:
         found = read_announcement(listener.recv(1 << 16))
         assert found is not None
         assert found.prefix == found.datagram[8:20]
-        sockets = "".join(
-            str(entry.readlink()) for entry in Path(f"/proc/{process.pid}/fd").iterdir() if entry.is_symlink()
-        )
-        own = set(re.findall(r"socket:\[(\d+)\]", sockets))
+        own = set()
+        for entry in Path(f"/proc/{process.pid}/fd").iterdir():
+            with suppress(FileNotFoundError):  # its node is still being made, which opens and closes files
+                own.update(re.findall(r"socket:\[(\d+)\]", str(entry.readlink())))
         lines = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
         ports = {int(line[1].rpartition(":")[2], 16) for line in lines if line[9] in own}
         assert found.port in ports
