@@ -96,6 +96,13 @@ def test_ros_would_be_found() -> None:
     assert {"rclpy"} <= {name for name in loaded if is_ros(name)}
 
 
+def test_the_verb_of_ros2_imports_no_other_package() -> None:
+    """ros2 loads it with all its verbs, perhaps by a Python that has none of ours."""
+    loaded = loaded_by(["msg_agents.cli.entry_points"])
+    assert "msg_agents" in loaded
+    assert not {name for name in loaded if name.partition(".")[0] in ("msg_analysis", "numpy", "rclpy")}
+
+
 def test_help_needs_no_ros() -> None:
     code = "import sys\nfrom msg_agents.cli.main import main\nmain(['--help'], standalone_mode=False)\n"
     code += "print([name for name in ('rclpy', 'numpy', 'scipy', 'matplotlib', 'rich') if name in sys.modules])"

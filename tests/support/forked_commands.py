@@ -81,7 +81,7 @@ CLONE_NEWNET = 0x40000000  # linux/sched.h
 LONGEST_TITLE = 2000
 FREE = 200  # descriptors from here on are not used
 
-_fork_exec: Callable[..., int] | None = getattr(
+FORK_EXEC: Callable[..., int] | None = getattr(
     subprocess, "_fork_exec", None
 )  # where Popen ends; not of the public API
 
@@ -89,7 +89,7 @@ _fork_exec: Callable[..., int] | None = getattr(
 @contextlib.contextmanager
 def installed() -> Iterator[None]:
     """Fork meanwhile, where the system can do it."""
-    if _fork_exec is None or sys.platform != "linux":
+    if FORK_EXEC is None or sys.platform != "linux":
         yield
         return
     adopt_orphans(adopt=True)
@@ -97,7 +97,7 @@ def installed() -> Iterator[None]:
     try:
         yield
     finally:
-        subprocess._fork_exec = _fork_exec  # type: ignore[attr-defined]
+        subprocess._fork_exec = FORK_EXEC  # type: ignore[attr-defined]
         adopt_orphans(adopt=False)
 
 
@@ -160,7 +160,7 @@ class _Forker:
     def fork_exec(self, *arguments: Any) -> int:
         request = request_of(arguments[0], arguments)
         if request is None:
-            return _fork_exec(*arguments)  # type: ignore[misc]
+            return FORK_EXEC(*arguments)  # type: ignore[misc]
         if self._control is None:
             self._control = self._start()
         request["packages"] = packages_of(request["environment"], self._path)
@@ -170,7 +170,7 @@ class _Forker:
         descriptors = descriptors_of(request, arguments)
         message = json.dumps([[request, list(range(len(descriptors)))]]).encode()
         if len(message) > LONGEST or at_start != self._environment:
-            return _fork_exec(*arguments)  # type: ignore[misc]
+            return FORK_EXEC(*arguments)  # type: ignore[misc]
         socket.send_fds(self._control, [message], descriptors)
         pid = int(self._control.recv(LONGEST))
         assert self._control.recv(LONGEST) == ALL_FORKED

@@ -29,8 +29,6 @@ NEEDED = (
     "msg_analysis.sweep.conduct",
 )
 
-_fork_exec = getattr(subprocess, "_fork_exec", None)  # where Popen ends; not of the public API
-
 
 def prepare() -> None:
     """Import what a sweep and its workers need besides."""
@@ -41,7 +39,7 @@ def prepare() -> None:
 def install() -> None:
     """In the process of a sweep, which has only one thread as yet: fork servers of multiprocessing and of networks."""
     multiprocessing.util.spawnv_passfds = _fork  # type: ignore[attr-defined]  not of the public API
-    if _fork_exec is not None:
+    if forked_commands.FORK_EXEC is not None:
         subprocess._fork_exec = _fork_run_server  # type: ignore[attr-defined]
 
 
@@ -57,7 +55,7 @@ def _fork_run_server(*arguments: Any) -> int:
     """Takes the place of ``_fork_exec``."""
     request = forked_commands.request_of(arguments[0], arguments)
     if request is None or request["command"][1:4] != forked_commands.OF_RUN_SERVER:
-        return _fork_exec(*arguments)  # type: ignore[misc,no-any-return]
+        return forked_commands.FORK_EXEC(*arguments)  # type: ignore[misc]
     pid = os.fork()
     if not pid:
         descriptors = list(map(os.dup, forked_commands.descriptors_of(request, arguments)))  # some are the same

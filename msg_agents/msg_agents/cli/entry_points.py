@@ -26,8 +26,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from msg_analysis.cli.entry_point import collect_garbage_seldom
-
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
 
@@ -68,9 +66,11 @@ def markers() -> None:
 
 
 def _run(*command: str) -> None:
-    collect_garbage_seldom()
     atexit.register(_leave_garbage)
     try:
+        from msg_analysis.cli.entry_point import collect_garbage_seldom  # not above: ros2 loads the verb without it
+
+        collect_garbage_seldom()
         from msg_agents.cli.main import main
     except KeyboardInterrupt:  # the command group handles it only after these imports
         from msg_analysis.common.exit_codes import INTERRUPTED

@@ -25,6 +25,7 @@ import functools
 import gc
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -90,11 +91,15 @@ class NodeServer(ForkServer):
     def has_middleware(self) -> bool:
         """Whether a forked process could use ROS 2: see ``middleware_check``."""
         with Path(os.devnull).open("wb") as nothing:
-            trial = self.fork_nodes([NodeStart([TRIAL], {}, nothing.fileno(), None)])
+            trials = self.fork_nodes([NodeStart([TRIAL], {}, nothing.fileno(), None)])
         deadline = time.monotonic() + TRIAL_PATIENCE
-        while trial and trial[0].poll() is None and time.monotonic() < deadline:
-            time.sleep(TRIAL_LOOK)
-        return bool(trial) and trial[0].poll() == 0
+        for trial in trials:  # one, or none if nothing can be forked
+            try:
+                while trial.poll() is None and time.monotonic() < deadline:
+                    time.sleep(TRIAL_LOOK)
+            finally:
+                trial.send_signal(signal.SIGKILL)  # it hangs, or this process is interrupted
+        return [trial.wait() for trial in trials] == [0]
 
     def _start(self, control: socket.socket, output: IO[bytes]) -> Process:
         return _wake(self._environment, control, output) or super()._start(control, output)

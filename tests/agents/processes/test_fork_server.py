@@ -17,6 +17,7 @@ pytest.importorskip("rclpy")
 from waiting import gone, participants, record_of_two, wait_for
 
 from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.processes import fork_server
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, early_server
 from msg_agents.processes.middleware_check import require_middleware
@@ -136,6 +137,21 @@ def test_the_middleware_is_tried(tmp_path: Path, domain: int, middleware: str, u
         assert server.has_middleware() == usable
         with contextlib.nullcontext() if usable else pytest.raises(InputError, match="rmw_none_cpp: this ROS 2 "):
             require_middleware(environment, server.has_middleware)
+
+
+def children() -> set[str]:
+    """Numbers of the processes whose parent is this one."""
+    return {pid for file in Path("/proc/self/task").glob("*/children") for pid in file.read_text().split()}
+
+
+def test_a_middleware_that_hangs(tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It cannot be used, and the process that tried it is ended."""
+    monkeypatch.setattr(fork_server, "TRIAL_PATIENCE", 1.0)
+    (tmp_path / "sitecustomize.py").write_text("import rclpy, time\nrclpy.init = lambda: time.sleep(600)\n")
+    with NodeServer(node_environment(domain) | {"PYTHONPATH": str(tmp_path)}, tmp_path / "server.log") as server:
+        before = children()
+        assert not server.has_middleware()
+        assert children() <= before
 
 
 def test_a_fork_server_that_cannot_import(tmp_path: Path) -> None:
