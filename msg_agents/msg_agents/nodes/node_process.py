@@ -47,7 +47,7 @@ from msg_agents.processes.hung_process import show_stacks_when_asked
 from msg_agents.recovery.takeover import Takeover
 from msg_analysis.errors import InputError
 
-FIRST_POLL, GATE_POLL = 0.02, 0.2  # s; a tight loop on the ROS graph starves discovery where many processes look
+FIRST_POLL, GATE_POLL = 0.005, 0.2  # s; a tight loop on the ROS graph starves discovery where many processes look
 PAUSE_PER_LOOK = 40  # times as long as a look took, which is longer the more processes compete for the cores
 SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wakes up
 GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collections find nothing

@@ -61,7 +61,7 @@ from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.until import Until
 from msg_analysis.twin.simulate import new_record
 
-POLL = 0.05  # s
+FIRST_POLL, POLL = 0.02, 0.05  # s; the first until all agents have started
 
 
 def run_network(
@@ -256,7 +256,7 @@ def _watch(
     lag, clock = (LagDetector(due), ClockDetector()) if run.pace == "realtime" and follow_clock else (None, None)
     events, warned = EventLog(result.events), None
     while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
-        time.sleep(POLL)
+        time.sleep(FIRST_POLL if began is None else POLL)
         supervisor.read_status()
         if ending and ending.look(min(supervisor.steps, default=-1), view.note):
             supervisor.last_step = steps = ending.last_step

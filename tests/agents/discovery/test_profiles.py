@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
@@ -27,13 +29,28 @@ OLD, NEW = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 FOLDER = Path(profiles.__file__).parent
 # All that the profiles have and Fast DDS 3 has renamed: its profiles are made by
 #     cd msg_agents/msg_agents/discovery
-#     for i in loopback introduced; do sed s/heartbeatPeriod/heartbeat_period/ $i.xml > fast_dds_3/$i.xml; done
-RENAMED = ("heartbeatPeriod", "heartbeat_period")
+#     for i in loopback introduced; do
+#         sed -e s/heartbeatPeriod/heartbeat_period/ -e s/initialAcknackDelay/initial_acknack_delay/ $i.xml \
+#             > fast_dds_3/$i.xml
+#     done
+RENAMED = {"heartbeatPeriod": "heartbeat_period", "initialAcknackDelay": "initial_acknack_delay"}
 
 
 @pytest.mark.parametrize("name", ["loopback.xml", "introduced.xml"])
 def test_profiles_for_fast_dds_3_differ_in_what_it_has_renamed(name: str) -> None:
-    assert (FOLDER / "fast_dds_3" / name).read_text() == (FOLDER / name).read_text().replace(*RENAMED)
+    old = (FOLDER / name).read_text()
+    new = re.sub("|".join(RENAMED), lambda found: RENAMED[found[0]], old)
+    assert (FOLDER / "fast_dds_3" / name).read_text() == new
+
+
+@pytest.mark.parametrize("path", [LOOPBACK_PROFILE, INTRODUCED_PROFILE], ids=lambda path: path.stem)
+def test_profiles_of_topics_have_the_times_of_the_others(path: Path) -> None:
+    """The profile of a topic is read instead of the default one."""
+    for kind in ("data_writer", "data_reader"):
+        profiles = ET.parse(path).findall(f".//{{*}}{kind}")
+        times = [[*each.iterfind("{*}times/{*}*/{*}nanosec")] for each in profiles]
+        assert [each.get("is_default_profile") for each in profiles] == ["true", None, None]
+        assert {(each[0].text, len(each)) for each in times} == {(times[0][0].text, 1)}
 
 
 @pytest.mark.parametrize("distribution", ["", "humble", "jazzy"])
