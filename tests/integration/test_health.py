@@ -13,10 +13,11 @@ from typing import Any
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 
-# Prints every DiagnosticArray of /diagnostics, level and values included, a line each.
+# Prints every DiagnosticArray of /diagnostics, level and values included, a line each; to stderr what agents report.
 MONITOR = """
-import json, rclpy
+import json, rclpy, sys
 from diagnostic_msgs.msg import DiagnosticArray
+from msg_agents_interfaces.msg import Progress
 
 def say(array):
     statuses = [
@@ -28,6 +29,7 @@ def say(array):
 rclpy.init()
 node = rclpy.create_node("monitor", enable_rosout=False)
 node.create_subscription(DiagnosticArray, "/diagnostics", say, 100)
+node.create_subscription(Progress, "/progress", lambda m: print(m.agent, m.step, file=sys.stderr, flush=True), 100)
 rclpy.spin(node)
 """
 
@@ -43,11 +45,12 @@ def heard_of(file: Path) -> set[str]:
 
 def test_a_stopped_agent_is_named(network: Any) -> None:
     """On /diagnostics, in the log of its neighbour, and to the user; then all goes on as if nothing had been."""
-    heard = network.directory / "heard"
-    with free_domain() as domain, heard.open("w") as output:
+    heard, reports = network.directory / "heard", network.directory / "reports"
+    with free_domain() as domain, heard.open("w") as output, reports.open("w") as errors:
         file = network.file(run={"duration": 300, "processes": "one_per_agent"})
         run = network.record(file, "--domain", str(domain), "--json")
-        monitor = subprocess.Popen([sys.executable, "-P", "-c", MONITOR], env=node_environment(domain), stdout=output)
+        command = [sys.executable, "-P", "-c", MONITOR]
+        monitor = subprocess.Popen(command, env=node_environment(domain), stdout=output, stderr=errors)
         try:
             network.wait_until_moving()
             network.wait_for(lambda: len(heard_of(heard)) == 7, 30, "diagnostics of every node")
@@ -70,6 +73,7 @@ def test_a_stopped_agent_is_named(network: Any) -> None:
     assert result["restarts"] == result["strangers"] == []
     ((step, words),) = complaint
     assert words in (f"step {step} of agent 2", "too far behind: agent 2")
+    assert reports.read_text().splitlines().count(f"1 {step}") >= 3  # it goes on saying where it stands
     assert result["notes"] == []
     assert re.match(rf"note: no step for \d+ s: .*agent_1: at step {step}, waiting for {words}", note)
     assert note.endswith("; no report from agent_2\n")

@@ -87,7 +87,8 @@ class Recorder(NetworkNode):
         every(self, LOOK_PERIOD, self._look_for_others)
 
     def health(self) -> Health:
-        """Number of recorded messages."""
+        """Number of recorded messages. One that has everything says so again, as agents that stand do."""
+        self._tell_if_complete()
         values = {"messages": str(self.bag.messages), "topics without their last message": str(len(self._awaiting))}
         return Health(f"{self.bag.messages} messages recorded", values=values)
 

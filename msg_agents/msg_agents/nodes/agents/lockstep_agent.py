@@ -72,8 +72,8 @@ class LockstepAgent(Agent):
         """See NetworkNode. A stalled agent says what it waits for, and asks for it again from time to time."""
         step, stall = self._law.step, self._stall
         overdue = stall.update(step)
-        if step > self._reported and time.monotonic() >= self._next_progress:
-            self._report()  # a channel that follows the graph opens the link that this agent waits for
+        if step > self._reported or stall.stalled:
+            self._report_again()  # a channel that follows the graph opens the link that this agent waits for
         values = {"step": str(step), "steps per second": f"{stall.rate:.1f}"}
         if self._synchronizer.finished:
             return Health("has made all steps", values=values)

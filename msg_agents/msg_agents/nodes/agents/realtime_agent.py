@@ -182,6 +182,8 @@ class RealtimeAgent(Agent):
         """How late the agent is, or what it waits for."""
         step, stall = self._law.step, self._stall
         overdue = stall.update(step)
+        if stall.stalled:
+            self._report_again()
         missed, late = self._missed - self._missed_before, self._late / self._speed / 1e6
         graph_late = self._graph_late / self._speed / 1e6
         self._missed_before, self._late, self._graph_late = self._missed, 0, 0
