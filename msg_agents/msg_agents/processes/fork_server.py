@@ -35,6 +35,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import IO, Any, NoReturn
 
 from msg_agents.processes.environment import start_environment
@@ -50,14 +51,52 @@ from msg_analysis.common.forked_processes import (
 
 PROGRAM = [sys.executable, "-m", "msg_agents.cli.servers.node_server"]  # calls ``serve``
 EARLY = "--early"  # argument of a server that is there before its run
-TRIAL = "try the middleware"  # instead of a command
+TRIAL, NEXT = "try the middleware", "fork server of the next run"  # instead of a command
 TRIAL_PATIENCE = 30.0  # s
 TRIAL_LOOK = 1e-3  # s between two looks
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
 ADOPTION = 1e-4  # s between two looks whether a forked process has its new parent
 _ending_at_once = False  # see ``ends_at_once``
 _forked_by = 0  # see ``await_adoption``
-_waiting: tuple[Process, socket.socket] | None = None  # a fork server that is there before its run
+READ_LATE = ("AMENT_", "CYCLONEDDS_", "FASTDDS_", "FASTRTPS_", "MSG_AGENTS_", "RCUTILS_", "RMW_", "ROS_")
+"""How variables begin that no process reads before it is a node."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """A fork server that is there before its run."""
+
+    process: Process
+    told: socket.socket  # where it will hear of its run
+    environment: Mapping[str, str]  # that it has
+    directory: Path | None  # in which it is
+    owner: int  # process that started it: one that this forks has no part in it
+
+    def serves(self, environment: Mapping[str, str]) -> bool:
+        """Whether it is what a new process with this environment would be."""
+        lasting, wanted = (
+            {name: value for name, value in each.items() if not name.startswith(READ_LATE)}
+            for each in (self.environment, environment)
+        )
+        return lasting == wanted and self.directory == _directory()
+
+    def end(self) -> None:
+        """End the process."""
+        self.told.close()
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait()
+
+
+_waiting: _Waiting | None = None
+_several = False  # whether a run leaves a fork server for the next one
+
+
+def _directory() -> Path | None:
+    """The working directory, unless that is gone."""
+    try:
+        return Path.cwd()
+    except OSError:
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +143,24 @@ class NodeServer(ForkServer):
     def _start(self, control: socket.socket, output: IO[bytes]) -> Process:
         return _wake(self._environment, control, output) or super()._start(control, output)
 
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if _several and kind is None:
+            self._leave_next()
+        super().__exit__(kind, error, trace)
+
+    def _leave_next(self) -> None:
+        """Fork the fork server of the next run: it has imported everything."""
+        global _waiting
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs, Path(os.devnull).open("wb") as nothing:
+            forked = self.fork_nodes([NodeStart([NEXT], {EARLY: theirs.fileno()}, nothing.fileno(), None)])
+        if forked:
+            _waiting = _Waiting(forked[0], ours, self._environment, _directory(), os.getpid())
+        else:
+            ours.close()
+
 
 @contextlib.contextmanager
 def early_server() -> Iterator[None]:
@@ -115,18 +172,33 @@ def early_server() -> Iterator[None]:
     if _waiting is not None or sys.platform != "linux":
         yield
         return
+    environment = start_environment()
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
-        server = start_server([*PROGRAM, EARLY], start_environment(), theirs, subprocess.DEVNULL)
-    _waiting = server, ours
+        server = start_server([*PROGRAM, EARLY], environment, theirs, subprocess.DEVNULL)
+    _waiting = _Waiting(server, ours, environment, _directory(), os.getpid())
     try:
         yield
     finally:
-        if _waiting is not None:  # no network was run
-            _waiting = None
-            ours.close()
-            server.kill()
-            server.wait()
+        left, _waiting = _waiting, None
+        if left is not None:  # no network was run, or the next one is not
+            left.end()
+
+
+@contextlib.contextmanager
+def prepared() -> Iterator[None]:
+    """Make the runs within start sooner: a process that has imported everything waits for each of them.
+
+    It starts at once, and is there for the next run when one has ended without an exception. It is gone at the end of
+    the context. Where the system cannot fork such processes, nothing is done.
+    """
+    global _several
+    before, _several = _several, True
+    try:
+        with early_server():
+            yield
+    finally:
+        _several = before
 
 
 def leave_one_waiting(serve_nodes: Callable[[socket.socket], NoReturn], unneeded: Iterable[int]) -> None:
@@ -144,7 +216,7 @@ def leave_one_waiting(serve_nodes: Callable[[socket.socket], NoReturn], unneeded
         return
     if pid:
         theirs.close()
-        _waiting = (ForkedProcess(pid), ours)
+        _waiting = _Waiting(ForkedProcess(pid), ours, dict(os.environ), _directory(), os.getpid())
         return
     ours.close()
     for descriptor in unneeded:
@@ -163,28 +235,27 @@ def await_run(early: socket.socket) -> socket.socket:
         os.setsid()
     environment = json.loads(message)
     for name in environment["removed"]:
-        del os.environ[name]
+        os.environ.pop(name, None)
     os.environ.update(environment["changed"])
     print_to(output)
     return socket.socket(fileno=control)
 
 
 def _wake(environment: Mapping[str, str], control: socket.socket, output: IO[bytes]) -> Process | None:
-    """Make the waiting process the fork server; None if there is none."""
+    """Make the waiting process the fork server; None if there is none, or a new one would be another."""
     global _waiting
-    if _waiting is None:
+    if _waiting is None or _waiting.owner != os.getpid():
         return None
-    (server, theirs), _waiting = _waiting, None
-    changed = {name: value for name, value in environment.items() if os.environ.get(name) != value}
-    message = json.dumps({"changed": changed, "removed": list(os.environ.keys() - environment.keys())}).encode()
-    with theirs:
-        if len(message) > LONGEST:
-            return None
-        try:
-            socket.send_fds(theirs, [message], [control.fileno(), output.fileno()])
-        except OSError:  # it has been killed
-            return None
-    return server
+    waiting, _waiting = _waiting, None
+    before = waiting.environment
+    changed = {name: value for name, value in environment.items() if before.get(name) != value}
+    message = json.dumps({"changed": changed, "removed": list(before.keys() - environment.keys())}).encode()
+    if len(message) <= LONGEST and (not _several or waiting.serves(environment)):
+        with contextlib.suppress(OSError), waiting.told:  # it has been killed
+            socket.send_fds(waiting.told, [message], [control.fileno(), output.fileno()])
+            return waiting.process
+    waiting.end()
+    return None
 
 
 def serve(

@@ -19,7 +19,7 @@ from waiting import gone, participants, record_of_two, wait_for
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes import fork_server
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, early_server
+from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, early_server, prepared
 from msg_agents.processes.middleware_check import require_middleware
 from msg_analysis.common.cores import available_cores
 from msg_analysis.common.forked_processes import LONGEST_TITLE, ForkedProcess
@@ -234,6 +234,63 @@ def test_an_early_server_without_a_run() -> None:
     with early_server():
         (early,) = early_servers(os.getpid())
     assert gone(early)
+
+
+def the_new_one(before: set[str]) -> int:
+    """Number of the only child that was not there before."""
+    (child,) = children() - before
+    return int(child)
+
+
+def one_run(log: Path, environment: dict[str, str]) -> int | None:
+    """Number of the fork server of a network, whose only process says how a command is used."""
+    with NodeServer(environment, log) as server:
+        help_of_agents = start(server, log.with_suffix(".help"), "agent", "--help")
+        assert help_of_agents.wait() == 0
+        return server.pid
+
+
+def test_several_runs_are_prepared(tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each has a fork server of its own, which waits for it: forked by that of the one before."""
+    log, environment, before = tmp_path / "log", node_environment(domain), children()
+    with prepared():
+        (first,) = early_servers(os.getpid())
+        assert one_run(log, environment) == first
+        for _ in range(2):
+            waits = the_new_one(before)
+            assert fork_server.PROGRAM[-1] in title(ForkedProcess(waits))
+            assert one_run(log, environment | {"ROS_DOMAIN_ID": "7"}) == waits
+            assert gone(waits)
+        # What a process reads at its start has changed: another one is started.
+        waits = the_new_one(before)
+        assert one_run(log, environment | {"PYTHONPATH": str(tmp_path)}) != waits
+        assert gone(waits)
+        waits = the_new_one(before)
+        monkeypatch.chdir(tmp_path)
+        assert one_run(log, environment | {"PYTHONPATH": str(tmp_path)}) != waits
+        # It has been killed.
+        waits = the_new_one(before)
+        os.kill(waits, signal.SIGKILL)
+        wait_for(lambda: gone(waits))
+        assert one_run(log, environment | {"PYTHONPATH": str(tmp_path)}) != waits
+        # A process that this one forks has no part in it.
+        waits = the_new_one(before)
+        if not (pid := os.fork()):
+            os._exit(one_run(log, environment | {"PYTHONPATH": str(tmp_path)}) == waits)
+        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    assert children() == before
+    with NodeServer(environment, log) as server:  # and leaves none
+        assert start(server, tmp_path / "help", "agent", "--help").wait() == 0
+    assert children() == before
+    assert not log.exists()
+
+
+def test_a_prepared_run_that_fails_leaves_nothing(tmp_path: Path, domain: int) -> None:
+    before = children()
+    with prepared():
+        with pytest.raises(KeyboardInterrupt), NodeServer(node_environment(domain), tmp_path / "log"):
+            raise KeyboardInterrupt
+        assert children() == before
 
 
 WITHOUT_RUN = """

@@ -75,13 +75,15 @@ def prepare() -> None:
 def serve_nodes(control: socket.socket) -> NoReturn:
     """Fork nodes; in a forked process, run the command of one."""
     from msg_agents.nodes.ros.middleware import use_middleware
-    from msg_agents.processes.fork_server import TRIAL, begin_node, serve
+    from msg_agents.processes.fork_server import EARLY, NEXT, TRIAL, await_run, begin_node, serve
 
     def run(request: dict[str, Any], descriptors: list[int]) -> None:
         arguments = begin_node(request, descriptors)
         if arguments == [TRIAL]:
             _show_as(arguments)
             use_middleware()
+        elif arguments[:2] == [NEXT, EARLY]:
+            serve_waiting(await_run(socket.socket(fileno=int(arguments[2]))))
         else:
             run_command(arguments)
 
