@@ -1,4 +1,4 @@
-"""The example of docs/python.md that starts a network, and `play --json`."""
+"""The example of docs/python.md that starts a network, runs that are prepared, and `play --json`."""
 
 from __future__ import annotations
 
@@ -35,6 +35,38 @@ def test_what_the_page_says(tmp_path: Path) -> None:
     assert process.returncode == 0, process.stderr
     assert "<Comparison, run of 'line_ring': agrees;" in process.stdout
     assert process.stdout.rstrip().endswith("[]")
+
+
+SEVERAL = """
+import os, sys
+from pathlib import Path
+from msg_agents import prepared, run_network
+from msg_analysis import Experiment, read_bag
+from msg_analysis.twin.check import check
+
+def children():
+    return Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+
+pair = {"graphs": {"a": {"path": [1, 2]}}, "run": {"dt": 0.1, "start": "zero", "processes": "one_per_agent"}}
+for name in ("first", "second"):
+    with prepared():
+        for duration in (2, 3):
+            run = {**pair["run"], "duration": duration}
+            result = run_network(Experiment.parse({**pair, "name": "pair", "run": run}), Path(f"{name} {duration}"))
+            outcome = check(read_bag(result.bag))
+            print(duration, result.failures, outcome.difference, outcome.missing, len(children()))
+print(children())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="this machine: not Linux")
+def test_prepared_runs(tmp_path: Path) -> None:
+    """Each is whole and equal to its twin; one process waits for the next run, and none is left."""
+    words = [sys.executable, "-P", "-c", SEVERAL]
+    process = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert process.returncode == 0, process.stderr
+    of_two = ["2 [] None 0 1", "3 [] None 0 1"]
+    assert process.stdout.splitlines() == [*of_two, *of_two, "[]"]
 
 
 def test_play_json(tmp_path: Path) -> None:

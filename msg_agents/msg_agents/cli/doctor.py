@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from msg_agents.processes.fork_server import early_server
+from msg_agents.processes.fork_server import early_server, prepared
 from msg_analysis.cli.console import complain, examples, print_json, print_text, result_console
 from msg_analysis.cli.options import PATH, json_option
 from msg_analysis.common.exit_codes import ExitCode
@@ -113,7 +113,7 @@ def doctor(
     if qos:
         _measure_qos(DEFAULT_TRIES if tries is None else tries, only, as_markdown=as_markdown, as_json=as_json)
         return
-    click.get_current_context().with_resource(early_server())
+    click.get_current_context().with_resource(prepared() if network else early_server())
     if network:
         _run_networks(NETWORKS if networks is None else networks, first_seed or 0, out or Path("runs"), as_json)
     else:
