@@ -363,7 +363,7 @@ class Agent(NetworkNode):
     def _report_again(self) -> None:
         """Report once more, unless that was just done.
 
-        In one of some 300 networks of 90 processes, the switcher was not given the last reports of four.
+        In one of some 600 networks of 90 processes, the switcher was not given the last reports of four.
         """
         if time.monotonic() >= self._next_progress:
             self._report()
