@@ -56,10 +56,10 @@ TRIAL_PATIENCE = 30.0  # s
 TRIAL_LOOK = 1e-3  # s between two looks
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
 ADOPTION = 1e-4  # s between two looks whether a forked process has its new parent
-_ending_at_once = False  # see ``ends_at_once``
-_forked_by = 0  # see ``await_adoption``
 READ_LATE = ("AMENT_", "CYCLONEDDS_", "FASTDDS_", "FASTRTPS_", "MSG_AGENTS_", "RCUTILS_", "RMW_", "ROS_")
 """How variables begin that no process reads before it is a node."""
+_ending_at_once = False  # see ``ends_at_once``
+_forked_by = 0  # see ``await_adoption``
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class NodeServer(ForkServer):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if _several and kind is None:
+        if _several and kind is None and _waiting is None:
             self._leave_next()
         super().__exit__(kind, error, trace)
 
@@ -180,9 +180,7 @@ def early_server() -> Iterator[None]:
     try:
         yield
     finally:
-        left, _waiting = _waiting, None
-        if left is not None:  # no network was run, or the next one is not
-            left.end()
+        _end_waiting()  # no network was run, or the next one is not
 
 
 @contextlib.contextmanager
@@ -199,6 +197,16 @@ def prepared() -> Iterator[None]:
             yield
     finally:
         _several = before
+        if not before:
+            _end_waiting()  # of the last run; early_server had nothing to do if one was waiting already
+
+
+def _end_waiting() -> None:
+    """End the fork server whose run will not be."""
+    global _waiting
+    left, _waiting = _waiting, None
+    if left is not None:
+        left.end()
 
 
 def leave_one_waiting(serve_nodes: Callable[[socket.socket], NoReturn], unneeded: Iterable[int]) -> None:

@@ -285,6 +285,17 @@ def test_several_runs_are_prepared(tmp_path: Path, domain: int, monkeypatch: pyt
     assert not log.exists()
 
 
+def test_the_next_server_of_a_process_that_had_one_is_ended_too(tmp_path: Path, domain: int) -> None:
+    before = children()
+    with early_server():
+        (first,) = early_servers(os.getpid())
+        with prepared():
+            assert one_run(tmp_path / "log", node_environment(domain)) == first
+            waits = the_new_one(before)
+        assert gone(waits)
+        assert children() == before
+
+
 def test_a_prepared_run_that_fails_leaves_nothing(tmp_path: Path, domain: int) -> None:
     before = children()
     with prepared():
