@@ -101,7 +101,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
-    """One for all pages of a module."""
+    """One for all pages of a worker."""
     from browser import chromium
 
     with chromium() as found:

@@ -114,6 +114,7 @@ class NodeServer(ForkServer):
 
     def __init__(self, environment: Mapping[str, str], log: Path) -> None:
         super().__init__(PROGRAM, environment, log)
+        self._directory = _directory()  # in which its process is
 
     def fork_nodes(self, nodes: Sequence[NodeStart]) -> list[ForkedProcess]:
         """Fork processes, each in a session of its own; see ``fork``."""
@@ -157,7 +158,7 @@ class NodeServer(ForkServer):
         with theirs, Path(os.devnull).open("wb") as nothing:
             forked = self.fork_nodes([NodeStart([NEXT], {EARLY: theirs.fileno()}, nothing.fileno(), None)])
         if forked:
-            _waiting = _Waiting(forked[0], ours, self._environment, _directory(), os.getpid())
+            _waiting = _Waiting(forked[0], ours, self._environment, self._directory, os.getpid())
         else:
             ours.close()
 

@@ -61,7 +61,7 @@ from msg_analysis.model.run.record import RunRecord
 from msg_analysis.model.run.until import Until
 from msg_analysis.twin.simulate import new_record
 
-FIRST_POLL, POLL = 0.02, 0.05  # s; the first until all agents have started
+FIRST_POLL, POLL = 0.02, 0.05  # s; the first until the switcher here has heard of all agents
 
 
 def run_network(
@@ -255,8 +255,9 @@ def _watch(
     due = run.speed / experiment.step_length  # steps per second in real time
     lag, clock = (LagDetector(due), ClockDetector()) if run.pace == "realtime" and follow_clock else (None, None)
     events, warned = EventLog(result.events), None
+    will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others are not told
     while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
-        time.sleep(FIRST_POLL if began is None else POLL)
+        time.sleep(FIRST_POLL if will_begin and began is None else POLL)
         supervisor.read_status()
         if ending and ending.look(min(supervisor.steps, default=-1), view.note):
             supervisor.last_step = steps = ending.last_step

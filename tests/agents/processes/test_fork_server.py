@@ -267,6 +267,11 @@ def test_several_runs_are_prepared(tmp_path: Path, domain: int, monkeypatch: pyt
         assert gone(waits)
         waits = the_new_one(before)
         monkeypatch.chdir(tmp_path)
+        with NodeServer(environment | {"PYTHONPATH": str(tmp_path)}, log) as server:
+            assert server.pid != waits
+            assert start(server, tmp_path / "help", "agent", "--help").wait() == 0
+            monkeypatch.chdir("/")  # the process for the next run is still where this one began
+        waits = the_new_one(before)
         assert one_run(log, environment | {"PYTHONPATH": str(tmp_path)}) != waits
         # It has been killed.
         waits = the_new_one(before)

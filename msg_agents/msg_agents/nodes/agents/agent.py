@@ -360,8 +360,8 @@ class Agent(NetworkNode):
         self._group.report(self._law.agent, self._reported)
         self._next_progress = time.monotonic() + self._group.progress_period
 
-    def _report_again(self) -> None:
-        """Report once more, unless that was just done.
+    def _report_if_due(self) -> None:
+        """Report, unless that was just done; once more where nothing is new.
 
         In one of some 600 networks of 90 processes, the switcher was not given the last reports of four.
         """

@@ -73,7 +73,7 @@ class LockstepAgent(Agent):
         step, stall = self._law.step, self._stall
         overdue = stall.update(step)
         if step > self._reported or stall.stalled:
-            self._report_again()  # a channel that follows the graph opens the link that this agent waits for
+            self._report_if_due()  # a channel that follows the graph opens the link that this agent waits for
         values = {"step": str(step), "steps per second": f"{stall.rate:.1f}"}
         if self._synchronizer.finished:
             return Health("has made all steps", values=values)

@@ -183,7 +183,7 @@ class RealtimeAgent(Agent):
         step, stall = self._law.step, self._stall
         overdue = stall.update(step)
         if stall.stalled:
-            self._report_again()
+            self._report_if_due()
         missed, late = self._missed - self._missed_before, self._late / self._speed / 1e6
         graph_late = self._graph_late / self._speed / 1e6
         self._missed_before, self._late, self._graph_late = self._missed, 0, 0
