@@ -12,6 +12,8 @@ from typing import Any
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
+from msg_agents.processes.status_file import read_steps
+from msg_agents.running.supervisor import STEPS
 
 # Prints every DiagnosticArray of /diagnostics, level and values included, a line each; to stderr what agents report.
 MONITOR = """
@@ -97,3 +99,21 @@ def test_a_stopped_agent_is_named(network: Any) -> None:
     assert blamed == {words}
     moving = [s for s in agents if re.fullmatch(r"at step \d+", s["message"]) and float(s["steps per second"]) > 0]
     assert moving
+
+
+def test_an_agent_that_was_not_given_the_end(network: Any) -> None:
+    """It was stopped when the run ended: nothing is missing, so the run does not wait for it for ever."""
+    file = network.file(run={"duration": 6, "pace": "realtime", "processes": "one_per_agent"})
+    run = network.record(file, "--json")
+    network.wait_for(network.nodes, 60, "processes")
+    steps = network.run_file().with_name(STEPS)
+    network.wait_for(lambda: min(read_steps(steps) or [-1]) > 0, 60, "steps")
+    (recorder,) = network.processes("recorder")
+    recorder.kill(signal.SIGSTOP)  # so the run does not end
+    network.wait_for(lambda: min(read_steps(steps)) == 120, 60, "the last steps")
+    (victim,) = (process for process in network.processes("agent") if process.agent == 2)
+    victim.kill(signal.SIGSTOP)
+    recorder.kill(signal.SIGCONT)
+    network.wait_for(lambda: not network.processes("switcher", "recorder"), 60, "the end of the others")
+    victim.kill(signal.SIGCONT)
+    assert network.completed(run)["notes"] == ["agent_2 had not left 10 s after the end of the run: told to end"]

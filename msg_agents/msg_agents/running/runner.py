@@ -43,7 +43,7 @@ from msg_agents.running.event_log import EventLog
 from msg_agents.running.run_channel import run_channel
 from msg_agents.running.run_folder import make_bag_directory, workshop
 from msg_agents.running.run_result import RunResult
-from msg_agents.running.supervisor import ACCOUNTS, CLOCKS, CRASHED, STEPS, Supervisor
+from msg_agents.running.supervisor import ACCOUNTS, CLOCKS, CRASHED, LATE, STEPS, Supervisor
 from msg_agents.running.surroundings import ROS_LOGS, surroundings, will_introduce
 from msg_agents.stepping.stall_detection import ClockDetector, LagDetector, StallDetector
 from msg_agents.terminal.interruption import Interruption
@@ -266,6 +266,8 @@ def _watch(
         if not warned and (warned := supervisor.clocks()[1]):
             view.note(warned)
         view.look(supervisor.steps)
+        for name in supervisor.dismiss_late():
+            view.note(f"{name} had not left {LATE:g} s after the end of the run: told to end")
         reached = min(supervisor.steps, default=-1)
         if clock and (words := clock.update()):
             view.note(words)

@@ -36,6 +36,7 @@ from msg_agents.processes.fork_server import NodeServer, NodeStart
 from msg_agents.processes.hung_process import SHOW_STACKS, HungDetector
 from msg_agents.processes.process_plan import CHANNEL, RECORDER, SWITCHER, ProcessPlan
 from msg_agents.processes.status_file import Account, read_accounts, read_clocks, read_steps
+from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.forked_processes import Process
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
@@ -50,6 +51,7 @@ LOOK = 1.0  # s between two looks whether processes have hung
 SILENCE = 3.0  # s; accounts are written once a second
 CHANNEL_SILENCE = 10.0  # s after which a channel that reports nothing is given up
 EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
+LATE = 10.0  # s after the end of the run after which a process that has not left is not waited for any more
 CRASHED = 1  # exit code of Python after an uncaught exception
 ACCOUNTS, STEPS, CLOCKS = "accounts", "steps.json", "clocks.json"
 
@@ -72,6 +74,7 @@ class Child:
     ended: float | None = None  # when it was first seen to have ended with exit code 0 [s]
     early: bool = False  # whether it did so before its last step
     given_up: str | None = None  # why it was ended
+    dismissed: bool = False  # whether it was told to end because the run was over
     detector: HungDetector = field(init=False)
 
     def __post_init__(self) -> None:
@@ -104,6 +107,8 @@ class Child:
             return self.given_up
         if self.early:
             return f"exit code {code} before its last step"
+        if self.dismissed and code == ExitCode.INCOMPLETE:
+            return None
         return None if code is None else failure_of(code)
 
     @property
@@ -150,6 +155,7 @@ class Supervisor:
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
     _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
     _looked: float = field(default=0.0, init=False)  # for processes that have hung [s of the monotonic clock]
+    _over_since: float | None = field(default=None, init=False)  # [s of the monotonic clock]
     _control: socket.socket | None = field(default=None, init=False)  # of the channel, which ends when it is closed
 
     def start(self, plans: Sequence[ProcessPlan]) -> None:
@@ -249,6 +255,23 @@ class Supervisor:
             if words := child.detector.update():
                 child.given_up = f"{words} (stacks in log/{child.log.name})"
                 self._end([child], AFTER_HANG)
+
+    def dismiss_late(self) -> list[str]:
+        """Tell processes to end that have not left long after the switcher; the names of those that were just told.
+
+        The middleware may not have given them the end of the run; one that was stopped then is not given it any more.
+        """
+        if not any(child.plan.name == SWITCHER and child.ended_well for child in self.children):
+            return []
+        self._over_since = self._over_since or time.monotonic()
+        late = [child for child in self.awaited if not child.dismissed]
+        if not late or time.monotonic() < self._over_since + LATE:
+            return []
+        for child in late:
+            child.dismissed = True
+            child.process.send_signal(signal.SIGINT)
+        self._end([child for child in late if child.plan.name != RECORDER])  # a recorder may need time for its bag
+        return [child.plan.name for child in late]
 
     @property
     def by_node(self) -> dict[str, Process]:

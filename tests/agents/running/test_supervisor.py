@@ -22,6 +22,7 @@ from msg_agents.processes.environment import node_environment
 from msg_agents.processes.process_plan import ProcessPlan
 from msg_agents.running import supervisor as module
 from msg_agents.running.supervisor import Child, Supervisor
+from msg_analysis.common.exit_codes import ExitCode
 
 STUBBORN = """
 import signal, time
@@ -47,6 +48,7 @@ for line in open(sys.argv[2]):
     write_steps(Path(sys.argv[sys.argv.index("--steps") + 1]), json.loads(line))
     print("written", flush=True)
 """
+INCOMPLETE = OBEDIENT.replace("exit(0)", f"exit({ExitCode.INCOMPLETE:d})")
 NAMES = ["agent_1", "agent_2", "recorder", "switcher"]
 
 
@@ -187,6 +189,34 @@ def test_who_is_killed_after_the_end_has_not_failed(
     supervisor = Supervisor(tmp_path, {}, children)
     assert supervisor.over == over
     assert [child.plan.name for child in supervisor.failures] == failed
+
+
+@pytest.mark.usefixtures("impatient")
+def test_who_does_not_leave_after_the_end(
+    tmp_path: Path, start: Callable[..., Child], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Agents are ended; the recorder is told to end once, and waited for."""
+    monkeypatch.setattr(module, "LATE", 0.0)
+    agent, recorder, switcher = start(STUBBORN), start(INCOMPLETE, "recorder"), start("", "switcher")
+    supervisor = Supervisor(tmp_path, {}, [agent, start("", "agent_2"), recorder, switcher])
+    wait_for(lambda: supervisor.over)
+    assert supervisor.dismiss_late() == ["agent_1", "recorder"]
+    assert not agent.running
+    assert supervisor.dismiss_late() == []
+    recorder.process.wait()
+    assert recorder.process.poll() == ExitCode.INCOMPLETE
+    assert supervisor.failures == supervisor.awaited == []
+
+
+def test_nobody_is_late_before_the_end(
+    tmp_path: Path, start: Callable[..., Child], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "LATE", 0.0)
+    agents, switcher = [start(OBEDIENT), start("")], start(OBEDIENT, "switcher")
+    agents[1].process.wait()
+    assert Supervisor(tmp_path, {}, [*agents, switcher]).dismiss_late() == []
+    assert Supervisor(tmp_path, {}, agents).dismiss_late() == []  # the switcher is on another host
+    assert agents[0].running
 
 
 def test_steps_that_the_switcher_reports(tmp_path: Path) -> None:
