@@ -77,7 +77,7 @@ def _blocks(noise: ProcessNoise, model: StepModel, modes: IntArray, first: int) 
             of_modes = noise.block(i, number, len(now))
             alike = all(each is of_modes[0] for each in of_modes)
             drives[:, i] = of_modes[0] if alike else np.stack(of_modes)[now, steps]
-            drives[:, i] += model.offsets[now, i][:, None]
+        drives += model.offsets[now][:, :, None]
         yield first + begin, now, drives
 
 

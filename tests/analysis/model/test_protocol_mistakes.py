@@ -230,7 +230,7 @@ def test_processes_that_a_protocol_forks_end_as_ever() -> None:
             os._exit(7)
         return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
-    with protocol_binding._kept_alive():
+    with protocol_binding._KeptAlive():
         assert fork() == 7
         with pytest.raises(SystemExit, match=r"os\._exit\(0\)"):
             os._exit(0)

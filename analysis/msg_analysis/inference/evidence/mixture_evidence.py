@@ -59,16 +59,23 @@ def variance_evidence(
     FloatArray
         (..., K) of each of ``VARIANCES``
     """
-    half, s = np.asarray(samples)[..., None] / 2.0, np.asarray(squares)[..., None] / 2.0
-    known = variance_constant(samples) if constant is None else constant
+    half, s = np.asarray(samples) / 2.0, np.asarray(squares) / 2.0
+    known = np.moveaxis(variance_constant(samples) if constant is None else constant, -1, 0)
+    strengths, near = (_first(each, max(half.ndim, s.ndim)) for each in (_STRENGTHS, _NEAR))
     # (a + n/2) log(b / (b + s)) instead of two large terms that cancel.
-    return np.asarray(known - (_STRENGTHS + half) * np.log1p(s / _NEAR) + s)
+    return np.moveaxis(known - (strengths + half) * np.log1p(s / near) + s, 0, -1)
 
 
 def variance_constant(samples: FloatArray | IntArray) -> FloatArray:
     """(..., K): log of G(a + n/2) / (G(a) b^(n/2)), what ``variance_evidence`` has of the numbers n (..., ) alone."""
-    half = np.asarray(samples)[..., None] / 2.0
-    return np.asarray(gammaln(_STRENGTHS + half) - gammaln(_STRENGTHS) - half * np.log(_NEAR))
+    half = np.asarray(samples) / 2.0
+    strengths, near = (_first(each, half.ndim) for each in (_STRENGTHS, _NEAR))
+    return np.moveaxis(gammaln(strengths + half) - gammaln(strengths) - half * np.log(near), 0, -1)
+
+
+def _first(alternatives: FloatArray, dimensions: int) -> FloatArray:
+    """(K, 1, ...): as the first axis of arrays of so many dimensions, since numpy is slow where the last is short."""
+    return alternatives.reshape(-1, *(1,) * dimensions)
 
 
 def coefficient_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
@@ -88,9 +95,10 @@ def coefficient_evidence(score: FloatArray, information: FloatArray) -> FloatArr
     FloatArray
         (..., K) of each tau in ``SHARES``
     """
-    tau2 = np.array(SHARES) ** 2
-    spread = 1.0 + tau2 * np.asarray(information)[..., None]
-    return np.asarray(0.5 * (tau2 * np.asarray(score)[..., None] ** 2 / spread - np.log(spread)))
+    u, j = np.asarray(score), np.asarray(information)
+    tau2 = _first(np.array(SHARES) ** 2, max(u.ndim, j.ndim))
+    spread = 1.0 + tau2 * j
+    return np.moveaxis(0.5 * (tau2 * u**2 / spread - np.log(spread)), 0, -1)
 
 
 def row_evidence(counts: FloatArray | IntArray, law: FloatArray) -> FloatArray:
@@ -188,6 +196,7 @@ def log_sums(logarithms: FloatArray, begins: IntArray) -> FloatArray:
 def log_sum(logarithms: FloatArray, axis: int) -> FloatArray:
     """log(sum(exp(...))) along an axis; a tenth of the time of scipy's, which also has signs and weights."""
     largest = logarithms.max(axis=axis, keepdims=True)
+    finite = np.where(np.isfinite(largest), largest, 0.0)
     with np.errstate(invalid="ignore", divide="ignore", under="ignore"):
-        total = np.log(np.exp(logarithms - np.where(np.isfinite(largest), largest, 0.0)).sum(axis=axis))
-    return np.asarray(np.where(np.isfinite(largest), largest, 0.0).squeeze(axis) + total)
+        total = np.log(np.exp(logarithms - finite).sum(axis=axis))
+    return np.asarray(finite.squeeze(axis) + total)

@@ -20,8 +20,7 @@ Whatever a protocol raises or returns wrongly becomes an error that names the pr
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import EntryPoint, entry_points
@@ -157,7 +156,7 @@ class ChosenProtocol:
         Results are checked, so that numpy need not warn of an overflow, too.
         """
         try:
-            with np.errstate(all="ignore"), _kept_alive():
+            with np.errstate(all="ignore"), _KeptAlive():
                 return call()
         except (Exception, SystemExit) as error:  # of code that we know nothing about
             text = str(error) if isinstance(error, ValueError) and str(error) else f"{type(error).__name__}: {error}"
@@ -165,15 +164,17 @@ class ChosenProtocol:
             raise ProtocolError(f"{self.info}{place}: {text}") from error
 
 
-@contextmanager
-def _kept_alive() -> Iterator[None]:
+class _KeptAlive:
     """``os._exit`` raises SystemExit meanwhile: it would end the program without a word."""
-    os._exit = _exit
-    token = _inside.set(os.getpid())
-    try:
-        yield
-    finally:
-        _inside.reset(token)
+
+    __slots__ = ("_token",)
+
+    def __enter__(self) -> None:
+        os._exit = _exit
+        self._token = _inside.set(os.getpid())
+
+    def __exit__(self, *raised: object) -> None:
+        _inside.reset(self._token)
 
 
 _inside: ContextVar[int] = ContextVar("inside", default=0)  # of a call of a protocol: the process that made it
