@@ -70,31 +70,36 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
         due = np.maximum.accumulate(due + 1e-9 * np.arange(1, steps + 1)[:, None], axis=0)
     made = np.zeros((steps + 1, m), dtype=np.int64)
     made[1:] = np.rint(1e9 * dt * due).astype(np.int64)
-    arrives = {
-        link: made[:, link[1]] + np.rint(1e9 * dt * latency * random.exponential(size=steps + 1)) for link in links
-    }
+    # Messages of a link keep their order.
+    arrives = {}
+    for link in links:
+        under_way = np.rint(1e9 * dt * latency * random.exponential(size=steps + 1))
+        arrives[link] = np.maximum.accumulate(made[:, link[1]] + under_way).tolist()
 
-    states = np.empty((steps + 1, m, replicas))
-    states[0] = record.start
-    published = np.empty_like(states)
-    published[0] = states[0] + air[0]
     used = np.full((steps, m, most), -1, dtype=np.int64)
     gone = np.zeros((steps, m, most), dtype=bool)
     newest = dict.fromkeys(links, 0)
-    # As plain numbers for the loop, which reads them one by one.
+    # For the loop, which reads them one by one: as plain numbers, rows of replicas where there are several.
     path, rows, is_lost = modes.tolist(), weights.tolist(), {link: one.tolist() for link, one in lost.items()}
+    process, air, at = _numbers(process), _numbers(air), made.T.tolist()
+    drawn = {link: _numbers(one) for link, one in drawn.items()}
+    states = [[None] * m for _ in range(steps + 1)]
+    published = [[None] * m for _ in range(steps + 1)]
+    states[0] = _numbers(np.asarray(record.start))
+    published[0] = [x + added for x, added in zip(states[0], air[0], strict=True)]
     order = np.lexsort((np.tile(np.arange(m), steps), np.repeat(np.arange(steps), m), due.ravel()))
-    gives = [law.reference * (1.0 - w.sum(axis=1)) for w in weights]  # the reference to each agent
+    gives = [(law.reference * (1.0 - w.sum(axis=1))).tolist() for w in weights]  # the reference to each agent
     for k, i in np.column_stack(np.unravel_index(order, (steps, m))).tolist():
-        mode, own = path[k], states[k, i]
+        mode, own = path[k], states[k][i]
         w = rows[mode][i]
         total = own * w[i] + gives[mode][i]
         for d, j in enumerate(senders[mode][i]):
             n = k
             if real_time:
-                while newest[i, j] < steps and _there(newest[i, j] + 1, made[k + 1, i], made[:, j], arrives[i, j]):
-                    newest[i, j] += 1
-                n = newest[i, j]
+                n, now, comes, sent = newest[i, j], at[i][k + 1], arrives[i, j], at[j]
+                while n < steps and sent[n + 1] < now and comes[n + 1] <= now:
+                    n += 1
+                newest[i, j] = n
             s = max(0, n - delay)
             gone[k, i, d] = is_lost[i, j][s]
             if holds:
@@ -103,9 +108,10 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
             elif is_lost[i, j][s]:
                 s = -1
             used[k, i, d] = s
-            total = total + w[j] * (own if s < 0 else published[s, j] + drawn[i, j][s])
-        states[k + 1, i] = total + process[k, i]
-        published[k + 1, i] = states[k + 1, i] + air[k + 1, i]
+            total = total + w[j] * (own if s < 0 else published[s][j] + drawn[i, j][s])
+        states[k + 1][i] = following = total + process[k][i]
+        published[k + 1][i] = following + air[k + 1][i]
+    states, published = (np.array(each).reshape(steps + 1, m, replicas) for each in (states, published))
     whole = Completeness(states.shape[0] * m, states.shape[0] * m, 0)
     return Trajectory(
         record,
@@ -120,6 +126,8 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
     )
 
 
-def _there(step, now, made, arrives):
-    """Whether a message has been made and has arrived; messages of a link keep their order."""
-    return made[step] < now and arrives[max(0, step - 50) : step + 1].max() <= now
+def _numbers(values):
+    """Nested lists (...) of an array (..., R): of numbers, or of the rows of the replicas where these are several."""
+    if values.shape[-1] == 1:
+        return values[..., 0].tolist()
+    return list(values) if values.ndim == 2 else [_numbers(each) for each in values]

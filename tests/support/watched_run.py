@@ -1,13 +1,10 @@
-"""A run given to a watcher message by message, as its topics would, from its bag."""
+"""A run given to a watcher message by message, as its topics would."""
 
 from __future__ import annotations
 
 import random
-from pathlib import Path
 
-from mcap.reader import make_reader
-
-from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.bags import trajectory_writer
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.online.running_errors import LiveEstimate
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
@@ -17,14 +14,9 @@ from msg_analysis.wire.messages import ActiveGraph
 from msg_analysis.wire.receiving import state_frame
 
 
-def messages_of(bag: Path) -> list[tuple[str, bytes]]:
-    """(topic, message) of a bag in one file, in the order of time."""
-    (file,) = bag.glob("*.mcap")
-    with file.open("rb") as stream:
-        # Ordered here: by the library, it takes three times as long.
-        records = list(make_reader(stream).iter_messages(log_time_order=False))
-    records.sort(key=lambda record: record[2].log_time)
-    return [(channel.topic, message.data) for _, channel, message in records]
+def messages_of(trajectory: Trajectory) -> list[tuple[str, bytes]]:
+    """(topic, message) in the order of time, as a bag has them (``test_messages_are_those_of_the_bag``)."""
+    return [(topic, content) for topic, content, _, _ in trajectory_writer._messages(trajectory)]
 
 
 def watch(live: LiveEstimate, messages: list[tuple[str, bytes]], *, disorder: float = 0.0, every: int = 200) -> None:
@@ -51,11 +43,10 @@ def watch(live: LiveEstimate, messages: list[tuple[str, bytes]], *, disorder: fl
     live.report()
 
 
-def watched(trajectory: Trajectory, folder: Path, *, disorder: float = 0.0, every: int = 200) -> LiveEstimate:
+def watched(trajectory: Trajectory, *, disorder: float = 0.0, every: int = 200) -> LiveEstimate:
     """A watcher that has seen a whole run."""
-    write_trajectory(trajectory, folder / "bag")
     live = LiveEstimate(trajectory.record)
-    watch(live, messages_of(folder / "bag"), disorder=disorder, every=every)
+    watch(live, messages_of(trajectory), disorder=disorder, every=every)
     return live
 
 

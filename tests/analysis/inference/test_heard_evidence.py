@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from tests.support import line_and_ring
 from tests.support.watched_run import messages_of, watch, watched, whole_sums
 
@@ -50,12 +51,25 @@ def law(duration: float = 40.0, seed: int = 1, **changes: Any) -> ValidExperimen
     return line_and_ring.experiment(seed, duration, **{**changes, "run": {"replicas": 2} | changes.get("run", {})})
 
 
+@pytest.mark.parametrize("name", ["everything", "real time"])
+def test_messages_are_those_of_the_bag(name: str, tmp_path: Path) -> None:
+    """Read by the library of MCAP: all but the record of the run, in the order of time."""
+    run = simulate(law(duration=20.0, **LAWS[name]))
+    write_trajectory(run, tmp_path / "bag")
+    with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
+        # Ordered here: by the library, it takes three times as long.
+        records = list(make_reader(stream).iter_messages(log_time_order=False))
+    records.sort(key=lambda record: record[2].log_time)
+    assert [(channel.topic, message.data) for _, channel, message in records[1:]] == messages_of(run)
+    assert records[0][1].topic == "/experiment"
+
+
 @pytest.mark.parametrize("name", LAWS)
-def test_is_the_evidence_of_the_comparison(name: str, tmp_path: Path) -> None:
+def test_is_the_evidence_of_the_comparison(name: str) -> None:
     """Whatever the order of the states is, and however often one looks."""
     run = simulate(law(duration=20.0, **LAWS[name]))
     disorder = 0.0 if name == "plain" else 30.0  # there, the next graph counts, which comes with the next step
-    live, wanted = watched(run, tmp_path, disorder=disorder), whole_sums(run, predict(run.record.experiment))
+    live, wanted = watched(run, disorder=disorder), whole_sums(run, predict(run.record.experiment))
     assert live.evidence is not None
     found = live.report()
     assert (found.refused, live.evidence.count) == ({}, 400)
@@ -64,20 +78,19 @@ def test_is_the_evidence_of_the_comparison(name: str, tmp_path: Path) -> None:
     assert found.any_time.log_evidence == pytest.approx(wanted.evidence(), abs=1e-8)
 
 
-def test_late_agents(tmp_path: Path, late_timers: Any) -> None:
+def test_late_agents(late_timers: Any) -> None:
     """Agents of a run in real time are far apart: values are used that are older, or newer, than the step."""
     run = late_timers.run(law(**LAWS["real time"]), late=late_timers.busy(0.4, 2.5), slow=late_timers.busy(0.2, 3.0))
     assert run.used is not None
     assert (run.used > np.arange(800)[:, None, None]).any()
-    live, wanted = watched(run, tmp_path), whole_sums(run, predict(run.record.experiment))
+    live, wanted = watched(run), whole_sums(run, predict(run.record.experiment))
     assert live.report().any_time.log_evidence == pytest.approx(wanted.evidence(), abs=1e-8)
 
 
 @pytest.mark.parametrize("name", ["everything", "hold", "real time"])
-def test_steps_that_were_not_seen(name: str, tmp_path: Path) -> None:
+def test_steps_that_were_not_seen(name: str) -> None:
     """They are left out, and so are agents that used a value of theirs; the rest is exact."""
     run = simulate(law(duration=200.0, **LAWS[name]).with_run(replicas=4))
-    write_trajectory(run, tmp_path / "bag")
     live = LiveEstimate(run.record)
     rng, hidden = np.random.default_rng(3), set(range(500, 700))
     hidden.update(np.flatnonzero(rng.random(4000) < 0.05).tolist())
@@ -87,7 +100,7 @@ def test_steps_that_were_not_seen(name: str, tmp_path: Path) -> None:
             LiveEstimate.add(live, *message, **options)
 
     object.__setattr__(live, "add", add)
-    watch(live, messages_of(tmp_path / "bag"))
+    watch(live, messages_of(run))
     assert live.evidence is not None
     sums = live.evidence.sums
     both = [k for k in range(4000) if k not in hidden and k + 1 not in hidden]
@@ -100,12 +113,12 @@ def test_steps_that_were_not_seen(name: str, tmp_path: Path) -> None:
     assert live.report().any_time.log_evidence < np.log(100.0)
 
 
-def test_values_older_than_what_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_older_than_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which agents are left out depends on losses only, so that the evidence stays fair, and losses all count."""
     monkeypatch.setattr(heard_evidence, "LEAST_KEPT", 8)
     monkeypatch.setattr(heard_evidence, "MOST_KEPT", 8)
     run = simulate(law(duration=200.0, noise={"loss": 0.7, "on_loss": "hold"}))
-    live, wanted = watched(run, tmp_path), whole_sums(run, predict(run.record.experiment))
+    live, wanted = watched(run), whole_sums(run, predict(run.record.experiment))
     assert live.evidence is not None
     sums = live.evidence.sums
     assert (sums.total.samples < wanted.total.samples).all()
@@ -115,14 +128,13 @@ def test_values_older_than_what_is_kept(tmp_path: Path, monkeypatch: pytest.Monk
     assert (np.abs(sums.total.squares - sums.total.samples) < 5 * np.sqrt(2.0 * sums.total.samples)).all()
 
 
-def test_impossible_messages(tmp_path: Path) -> None:
+def test_impossible_messages() -> None:
     """Steps with an entry of ``heard`` that cannot be are left out, and counted."""
     run = simulate(law(**LAWS["hold"]))
     assert run.used is not None
     run.used[100, 2, 0] = 300  # of a later step
-    write_trajectory(run, tmp_path / "bag")
     live = LiveEstimate(run.record)
-    watch(live, messages_of(tmp_path / "bag"))
+    watch(live, messages_of(run))
     report = live.report()
     assert report.refused == {"impossible entry in heard": 1}
     assert live.evidence is not None
@@ -130,13 +142,12 @@ def test_impossible_messages(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["everything", "hold", "real time"])
-def test_a_run_that_ends_early(name: str, tmp_path: Path) -> None:
+def test_a_run_that_ends_early(name: str) -> None:
     """What agents do after the end is not a part of the run."""
     run = simulate(law(**LAWS[name]))
-    write_trajectory(run, tmp_path / "bag")
     live = LiveEstimate(run.record)
     live.end_at(500)
-    watch(live, messages_of(tmp_path / "bag"))
+    watch(live, messages_of(run))
     assert live.evidence is not None
     assert live.evidence.count == 500
     assert live.report().newest == 500
@@ -175,17 +186,16 @@ def test_a_contradiction_in_the_path() -> None:
     assert not path.add(0, 4, 1)
 
 
-def test_correct_runs_seldom_pass_at_any_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_correct_runs_seldom_pass_at_any_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 40 watchers that miss steps, at level 10 %: more than 10 pass with probability 0.2 %."""
     prediction = predict(law(duration=25.0, **LAWS["hold"]))
     monkeypatch.setattr(running_errors, "predict", lambda *_: prediction)
     passed = 0
     for seed in range(40):
         run = simulate(law(duration=25.0, seed=200 + seed, **LAWS["hold"]))
-        write_trajectory(run, tmp_path / str(seed))
         live, rng = LiveEstimate(run.record), np.random.default_rng(seed)
         hidden = set(np.flatnonzero(rng.random(501) < 0.1).tolist())
-        messages = [(topic, data) for topic, data in messages_of(tmp_path / str(seed))]
+        messages = messages_of(run)
         highest = -np.inf
 
         def add(*message: Any, live: LiveEstimate = live, hidden: set[int] = hidden, **options: Any) -> None:
