@@ -362,7 +362,7 @@ def test_document_survives_json_and_yaml(document: dict[str, Any]) -> None:
     written = experiment.to_document()
     for again in (
         json.loads(json.dumps(written, allow_nan=False)),
-        yaml.safe_load(yaml.safe_dump(written, sort_keys=False)),
+        yaml.load(yaml.dump(written, Dumper=yaml.CSafeDumper, sort_keys=False), yaml.CSafeLoader),
     ):
         other = ValidExperiment.parse(again)
         assert other == experiment

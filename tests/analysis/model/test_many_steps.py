@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -102,25 +103,26 @@ def networks(draw: st.DrawFn, rounds: int = 2) -> tuple[int, list[list[list[Row]
     return m, graphs
 
 
-@pytest.mark.parametrize("compiled", [True, False])
 @given(network=networks(), data=st.data())
-def test_equal_to_the_last_bit(compiled: bool, network: tuple[int, list[list[list[Row]]]], data: st.DataObject) -> None:
+def test_equal_to_the_last_bit(network: tuple[int, list[list[list[Row]]]], data: st.DataObject) -> None:
+    """Compiled, and by numpy."""
     m, graphs = network
     replicas = data.draw(st.integers(1, 4))
     modes = data.draw(st.lists(st.integers(0, len(graphs) - 1), min_size=1, max_size=6))
     random = np.random.default_rng(data.draw(st.integers(0, 1000)))
     start, drives = random.normal(size=(1, m, replicas)), random.normal(size=(len(modes), m, replicas))
     assert many_steps.COMPILED
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(many_steps, "COMPILED", compiled)
-        states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), start, drives)
-    np.testing.assert_array_equal(states, by_hand(graphs, modes, start, drives))
+    expected = by_hand(graphs, modes, start, drives)
+    for compiled in (True, False):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(many_steps, "COMPILED", compiled)
+            states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), start, drives)
+        np.testing.assert_array_equal(states, expected)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
 @given(m=st.integers(1, 5), data=st.data())
-def test_with_noise_loss_and_delay_on_the_air(compiled: bool, m: int, data: st.DataObject) -> None:
-    """In lockstep, or one agent after the other in an order that all graphs share."""
+def test_with_noise_loss_and_delay_on_the_air(m: int, data: st.DataObject) -> None:
+    """In lockstep, or one agent after the other in an order that all graphs share; compiled, and by numpy."""
     graphs, order = [], data.draw(st.permutations(range(m)))
     one_by_one = data.draw(st.booleans())
     before = {agent: set(order[:place]) if one_by_one else set() for place, agent in enumerate(order)}
@@ -153,12 +155,16 @@ def test_with_noise_loss_and_delay_on_the_air(compiled: bool, m: int, data: st.D
         held=held,
     )
     last = None if held is None else {pair: held[link].tolist() for link, pair in enumerate(pairs)}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(many_steps, "COMPILED", compiled)
-        states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), past, drives, reception)
-    np.testing.assert_array_equal(states, by_hand(graphs, modes, past, drives, reception, last))
-    if last is not None:
-        np.testing.assert_array_equal(held, list(last.values()))
+    expected = by_hand(graphs, modes, past, drives, reception, last)
+    for compiled in (True, False):
+        own = None if held is None else held.copy()
+        heard = dataclasses.replace(reception, held=own)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(many_steps, "COMPILED", compiled)
+            states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), past, drives, heard)
+        np.testing.assert_array_equal(states, expected)
+        if own is not None and last is not None:
+            np.testing.assert_array_equal(own, list(last.values()))
 
 
 ARGUMENTS: dict[str, Any] = {  # two agents, one graph, three steps of one replica; agent 1 uses both
