@@ -19,6 +19,7 @@ Propositions 2 and 3 of the paper, 7 and 8 in discrete time; for the steps of a 
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -233,6 +234,12 @@ class Prediction:
         """Whether the fourth moments of the run's steps are finite: without, errors have no standard errors."""
         with blas_threads(self.experiment.agents):
             return fourth_moment(build_run_model(self.experiment, self.step), self.system)
+
+    def for_run(self, experiment: ValidExperiment) -> Prediction:
+        """The same for an experiment that differs in the seed or the duration only, with what was computed before."""
+        other = copy.copy(self)
+        object.__setattr__(other, "experiment", experiment)
+        return other
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis predict --json``."""

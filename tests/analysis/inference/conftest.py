@@ -1,6 +1,5 @@
 """Runs in real time with late agents, from the benchmarks; one prediction of many runs."""
 
-import copy
 import importlib.util
 import json
 import sys
@@ -38,9 +37,7 @@ def predicted_once(monkeypatch):
         if key not in known:
             known[key] = predict(experiment, step)
             assert known[key].fourth_moment  # computed once, as what the copies keep
-        same = copy.copy(known[key])
-        object.__setattr__(same, "experiment", experiment)
-        return same
+        return known[key].for_run(experiment)
 
     for module in (compare, pool):
         monkeypatch.setattr(module, "predict", prediction)

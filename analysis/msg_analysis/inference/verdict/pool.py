@@ -63,6 +63,7 @@ def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.0
         if prediction is None:
             _require_prediction(name, run.record.experiment)
             prediction, trajectory = predict(run.record.experiment, run.record.step_model), _without_data(run)
+        prediction = prediction.for_run(run.record.experiment)
         member, evidence = _examine(name, run, prediction, level)
         members.append(member)
         if evidence:
@@ -80,14 +81,13 @@ def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.0
 
 
 def _examine(name: str, run: Trajectory, prediction: Prediction, level: float) -> tuple[Member, Evidence | None]:
-    """One run by itself; no evidence where too little of it arrived."""
-    own = dataclasses.replace(prediction, experiment=run.record.experiment)
-    observation = Observation.of(run, own)
+    """One run by itself, with its prediction; no evidence where too little of it arrived."""
+    observation = Observation.of(run, prediction)
     if observation.steps < compare.MIN_STEPS and not run.completeness.complete:
         missing = Estimate(predicted=prediction.emulated.system_error)
         return Member(name, run.record, 0, run.completeness, missing, missing, "incomplete"), None
     evidence = Evidence.of(observation, level)
-    alone = compare.judge(run, own, evidence, level)
+    alone = compare.judge(run, prediction, evidence, level)
     tested = alone.given.system_error if alone.given else alone.system_error
     member = Member(name, run.record, evidence.steps, run.completeness, alone.system_error, tested, alone.verdict)
     return member, evidence
