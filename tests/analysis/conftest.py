@@ -40,6 +40,6 @@ def offer(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
             )
             for name, kind in offers
         ]
-        monkeypatch.setattr(protocol_binding, "entry_points", lambda group: points)
+        monkeypatch.setattr(protocol_binding, "offered", lambda: tuple(points))
 
     return have

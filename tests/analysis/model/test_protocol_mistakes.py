@@ -235,3 +235,19 @@ def test_processes_that_a_protocol_forks_end_as_ever() -> None:
         with pytest.raises(SystemExit, match=r"os\._exit\(0\)"):
             os._exit(0)
     assert fork() == 7
+
+
+def test_a_package_that_is_installed_meanwhile_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And one that is removed is not: what packages offer is kept only as long as no directory of them changes."""
+    monkeypatch.syspath_prepend(tmp_path)
+    before = set(protocol_binding.installed_protocols())
+    assert "saturated" in before
+    info = tmp_path / "later-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: later\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[msg_agents.protocols]\nlater = later:Later\n")
+    os.utime(tmp_path, ns=(1, 1))  # file systems count in ticks, of which this may be the same
+    assert set(protocol_binding.installed_protocols()) == before | {"later"}
+    info.rename(tmp_path / "gone")
+    os.utime(tmp_path, ns=(2, 2))
+    assert set(protocol_binding.installed_protocols()) == before

@@ -20,9 +20,11 @@ Whatever a protocol raises or returns wrongly becomes an error that names the pr
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -243,9 +245,27 @@ def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
 def installed_protocols() -> dict[str, list[EntryPoint]]:
     """Entry points of the installed protocols, by name; several where packages offer the same name."""
     found: dict[str, list[EntryPoint]] = {}
-    for point in entry_points(group=ENTRY_POINTS):
+    for point in offered():
         found.setdefault(point.name, []).append(point)
     return dict(sorted(found.items()))
+
+
+def offered() -> tuple[EntryPoint, ...]:
+    """What the packages on the path offer; read again only where one was installed or removed meanwhile."""
+    return _offered(tuple((place, _changed(place)) for place in sys.path))
+
+
+@lru_cache(maxsize=1)
+def _offered(_places: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
+    return tuple(entry_points(group=ENTRY_POINTS))
+
+
+def _changed(place: str) -> int:
+    """When something was last added to a directory, or removed [ns]; 0 where it is not there."""
+    try:
+        return os.stat(place or ".").st_mtime_ns  # noqa: PTH116 # twenty of these for each experiment
+    except OSError:
+        return 0
 
 
 def find(spec: ProtocolSpec, recorded: ProtocolInfo | None = None) -> tuple[ChosenProtocol | None, list[str]]:
