@@ -108,9 +108,14 @@ def test_sums_are_those_of_a_loop_over_the_steps(changes: dict[str, Any]) -> Non
 )
 def test_correct_runs_seldom_pass_at_any_time(changes: dict[str, Any]) -> None:
     """Of 40 runs, watched 100 times each, at level 10 %: false-alarm rate P(binomial(40, 0.1) > 10) = 0.2 %."""
-    passed = 0
+    passed, prediction = 0, predict(experiment(seed=100, duration=25.0, **changes))
     for seed in range(40):
-        observation = observed(experiment(seed=100 + seed, duration=25.0, **changes))
+        trajectory = simulate(experiment(seed=100 + seed, duration=25.0, **changes))
+        if trajectory.made is None:
+            prediction = prediction.for_run(trajectory.record.experiment)
+        else:  # the seed says in which order the agents step
+            prediction = predict(trajectory.record.experiment)
+        observation = Observation.of(trajectory, prediction)
         watched = WatchedEvidence.of(observation, np.arange(5, observation.steps + 1, 5))
         assert watched.logarithms is not None
         passed += bool((watched.logarithms >= np.log(10.0)).any())
