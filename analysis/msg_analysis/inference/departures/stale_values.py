@@ -51,7 +51,8 @@ class StaleValues(Departure):
         steps, agents, neighbours = heard.used.shape
         if not len(self._links):
             return np.empty((looks.count, 0, 1))
-        score, information = np.zeros((2, looks.count, agents, agents))
+        shape = looks.count, agents, agents
+        score, information = np.zeros((2, *shape))
         look = looks.after(np.arange(steps))
         self.samples += steps * block.white.shape[2]
         receivers = np.broadcast_to(np.arange(agents), (steps, agents))
@@ -62,8 +63,9 @@ class StaleValues(Departure):
             sender, newest = senders[at, who], used[at, who]
             older = heard.published[newest - 1, sender] - heard.published[newest, sender]
             part = (heard.weights[at, who, d] / block.scale[at, who])[:, None] * older
-            np.add.at(score, (look[at], who, sender), (part * block.white[at, who]).sum(axis=1))
-            np.add.at(information, (look[at], who, sender), (part**2).sum(axis=1))
+            place = np.ravel_multi_index((look[at], who, sender), shape)
+            for total, values in ((score, part * block.white[at, who]), (information, part**2)):
+                total += np.bincount(place, values.sum(axis=1), minlength=total.size).reshape(shape)
         score, information = self.score + score.cumsum(axis=0), self.information + information.cumsum(axis=0)
         self.score, self.information = score[-1], information[-1]
         return self._evidence(score, information)
