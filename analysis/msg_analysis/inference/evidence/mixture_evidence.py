@@ -59,7 +59,7 @@ def variance_evidence(
     FloatArray
         (..., K) of each of ``VARIANCES``
     """
-    half, s = np.asarray(samples) / 2.0, np.asarray(squares) / 2.0
+    half, s = np.asarray(samples, dtype=float) / 2.0, np.asarray(squares) / 2.0
     known = np.moveaxis(variance_constant(samples) if constant is None else constant, -1, 0)
     strengths, near = (_first(each, max(half.ndim, s.ndim)) for each in (_STRENGTHS, _NEAR))
     # (a + n/2) log(b / (b + s)) instead of two large terms that cancel.
@@ -68,7 +68,7 @@ def variance_evidence(
 
 def variance_constant(samples: FloatArray | IntArray) -> FloatArray:
     """(..., K): log of G(a + n/2) / (G(a) b^(n/2)), what ``variance_evidence`` has of the numbers n (..., ) alone."""
-    half = np.asarray(samples) / 2.0
+    half = np.asarray(samples, dtype=float) / 2.0
     strengths, near = (_first(each, half.ndim) for each in (_STRENGTHS, _NEAR))
     return np.moveaxis(gammaln(strengths + half) - gammaln(strengths) - half * np.log(near), 0, -1)
 
