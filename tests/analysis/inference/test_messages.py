@@ -18,6 +18,7 @@ from msg_analysis.inference.hypothesis_tests.losses import LossTally, loss_test
 from msg_analysis.inference.observed.heard_values import HeardValues
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.observed.repeated_noise import RepeatedNoise
+from msg_analysis.inference.realtime import pattern_events
 from msg_analysis.inference.realtime.event_order import newest_steps, order_events
 from msg_analysis.inference.realtime.logged_pattern import means_in_lockstep, pattern_means
 from msg_analysis.inference.verdict.compare import compare
@@ -119,6 +120,20 @@ def test_expectation_and_variance_given_the_log(case):
     assert variance == pytest.approx(brute.variance(), rel=0.03)
     measured = means.trace @ means.measured
     assert abs(measured - brute.node_errors().sum()) < 4 * math.sqrt(brute.variance() / observation.replicas)
+
+
+def test_rounding_changes_no_standard_error(monkeypatch):
+    """What was received is not logged: it follows by regression on values that depend linearly on each other."""
+    observation = observed("real time, own", duration=60, replicas=2)
+    order, random, completed = order_events(observation), np.random.default_rng(1), pattern_events._completed
+
+    def rounded(seen, known, moment, *, centred):
+        errors = 1e-15 * random.standard_normal(moment.shape)
+        return completed(seen, known, moment * (1.0 + errors + errors.T), centred=centred)
+
+    exact = pattern_means(observation, order)
+    monkeypatch.setattr(pattern_events, "_completed", rounded)
+    np.testing.assert_allclose(pattern_means(observation, order).covariance, exact.covariance, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if CASES[case][0].get("link")])

@@ -38,6 +38,8 @@ from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 CACHED_NUMBERS = 20_000_000  # numbers in cached matrices: 160 MB
 
+NULL = 1e-12  # eigenvalues of second moments this small, relative to the largest, are rounding: some are 0 exactly
+
 _OWN = np.iinfo(np.int64).min  # stands for a value that was never heard; the agent's own value takes its place
 
 
@@ -328,7 +330,7 @@ def _completed(seen: FloatArray, known: BoolArray, moment: FloatArray, *, centre
     if centred:
         centre = np.eye(len(known)) - np.outer(np.ones(len(known)), known / known.sum())
         moment = centre @ moment @ centre.T
-    gain = moment[:, known] @ np.linalg.pinv(moment[np.ix_(known, known)], hermitian=True)
+    gain = moment[:, known] @ np.linalg.pinv(moment[np.ix_(known, known)], rcond=NULL, hermitian=True)
     rest = moment[np.ix_(~known, ~known)] - gain[~known] @ moment[np.ix_(known, ~known)]
     found = gain @ seen @ gain.T
     found[np.ix_(known, known)] = seen
