@@ -18,6 +18,7 @@ from msg_analysis.inference.planning.precision import REPLICAS
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
 from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
 from msg_analysis.inference.statistics.distributions import needed_noncentrality, noncentral_chi2_tail
+from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -55,11 +56,12 @@ def test_the_interval_of_a_run_is_the_planned_one() -> None:
     """The standard error that a run itself states, and its interval for all times."""
     experiment = line_ring(duration=4000, replicas=4)
     plan = experiment.plan()
-    run = Observation.of(simulate(experiment), predict(experiment))
+    trajectory = simulate(experiment)
+    run = Observation.of(trajectory, predict(experiment))
     means = time_means(run)
     measured = math.sqrt(means.system_variances.sum()) / run.steps / plan.precision.error
     assert measured == pytest.approx(plan.precision.standard_error(run.steps, 4), rel=0.05)
-    any_time = experiment.simulate().compare().any_time
+    any_time = compare(trajectory).any_time
     assert any_time is not None
     assert any_time.half_width is not None
     planned = plan.to_json()["file"]["any_time_half_width"] * plan.precision.error
