@@ -47,7 +47,9 @@ def new_record(experiment: ValidExperiment, run: uuid.UUID | None = None) -> Run
     matrices = None
     if isinstance(model, StepModel) and (experiment.time == "discrete" or experiment.protocol):
         matrices = StepMatrices(model.nominal, model.noise_gain)
-    return RunRecord(run or uuid.uuid4(), experiment, start, matrices=matrices, key=secrets.token_bytes(KEY_SIZE))
+    record = RunRecord(run or uuid.uuid4(), experiment, start, matrices=matrices, key=secrets.token_bytes(KEY_SIZE))
+    record.__dict__["model"] = model  # what this cached property would compute again
+    return record
 
 
 def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) -> Trajectory:
