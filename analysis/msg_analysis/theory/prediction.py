@@ -236,7 +236,13 @@ class Prediction:
             return fourth_moment(build_run_model(self.experiment, self.step), self.system)
 
     def for_run(self, experiment: ValidExperiment) -> Prediction:
-        """The same for an experiment that differs in the seed or the duration only, with what was computed before."""
+        """The same for another run, with what was computed before.
+
+        Parameters
+        ----------
+        experiment
+            differs from that of the prediction in the seed and the duration at most
+        """
         other = copy.copy(self)
         object.__setattr__(other, "experiment", experiment)
         return other
