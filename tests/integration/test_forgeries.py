@@ -1,4 +1,4 @@
-"""Messages with the id of the run that are not of the run, before it begins and while it goes on.
+"""Messages with the id of the run that are not of the run, before it begins and while it goes on; in real time, others.
 
 Nothing crashes, no trajectory changes, and what was refused is counted.
 """
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stranger import STEPS, Forgery, graph, run_beside
+from stranger import STEPS, Forgery, Refused, batch, graph, run_beside, states
 
 from msg_analysis.model.run.graph_path import sojourns
 from msg_analysis.model.run.record import RunRecord
@@ -25,7 +25,7 @@ from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, encode
 from msg_analysis.wire.state_batches import encode_batch
 
 PACES = {"lockstep": {}, "realtime": {"pace": "realtime", "speed": 5}}
-MANY = 1000  # messages of each kind, before the run and again while it goes on
+MANY = 200  # messages of each kind, before the run and again while it goes on
 
 
 def record_of(network: Any, pace: str) -> RunRecord:
@@ -41,10 +41,8 @@ def unharmed(record: RunRecord, trajectory: Any) -> None:
     assert (outcome.difference, outcome.missing) == (None, 0)
 
 
-@pytest.mark.parametrize("pace", PACES)
-def test_steering(network: Any, pace: str) -> None:
+def steering(record: RunRecord) -> list[Forgery]:
     """A record with other noise, the other graph, the last step of everybody, the end and another epoch."""
-    record = record_of(network, pace)
     run = record.run.bytes
     noisy = record.experiment.parse(record.experiment.to_document() | {"noise": {"process": 3.0}})
     first = next(sojourns(record.experiment, first_graph(record.experiment)))
@@ -57,9 +55,13 @@ def test_steering(network: Any, pace: str) -> None:
         *(("resend", Progress(0, run, agent, 0).encode()) for agent in range(1, 6)),
         ("end", Progress(STEPS * 50_000_000, run, 0, STEPS).encode()),
     ]
-    forged += [("epoch", Progress(10**18, run, 0, 0).encode())] if pace == "realtime" else []
-    trajectory, _, refused = run_beside(network, record, forged)
-    unharmed(record, trajectory)
+    if record.experiment.run.pace == "realtime":
+        forged.append(("epoch", Progress(10**18, run, 0, 0).encode()))
+    return forged
+
+
+def steered_nobody(refused: Refused, pace: str) -> None:
+    """Every reader has refused all of ``steering``."""
     assert refused["recorder", "experiment", "contradicts the run record"] == 1
     for node in ("agent_1", "agent_3", "recorder"):
         assert refused[node, "graph", "contradicts the run record"] == 2
@@ -68,6 +70,41 @@ def test_steering(network: Any, pace: str) -> None:
     for host in ("agent_1", "agent_3"):
         assert refused[host, "resend", "not signed with the key of the run"] == 5
         assert refused[host, "epoch", "not signed with the key of the run"] == (pace == "realtime")
+
+
+def test_steering_and_states_that_are_not_finite(network: Any) -> None:
+    """The states are of the right run, the right agent and the right steps, and there before the truth."""
+    record = record_of(network, "lockstep")
+    values = [np.nan, np.inf, -np.inf, np.nan, np.inf]
+    forged = [m for agent, value in enumerate(values, start=1) for m in states(record.run.bytes, agent, value=value)]
+    forged.append(batch(record.run.bytes, [message for message in forged if message[0] == "agent_4/state"]))
+    trajectory, _, refused = run_beside(network, record, [*steering(record), *forged])
+    unharmed(record, trajectory)
+    steered_nobody(refused, "lockstep")
+    # In a batch; and as single messages, which the recorder reads when it sees a stranger on these topics.
+    assert refused["recorder", "/agent_4/state", "not finite"] == 2 * (STEPS + 1)
+    for node, agent in (("agent_5", 1), ("agent_3", 2), ("agent_2", 3), ("agent_1", 5)):
+        assert refused[node, f"agent_{agent}/state", "not finite"] == STEPS + 1
+
+
+def test_steering_and_other_messages_in_real_time(network: Any) -> None:
+    """Before simulated time has begun: other epochs, states of other runs and layouts, what nobody can have yet.
+
+    How many of the states are refused is not known: agents read only the newest of those that wait for them.
+    """
+    record = record_of(network, "realtime")
+    run, other = record.run.bytes, new_record(record.experiment).run.bytes
+    forged = [message for agent in range(1, 6) for message in states(other, agent)]
+    forged += states(run, 1, replicas=3) + states(run, 2, value=np.nan)
+    forged += [("agent_3/state", AgentState(0, run, 3, STEPS + 1, 1, np.zeros(2)).encode())]
+    forged += [("epoch", Progress(0, other, 0, 0).encode()), ("epoch", Progress(0, run, 2, 0).encode())]
+    forged += [graph(other), ("end", Progress(0, other, 0, STEPS).encode())]
+    trajectory, _, refused = run_beside(network, record, [*steering(record), *forged])
+    unharmed(record, trajectory)
+    steered_nobody(refused, "realtime")
+    for host in ("agent_1", "agent_3"):
+        assert refused[host, "epoch", "other run"] >= 1
+        assert refused[host, "graph", "other run"] == 1
 
 
 class Absurd:
@@ -144,7 +181,7 @@ class Absurd:
 
 def test_batches_that_processes_read(network: Any) -> None:
     """In a dense network, where agents hear each other by them."""
-    run_of_three = {"dt": 0.01, "duration": 3, "processes": 3, "start": "zero"}
+    run_of_three = {"dt": 0.01, "duration": 1, "processes": 3, "start": "zero"}
     dense = {"agents": 24, "graphs": {"all": {"complete": True}}, "switching": {"generator": [[0]]}}
     record = new_record(network.experiment(**dense, run=run_of_three))
     run, other = record.run.bytes, bytes(16)
@@ -166,8 +203,8 @@ def test_batches_that_processes_read(network: Any) -> None:
 
 @pytest.mark.parametrize("pace", PACES)
 def test_absurd_fields(network: Any, pace: str, rng: random.Random) -> None:
-    """2,000 of each kind, half of them while the run goes on."""
-    length = {"duration": 200} if pace == "lockstep" else {"duration": 40, "speed": 10}
+    """400 of each kind, half of them while the run goes on."""
+    length = {"duration": 120} if pace == "lockstep" else {"duration": 20, "speed": 10}
     record = new_record(network.experiment(run={"processes": 2} | PACES[pace] | length))
     absurd = Absurd(record, rng)
     early, meanwhile = absurd.messages(MANY), absurd.messages(MANY)

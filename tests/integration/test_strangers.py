@@ -1,132 +1,104 @@
-"""Other publishers on the topics of a run: refused, counted, and without any effect on the result."""
+"""Other publishers on the topics of a run: refused, counted, and without any effect on the result.
+
+In real time, and with what only looks as if it were of the run: test_forgeries; second processes: test_health.
+"""
 
 from __future__ import annotations
 
 import html
 import random
-import re
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from stranger import STEPS, batch, graph, run_beside, states
+from stranger import STEPS, Forgery, batch, graph, run_beside, states
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.model.run.record import RunRecord
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.messages import AgentState, Progress, encode_string
+from msg_analysis.wire.messages import Progress, encode_string
 
 
-def test_another_run_of_the_same_experiment(network: Any) -> None:
-    """Complete and well-formed, but of another run: its states, its graph, its progress, its record, its end."""
+def test_another_run_and_nonsense(network: Any) -> None:
+    """Another run of the same experiment, complete and well-formed: its states, graph, progress, record and end.
+
+    Bytes that are no message, and messages of this run that cannot be.
+    """
     record = new_record(network.experiment(run={"processes": 2}))
     other = new_record(network.experiment(run={"processes": 2, "seed": 8}))
-    run = other.run.bytes
-    forged = [("experiment", encode_string(other.to_json())), graph(run)]
-    forged += [message for agent in range(1, 6) for message in states(run, agent)]
-    forged += [batch(run, states(run, 4)), batch(record.run.bytes, states(run, 4))]
-    forged += [("progress", Progress(0, run, agent, STEPS).encode()) for agent in range(6)]
-    forged += [("end", Progress(0, run, 0, STEPS).encode())]
+    forged = of_another_run(record.run.bytes, other) + nonsense(record.run.bytes)
     trajectory, logs, refused = run_beside(network, record, forged)
     assert trajectory.completeness.complete
+    assert trajectory.completeness.received == trajectory.completeness.expected
+    assert trajectory.completeness.duplicates == 0
+    assert trajectory.completeness.refused == {}
     assert trajectory.record.run == record.run
     outcome = check(trajectory)
     assert (outcome.difference, outcome.missing) == (None, 0)
-    for name, log in logs.items():
-        assert "refused a message on" in log, name
+    for name, log in logs.items():  # one warning for each reason and topic
+        warnings = [line.partition("refused a message on ")[2] for line in log.splitlines() if "refused a" in line]
+        assert len(warnings) == len(set(warnings)) > 0, name
+    assert {reason for _, _, reason in refused} == {
+        *("other run", "wrong length", "undecodable", "of another agent than its topic", "unknown agent"),
+        "contradicts the run record",
+    }
+
     for agent in (1, 2, 3, 5):  # who are heard in the other process
-        (by_agent,) = (n for (node, topic, _), n in refused.items() if topic == f"agent_{agent}/state")
+        topic = f"agent_{agent}/state"
+        (by_agent,) = (n for (_, *what), n in refused.items() if what == [topic, "other run"])
         assert by_agent == STEPS + 1
     assert refused["recorder", "states", "other run"] == 1 + STEPS + 1  # a batch, and every state of the other one
     assert refused["switcher", "progress", "other run"] == 6
     for node in ("agent_1", "agent_3", "recorder"):
         assert refused[node, "end", "other run"] == 1
         assert refused[node, "graph", "other run"] == 1
-    assert {reason for _, _, reason in refused} == {"other run"}
+        assert refused[node, "graph", "contradicts the run record"] == 3
+
+    assert refused["recorder", "states", "wrong length"] == STEPS + 1
+    assert refused["recorder", "states", "undecodable"] == (len(GARBAGE) - 1) + len(GARBAGE) + 1
+    assert refused["agent_3", "agent_2/state", "wrong length"] == STEPS + 1
+    assert refused["agent_5", "agent_1/state", "of another agent than its topic"] == 10
+    assert refused["agent_5", "agent_1/state", "undecodable"] == len(GARBAGE) - 1
+    assert refused["switcher", "progress", "unknown agent"] == 2
+    assert refused["recorder", "experiment", "undecodable"] == 4 + len(GARBAGE) - 1
+    assert refused["recorder", "experiment", "other run"] == 2  # that of the other run, and one that only has an id
 
 
-def test_nonsense(network: Any) -> None:
-    """Bytes that are no message, and messages of this run that cannot be."""
-    record = new_record(network.experiment(run={"processes": 2}))
-    run = record.run.bytes
-    garbage = [
-        b"",
-        b"\x00",
-        b"\x00\x01\x00\x00",
-        bytes(range(40)),
-        b"\xff" * 200,
-        b"\x00\x01\x00\x00" + b"\xff" * 96,
-    ]
+GARBAGE = [
+    b"",
+    b"\x00",
+    b"\x00\x01\x00\x00",
+    bytes(range(40)),
+    b"\xff" * 200,
+    b"\x00\x01\x00\x00" + b"\xff" * 96,
+]
+
+
+def of_another_run(run: bytes, record: RunRecord) -> list[Forgery]:
+    """All that another run has, and a batch of it that says that it is of this one."""
+    other = record.run.bytes
+    forged = [("experiment", encode_string(record.to_json())), graph(other)]
+    forged += [message for agent in range(1, 6) for message in states(other, agent)]
+    forged += [batch(other, states(other, 4)), batch(run, states(other, 4))]
+    forged += [("progress", Progress(0, other, agent, STEPS).encode()) for agent in range(6)]
+    return [*forged, ("end", Progress(0, other, 0, STEPS).encode())]
+
+
+def nonsense(run: bytes) -> list[Forgery]:
+    """No messages, or impossible ones."""
     topics = ["agent_1/state", "agent_3/state", "states", "graph", "progress", "end", "experiment"]
-    forged = [(topic, data) for topic in topics for data in garbage if data]
+    forged = [(topic, data) for topic in topics for data in GARBAGE if data]
     forged += states(run, 1, replicas=3) + states(run, 2, replicas=1)
     forged += [("agent_1/state", data) for _, data in states(run, 5)[:10]]  # on another agent's topic
-    forged += [batch(run, states(run, 1, replicas=3)), batch(run, [("", data) for data in garbage])]
+    forged += [batch(run, states(run, 1, replicas=3)), batch(run, [("", data) for data in GARBAGE])]
     forged += [("states", data[:-9]) for _, data in [batch(run, states(run, 1))]]
     forged += [graph(run, sequence=7), graph(run, first_step=5), graph(run, first_step=9, last_step=3)]
     forged += [("progress", Progress(0, run, agent, STEPS).encode()) for agent in (6, 2**32 - 1)]
-    forged += [("experiment", encode_string(text)) for text in ("", "{}", "[1]", '{"run": 1}', "hello")]
-    trajectory, logs, refused = run_beside(network, record, forged)
-    assert trajectory.completeness.received == trajectory.completeness.expected
-    assert check(trajectory).difference is None
-    assert trajectory.completeness.duplicates == 0
-    assert trajectory.completeness.refused == {}
-    assert refused["recorder", "states", "wrong length"] == STEPS + 1
-    assert refused["recorder", "states", "undecodable"] == (len(garbage) - 1) + len(garbage) + 1
-    assert refused["agent_3", "agent_2/state", "wrong length"] == STEPS + 1
-    assert refused["agent_5", "agent_1/state", "of another agent than its topic"] == 10
-    assert refused["agent_5", "agent_1/state", "undecodable"] == len(garbage) - 1
-    assert refused["switcher", "progress", "unknown agent"] == 2
-    assert refused["recorder", "experiment", "undecodable"] == 4 + len(garbage) - 1
-    assert refused["recorder", "experiment", "other run"] == 1
-    for name, log in logs.items():  # one warning for each reason and topic
-        warnings = [line.partition("refused a message on ")[2] for line in log.splitlines() if "refused a" in line]
-        assert len(warnings) == len(set(warnings)) > 0, name
-    for node in ("agent_1", "agent_3", "recorder"):
-        assert refused[node, "graph", "contradicts the run record"] == 3
-    assert trajectory.completeness.complete
-
-
-def test_states_of_this_run_that_are_not_finite(network: Any) -> None:
-    """Right run, right agent, right steps, and there before the truth."""
-    record = new_record(network.experiment(run={"processes": 2}))
-    values = [np.nan, np.inf, -np.inf, np.nan, np.inf]
-    forged = [m for agent, value in enumerate(values, start=1) for m in states(record.run.bytes, agent, value=value)]
-    forged.append(batch(record.run.bytes, [message for message in forged if message[0] == "agent_4/state"]))
-    trajectory, _, refused = run_beside(network, record, forged)
-    assert trajectory.completeness.complete
-    # In a batch; and as single messages, which the recorder reads when it sees a stranger on these topics.
-    assert refused["recorder", "/agent_4/state", "not finite"] == 2 * (STEPS + 1)
-    for node, agent in (("agent_5", 1), ("agent_3", 2), ("agent_2", 3), ("agent_1", 5)):
-        assert refused[node, f"agent_{agent}/state", "not finite"] == STEPS + 1
-    assert check(trajectory).difference is None
-
-
-def test_in_real_time(network: Any) -> None:
-    """Before simulated time has begun: another epoch, states of other runs and layouts, what nobody can have yet.
-
-    How many of the states are refused is not known: agents read only the newest of those that wait for them.
-    """
-    record = new_record(network.experiment(run={"processes": 2, "pace": "realtime", "speed": 5}))
-    run, other = record.run.bytes, new_record(record.experiment).run.bytes
-    forged = [message for agent in range(1, 6) for message in states(other, agent)]
-    forged += states(run, 1, replicas=3) + states(run, 2, value=np.nan)
-    forged += [("agent_3/state", AgentState(0, run, 3, STEPS + 1, 1, np.zeros(2)).encode())]
-    forged += [("epoch", Progress(0, other, 0, 0).encode()), ("epoch", Progress(0, run, 2, 0).encode())]
-    forged += [graph(other), ("end", Progress(0, other, 0, STEPS).encode())]
-    trajectory, _, refused = run_beside(network, record, forged)
-    assert trajectory.completeness.complete
-    outcome = check(trajectory)
-    assert (outcome.difference, outcome.missing) == (None, 0)
-    for host in ("agent_1", "agent_3"):
-        assert refused[host, "epoch", "other run"] >= 1
-        assert refused[host, "graph", "other run"] == 1
+    return forged + [("experiment", encode_string(text)) for text in ("", "{}", "[1]", '{"run": 1}', "hello")]
 
 
 def test_a_forged_state_is_noticed_and_nothing_is_concluded(network: Any) -> None:
@@ -150,7 +122,7 @@ import random, sys, time
 from pathlib import Path
 import numpy as np
 import rclpy
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from msg_agents_interfaces.msg import ActiveGraph as GraphMsg, AgentState as StateMsg, Progress as ProgressMsg
 from msg_agents_interfaces.msg import StateBatch
 from msg_agents.nodes.ros.qos import ros_profile
@@ -178,8 +150,9 @@ def listen(data):  # to the true agent, not to itself
     if agent == 2 and np.isfinite(np.frombuffer(value)).all() and np.frombuffer(value)[0] != 9:
         now[0] = step
 
-# Not reliable: whoever is as slow as this would hold back the whole network.
-node.create_subscription(StateMsg, "agent_2/state", listen, qos_profile_sensor_data, raw=True)
+# Only the newest, and not reliable: whoever is as slow as this would hold back the whole network.
+newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+node.create_subscription(StateMsg, "agent_2/state", listen, newest, raw=True)
 while state.get_subscription_count() < 2 or not states.get_subscription_count():  # a neighbour, this process; recorder
     time.sleep(0.1)
 
@@ -207,11 +180,12 @@ forge = {
 }
 while now[0] < 8300:
     rclpy.spin_once(node, timeout_sec=0.1)
+    time.sleep(0.01)
 order = [name for name in forge for _ in range(20)]
 rng.shuffle(order)
 for name in order:
-    for _ in range(20):
-        rclpy.spin_once(node, timeout_sec=0)
+    rclpy.spin_once(node, timeout_sec=0)
+    time.sleep(0.001)
     forge[name]()
 print(now[0], flush=True)
 time.sleep(600)
@@ -257,33 +231,3 @@ def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Ra
         assert refused[topic, "other run"]["count"] > 0
     report = html.unescape(Path(result["report"]).read_text())
     assert all(f"<td>{entry['reason']}</td>" in report for entry in result["strangers"])
-
-
-def test_second_processes_of_agents(network: Any) -> None:
-    """Of the same run and of another one: they find their names taken and leave; the run says who was there."""
-    other = network.directory / "other.json"
-    other.write_text(new_record(network.experiment(run={"duration": 100, "seed": 8})).to_json(with_key=True))
-    with free_domain() as domain:
-        # 8,000 steps: of 2,000, a quiet machine has made the last one before the first is seen in the bag.
-        file = network.file(run={"duration": 400, "processes": 3})
-        run = network.record(file, "--domain", str(domain), "--json")
-        network.wait_until_moving()
-        (first, *_) = network.processes("agent")
-        first.kill(signal.SIGSTOP)  # the network stands still until they have left
-        time.sleep(0.5)  # a run whose last step was already made ends meanwhile
-        assert len(network.nodes()) == 5, "too fast to be stopped in the middle"
-        environment = node_environment(domain)
-        # What gets lost while they look for each other comes again after 3 s, and the same can happen to that.
-        doubles = {
-            agent: network.start("agent", record, "--agent", agent, "--discovery-timeout", "12", **environment)
-            for agent, record in (("2", network.run_file()), ("4", other))
-        }
-        for agent, double in doubles.items():
-            _, stderr = double.communicate(timeout=60)
-            assert double.returncode == 2, stderr
-            assert re.search(rf"more than one node was still called .*agent_{agent}.* in ROS_DOMAIN_ID", stderr), stderr
-        first.kill(signal.SIGCONT)
-        result = network.completed(run)
-    for agent in doubles:
-        entry = {"node": "switcher", "topic": f"agent_{agent}", "reason": "duplicate node name", "count": 1}
-        assert entry in result["strangers"]

@@ -76,7 +76,7 @@ of_states = [message for message in dict(messages).items() if message[0].endswit
 while int(sys.argv[5]):
     for topic, data in of_states:
         publish(topic, data)
-    time.sleep(0.004)
+    time.sleep(0.01)
 time.sleep(600)
 """
 Forgery = tuple[str, bytes]  # topic, message
