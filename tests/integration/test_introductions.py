@@ -10,21 +10,25 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Any
 
+import numpy as np
 import pytest
+from visitor import assert_delivery
 
 from msg_agents.discovery.profiles import FIRST_INTRODUCED
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.discovery.rtps import discovery_port
 from msg_agents.processes.environment import node_environment
 from msg_analysis.twin.check import check
+from msg_analysis.twin.simulate import simulate
 
 NODES = sorted(["recorder", "switcher", *(f"agent_{i}" for i in range(1, 6))])
 VISITOR = """
 import sys, time, rclpy
 rclpy.init()
-node = rclpy.create_node("visitor")
+name, *wanted = sys.argv[1:]
+node = rclpy.create_node(name)
 print("ready", flush=True)
-wanted, end = set(sys.argv[1:]), time.monotonic() + 60
+wanted, end = set(wanted), time.monotonic() + 60
 while not wanted <= set(node.get_node_names()) and time.monotonic() < end:
     time.sleep(0.05)
 print(*sorted(node.get_node_names()), flush=True)
@@ -37,44 +41,63 @@ def domain() -> Iterator[int]:
         yield number
 
 
-def visit(environment: dict[str, str]) -> subprocess.Popen[str]:
-    command = [sys.executable, "-P", "-c", VISITOR, *NODES]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+def visits(stack: ExitStack, when: str, domain: int) -> dict[str, subprocess.Popen[str]]:
+    """Visitors in each kind of surroundings, by the names of their nodes."""
+    surroundings = {
+        "our_profile": node_environment(domain),
+        "range_of_ros": os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
+    }
+    found = {}
+    for kind, environment in surroundings.items():
+        command = [sys.executable, "-P", "-c", VISITOR, f"visitor_{when}_{kind}", *NODES]
+        visitor = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+        found[command[4]] = stack.enter_context(visitor)
+    return found
 
 
-def surroundings(kind: str, domain: int) -> dict[str, str]:
-    if kind == "our profile":
-        return node_environment(domain)
-    return os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+def test_visitors_see_every_process(network: Any, domain: int) -> None:
+    """Those that were there before the run and those that come during it, with our profile and in ROS's own range.
 
-
-@pytest.mark.parametrize("kind", ["ROS's own range", "our profile"])
-@pytest.mark.parametrize("first", [True, False], ids=["before the run", "during the run"])
-def test_a_visitor_sees_every_process(network: Any, domain: int, kind: str, first: bool) -> None:
-    """Of a run in which no process knows more than half of the others."""
+    Of a run in which no process knows more than half of the others. In real time, agents hear each other with best
+    effort if nothing is said of it; all else is reliable.
+    """
     graphs = {"line": {"path": [1, 2, 3, 4, 5]}, "none": {"edges": []}}
-    file = network.file(graphs=graphs, run={"duration": 2000, "replicas": 32})  # large states are soon seen in the bag
+    # Few steps, and large states, which are soon seen in the bag.
+    file = network.file(graphs=graphs, run={"pace": "realtime", "duration": 2000, "replicas": 128})
     with ExitStack() as stack:
-        visitors = [stack.enter_context(visit(surroundings(kind, domain)))] if first else []
-        for visitor in visitors:
+        visitors = visits(stack, "before", domain)
+        for visitor in visitors.values():
             assert visitor.stdout is not None
             assert visitor.stdout.readline() == "ready\n"
         run = network.record(file, "--domain", str(domain))
         network.wait_until_moving()
-        visitors = visitors or [stack.enter_context(visit(surroundings(kind, domain)))]
-        said, _ = visitors[0].communicate(timeout=90)
+        visitors |= visits(stack, "during", domain)
+        for name, visitor in visitors.items():
+            said, _ = visitor.communicate(timeout=90)
+            seen = said.splitlines()[-1].split()
+            assert name in seen
+            assert [node for node in seen if node not in visitors] == NODES, name
+        assert_delivery("BEST_EFFORT", [2], domain)
         run.terminate()
         run.communicate(timeout=60)
-    assert said.splitlines()[-1].split() == [*NODES, "visitor"]
 
 
 def test_a_domain_without_room_for_introductions(network: Any, domain: int) -> None:
-    """Where others have all the numbers of visitors, the processes look for each other."""
+    """Where others have all the numbers of visitors, the processes look for each other; the result is the same.
+
+    One process per agent: the twin says, from the experiment alone, what they record.
+    """
+    what = network.experiment(run={"processes": "one_per_agent"})
     with ExitStack() as stack:
         for number in range(FIRST_INTRODUCED):
             other = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             other.bind(("127.0.0.1", discovery_port(domain, number)))
-        result = network.run(network.experiment(), domain=domain)
+        result = network.run(what, domain=domain)
     assert result.failures == []
-    assert result.trajectory.completeness.complete
-    assert check(result.trajectory).difference is None
+    trajectory, twin = result.trajectory, simulate(what)
+    assert trajectory.completeness == twin.completeness
+    outcome = check(trajectory)
+    assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, 5 * 301)
+    assert np.array_equal(trajectory.states, twin.states)
+    assert np.array_equal(trajectory.modes, twin.modes)
+    assert np.array_equal(trajectory.agent_modes[1:], np.repeat(twin.modes[:, None], 5, axis=1))

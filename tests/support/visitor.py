@@ -22,6 +22,16 @@ def assert_endpoints(readers: Endpoints, writers: Endpoints, domain: int) -> Non
     assert json.loads(visitor.stdout) == json.loads(wanted), visitor.stderr
 
 
+def assert_delivery(heard: str, hearers: Sequence[int], domain: int) -> None:
+    """In a network of five, these agents hear agent 1 so; its writer is reliable, as other readers may want it."""
+    readers = {
+        "/agent_1/state": [[f"agent_{i}", heard] for i in hearers],
+        "/states": [["recorder", "RELIABLE"]],
+        "/graph": [*([f"agent_{i}", "RELIABLE"] for i in range(1, 6)), ["recorder", "RELIABLE"]],
+    }
+    assert_endpoints(readers, {"/agent_1/state": [["agent_1", "RELIABLE"]]}, domain)
+
+
 VISITOR = """
 import json, sys, time, rclpy
 wanted, found, end = json.loads(sys.argv[1]), [], time.monotonic() + 20
