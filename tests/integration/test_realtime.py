@@ -17,15 +17,17 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from set_clock import SetClock
+from started_processes import started_processes
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
+from msg_agents.processes.status_file import read_steps
+from msg_agents.running.supervisor import STEPS
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.run.trajectory import Trajectory
@@ -82,10 +84,9 @@ def clock(domain: int) -> Iterator[None]:
         process.wait()
 
 
-@pytest.mark.parametrize("processes", ["one_per_agent", 2])
-def test_five_agents(network: Any, processes: Any) -> None:
+def test_one_process_per_agent(network: Any) -> None:
     """The verdict is one that a right run misses once in 10,000 times."""
-    result = network.run(network.experiment(run={**UNDISTURBED, "processes": processes}))
+    result = network.run(network.experiment(run={**UNDISTURBED, "processes": "one_per_agent"}))
     assert result.failures == []
     assert_possible(result.trajectory)
     assert compare(result.trajectory, level=1e-4).verdict == "agrees"
@@ -93,13 +94,15 @@ def test_five_agents(network: Any, processes: Any) -> None:
 
 def test_a_busy_machine_is_no_wrong_theory(network: Any) -> None:
     """Others keep every core busy. Whoever is late is said to be late; a false alarm comes once in 10,000 times."""
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2 * (os.cpu_count() or 1))]
-    try:
-        result = network.run(network.experiment(run={**UNDISTURBED, "processes": 2}))
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
+    with started_processes() as busy:
+
+        def disturb(_: int) -> None:
+            """As soon as agents make steps."""
+            while len(busy) < 2 * (os.cpu_count() or 1):
+                busy.append(subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"]))
+
+        result = network.run(network.experiment(run={**UNDISTURBED, "processes": 2}), on_progress=disturb)
+        assert busy
     assert result.failures == []
     assert_possible(result.trajectory)
     comparison = compare(result.trajectory, level=1e-4)
@@ -114,41 +117,23 @@ def test_a_busy_machine_is_no_wrong_theory(network: Any) -> None:
 def test_sojourns_of_one_step(network: Any) -> None:
     """They are over before they arrive: agents go on with the next ones, and nothing is refused.
 
-    Between two graphs of 1.3 steps on average, an agent that had missed one would have kept its graph for ever.
+    Between two graphs of 1.3 steps on average, an agent that had missed one would have kept its graph for ever. With
+    two processes; the verdict as above.
     """
     fast = {"switching": {"generator": [[-20.0, 20.0], [20.0, -20.0]]}}
-    result = network.run(network.experiment(**fast, run={**REALTIME, "speed": 10, "duration": 40, "processes": 2}))
+    result = network.run(network.experiment(**fast, run={**UNDISTURBED, "speed": 10, "duration": 20, "processes": 2}))
     assert result.failures == []
     assert result.strangers == []
     assert_possible(result.trajectory)
+    assert compare(result.trajectory, level=1e-4).verdict == "agrees"
     changes = np.diff(result.trajectory.agent_modes[1:], axis=0) != 0
-    assert (changes.sum(axis=0) >= 20).all()  # of some 500; on a busy machine agents make many steps at once
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"problem": "tracking", "leaders": {"agents": [1, 4], "gain": "inf", "reference": 2.0}},
-        {
-            "time": "discrete",
-            "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
-            "noise": {"process": [[1.0 if i == j else 0.3 / (1 + i + 2 * j) for j in range(5)] for i in range(5)]},
-            "run": {"dt": 1, "duration": 200, "speed": 100},
-        },
-    ],
-    ids=["grounded", "discrete, correlated"],
-)
-def test_other_laws(network: Any, changes: dict[str, Any]) -> None:
-    run = {**UNDISTURBED, "processes": 1, **changes.get("run", {})}
-    result = network.run(network.experiment(**{**changes, "run": run}))
-    assert result.failures == []
-    assert_possible(result.trajectory)
+    assert (changes.sum(axis=0) >= 20).all()  # of some 250; on a busy machine agents make many steps at once
 
 
 def test_under_a_clock_of_somebody_else(network: Any) -> None:
     """All stamps are ticks of that clock, but for the nanoseconds by which what comes out of something is later."""
     speed = 2.5
-    what = network.experiment(run={**REALTIME, "speed": speed, "duration": 20, "processes": 2})
+    what = network.experiment(run={**REALTIME, "speed": speed, "duration": 12, "processes": 2})
     with free_domain() as domain, clock(domain):
         result = network.run(what, domain=domain, use_sim_time=True)
     assert result.failures == []
@@ -190,42 +175,50 @@ def test_killed_and_back(network: Any, repetition: int) -> None:
     assert_possible(result.trajectory)
 
 
-def test_a_network_that_cannot_keep_up(network: Any) -> None:
-    """An agent is stopped for three seconds: the run says that it is behind, catches up, and its log is possible."""
-    run = network.record(network.file(run=REALTIME | {"duration": 30, "processes": 5}))
+def test_an_agent_stands_still_and_the_clock_is_set_back(network: Any) -> None:
+    """Each by three seconds: the run says that it is behind, and catches up; then, that no step is due, and waits.
+
+    The clock is that of all processes of the run, whose log is possible.
+    """
+    clock = SetClock(network.directory)
+    file = network.file(run=REALTIME | {"duration": 35, "processes": 2})
+    run = network.record(file, "--json", **clock.environment)
     network.wait_until_moving()
+    steps = network.run_file().with_name(STEPS)
     (agent, *_) = network.processes("agent")
     agent.kill(signal.SIGSTOP)
     time.sleep(3.0)
     agent.kill(signal.SIGCONT)
-    _, stderr = run.communicate(timeout=120)
+    network.wait_for(lambda: np.ptp(read_steps(steps) or [0, 999]) < 50, 30, "everybody at the same step")
+    clock.set_ahead(-3.0)
+    stdout, stderr = run.communicate(timeout=120)
     assert run.returncode == 0, stderr
     assert re.search(r"note: the network cannot keep up: it is [23]\.\d s behind the 100 steps/s of real time", stderr)
-    (bag,) = (network.directory / "runs").iterdir()
-    assert_possible(read_bag(bag))
+    assert re.search(r"note: the clock of this machine was set back by 3\.0 s: no step is due", stderr)
+    assert_possible(read_bag(json.loads(stdout)["bag"]))
+
+
+OTHER_LAWS: dict[str, dict[str, Any]] = {
+    "grounded": {"problem": "tracking", "leaders": {"agents": [1, 4], "gain": "inf", "reference": 2.0}},
+    "discrete, correlated": {
+        "time": "discrete",
+        "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
+        "noise": {"process": [[1.0 if i == j else 0.3 / (1 + i + 2 * j) for j in range(5)] for i in range(5)]},
+        "run": {"dt": 1, "duration": 200, "speed": 100},
+    },
+}
 
 
 def test_two_runs_at_the_same_time(network: Any) -> None:
-    """They neither hear nor overwrite each other."""
-    file, out = network.file(run={**REALTIME, "processes": 1}), network.directory / "runs"
-    runs = [network.record(file, "--seed", seed) for seed in ("1", "2")]
-    errors = [run.communicate(timeout=100)[1] for run in runs]
-    assert [run.returncode for run in runs] == [0, 0]
+    """Of other laws, each in one process, into one directory: they neither hear nor overwrite each other."""
+    out, runs = network.directory / "runs", {}
+    for seed, (law, changes) in enumerate(OTHER_LAWS.items(), start=1):
+        run = {**UNDISTURBED, "processes": 1, "seed": seed, **changes.get("run", {})}
+        runs[law] = network.record(network.file(f"{law}.yaml", **{**changes, "run": run}))
+    errors = [run.communicate(timeout=100)[1] for run in runs.values()]
+    assert [run.returncode for run in runs.values()] == [0, 0]
     assert not any("Traceback" in text or "failed" in text for text in errors), errors
-    bags = sorted(Path(directory) for directory in out.iterdir())
-    trajectories = [read_bag(bag) for bag in bags]
+    trajectories = [read_bag(directory) for directory in sorted(out.iterdir())]
     assert {trajectory.record.experiment.run.seed for trajectory in trajectories} == {1, 2}
     for trajectory in trajectories:
         assert_possible(trajectory)
-
-
-def test_the_clock_is_set_back(network: Any) -> None:
-    """By three seconds, for all processes of the run: it says so, waits, and its log is possible."""
-    clock = SetClock(network.directory)
-    run = network.record(network.file(run=REALTIME | {"duration": 15, "processes": 2}), "--json", **clock.environment)
-    network.wait_until_moving()
-    clock.set_ahead(-3.0)
-    stdout, stderr = run.communicate(timeout=60)
-    assert run.returncode == 0, stderr
-    assert re.search(r"note: the clock of this machine was set back by 3\.0 s: no step is due", stderr)
-    assert_possible(read_bag(json.loads(stdout)["bag"]))
