@@ -8,9 +8,7 @@ import subprocess
 import sys
 import zlib
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from functools import partial
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -76,67 +74,54 @@ def once(states: list[list[int]]) -> list[list[int]]:
     return [list(state) for state in dict.fromkeys(map(tuple, states))]
 
 
-@pytest.mark.parametrize("pause", [0.0, 0.001], ids=["fast", "slow"])
-def test_a_reader_that_was_there_first_gets_everything(network: Any, pause: float) -> None:
-    """A slow one holds the run back, and nothing is lost."""
+def test_readers_that_were_there_first_get_everything(network: Any) -> None:
+    """One that is fast, and a slow one, which holds the run back: nothing is lost."""
     what = network.experiment()
-    with free_domain() as domain, cyclone(domain, "--pause", str(pause)) as reader:
-        result = network.run(what, domain=domain, readers=["cyclone_reader"])
-        found = came(reader)
+    pauses = {"fast": "0", "slow": "0.001"}
+    with free_domain() as domain, ExitStack() as stack:
+        readers = {
+            name: stack.enter_context(cyclone(domain, "--name", name, "--pause", pause))
+            for name, pause in pauses.items()
+        }
+        result = network.run(what, domain=domain, readers=list(readers))
+        came_to = {name: came(reader) for name, reader in readers.items()}
     assert result.failures == []
     assert result.strangers == []
     equal_to_the_twin(result.trajectory)
     asked = any("no step for" in log.read_text() for log in (result.bag / "log").iterdir())
-    for agent in range(5):
-        states = found[f"agent_{agent + 1}/state"]
-        assert (once(states) if asked else states) == states_of(result.trajectory, agent)
-    (record,) = found["experiment"]
-    assert json.loads(record)["run"] == str(result.trajectory.record.run)
-    assert [sequence for sequence, _, _ in found["graph"]] == list(range(len(found["graph"])))
-    assert found["graph"][-1][2] == what.steps - 1
-    assert {agent for agent, _ in found["progress"]} >= {1, 2, 3, 4, 5}
-    assert found["end"] == [[0, what.steps]]
+    for found in came_to.values():
+        for agent in range(5):
+            states = found[f"agent_{agent + 1}/state"]
+            assert (once(states) if asked else states) == states_of(result.trajectory, agent)
+        (record,) = found["experiment"]
+        assert json.loads(record)["run"] == str(result.trajectory.record.run)
+        assert [sequence for sequence, _, _ in found["graph"]] == list(range(len(found["graph"])))
+        assert found["graph"][-1][2] == what.steps - 1
+        assert {agent for agent, _ in found["progress"]} >= {1, 2, 3, 4, 5}
+        assert found["end"] == [[0, what.steps]]
 
 
-def test_a_late_reader_gets_what_is_latched(network: Any) -> None:
-    """Every sojourn from the first one on, in the middle of a run, which another reader holds back for so long."""
+def test_a_reader_comes_late_and_another_one_is_killed(network: Any) -> None:
+    """The late one gets every sojourn from the first one on, in the middle of a run, which the first reader holds back.
+
+    Then that one is killed: the writers keep what it has not read until its lease ends, and the run goes on.
+    """
     begun, found = network.directory / "begun", network.directory / "found"
-    what = network.experiment(run={"duration": 50})
-    with (
-        free_domain() as domain,
-        cyclone(domain, "--seen", begun, "--until", found),
-        ThreadPoolExecutor() as threads,
-    ):
-        late = threads.submit(partial(_read_late, network, domain, begun, found))
-        result = network.run(what, domain=domain, readers=["cyclone_reader"])
-        came_late = late.result()
-    assert result.failures == []
-    equal_to_the_twin(result.trajectory)
-    (record,) = came_late["experiment"]
-    assert json.loads(record)["run"] == str(result.trajectory.record.run)
-    graphs = came_late["graph"]
-    assert [first for _, first, _ in graphs] == [0, *(last + 1 for _, _, last in graphs[:-1])]
-    assert (graphs[-1][2], came_late["end"]) == (what.steps - 1, [[0, what.steps]])
-
-
-def _read_late(network: Any, domain: int, begun: Path, found: Path) -> dict[str, list[Any]]:
-    network.wait_for(begun.exists, 60, "states at the first reader")
-    with cyclone(domain, "--latched", "--name", "late", "--seen", found) as reader:
-        return came(reader)
-
-
-def test_a_reader_is_killed(network: Any) -> None:
-    """The writers keep what it has not read until its lease ends; then the run goes on."""
-    seen = network.directory / "seen"
     file = network.file(run={"duration": 300, "processes": 2})
-    with free_domain() as domain, cyclone(domain, "--seen", seen, uri=SHORT_LEASE) as reader:
-        run = network.start(
-            *("run", file, "--out", network.directory / "runs", "--no-analyse", "--json"),
-            *("--await", "cyclone_reader", "--domain", str(domain)),
-        )
-        network.wait_for(seen.exists, 60, "states at the reader")
-        reader.kill()
-        network.completed(run)
+    with free_domain() as domain, cyclone(domain, "--seen", begun, "--until", found, uri=SHORT_LEASE) as first:
+        run = network.record(file, "--json", "--await", "cyclone_reader", "--domain", str(domain))
+        network.wait_for(begun.exists, 60, "states at the first reader")
+        with cyclone(domain, "--latched", "--name", "late", "--seen", found) as late:
+            network.wait_for(found.exists, 60, "the run record at the late reader")
+            first.kill()
+            result = network.completed(run)
+            came_late = came(late)
+    trajectory = read_bag(result["bag"])
+    (record,) = came_late["experiment"]
+    assert json.loads(record)["run"] == str(trajectory.record.run)
+    graphs, steps = came_late["graph"], trajectory.record.experiment.steps
+    assert [first for _, first, _ in graphs] == [0, *(last + 1 for _, _, last in graphs[:-1])]
+    assert (graphs[-1][2], came_late["end"]) == (steps - 1, [[0, steps]])
 
 
 def test_a_stranger_is_refused(network: Any) -> None:
@@ -153,7 +138,8 @@ def test_a_stranger_is_refused(network: Any) -> None:
 @pytest.mark.parametrize("noise", [{}, {"link": 0.2, "delay": 1, "loss": 0.4, "on_loss": "hold"}], ids=["plain", "air"])
 def test_an_agent(network: Any, noise: dict[str, Any]) -> None:
     """The example of the documentation takes part in a run in lockstep, whose bag is equal to the twin."""
-    record = new_record(network.experiment(noise={"process": 1.0} | noise))
+    graphs = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
+    record = new_record(network.experiment(graphs=graphs, noise={"process": 1.0} | noise))
     directory: Path = network.directory
     file, bag = directory / "run.json", directory / "bag"
     file.write_text(record.to_json(with_key=True))
@@ -163,9 +149,9 @@ def test_an_agent(network: Any, noise: dict[str, Any]) -> None:
             NodeServer(environment, directory / "fork_server.log") as server,
             Supervisor(directory, environment, fork_server=server) as nodes,
         ):
-            nodes.start([plan for plan in plan_network(record.experiment, file, bag) if plan.name != "agent_5"])
+            nodes.start([plan for plan in plan_network(record.experiment, file, bag) if plan.name != "agent_3"])
             foreign = subprocess.run(
-                [sys.executable, str(AGENT), str(file), "5"],
+                [sys.executable, str(AGENT), str(file), "3"],
                 env=os.environ | {"ROS_DOMAIN_ID": str(domain), "CYCLONEDDS_URI": UNICAST},
                 timeout=100,
                 check=False,
