@@ -9,12 +9,13 @@ import pytest
 from processors import another_processor
 
 from msg_analysis.bags.reader import read_bag
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
 LEADERS = {"agents": [1, 4], "reference": 2.0}
 CASES: dict[str, dict[str, Any]] = {
-    "consensus": {},
     "tracking": {
         "problem": "tracking",
         "leaders": {**LEADERS, "gain": 0.7},
@@ -40,35 +41,42 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 LAYOUTS: dict[str, list[Any]] = {
-    "consensus": [1, 2, "one_per_agent"],
     "tracking": [2],
     "noise by graph": ["one_per_agent"],
     "grounded": [1],
     "discrete": [2],  # with one process per agent: on another processor, below
     "disconnected": ["one_per_agent"],
 }
-"""Every law, and every number of processes: what one agent computes does not depend on the other."""
+"""Every law, and every number of processes: what one agent computes does not depend on the other.
+
+Consensus with equal noise: below, with one and two processes, and in test_introductions with one per agent.
+"""
 
 
 @pytest.mark.parametrize(("case", "processes"), [(case, count) for case in CASES for count in LAYOUTS[case]])
 def test_equals_the_twin(network: Any, case: str, processes: Any) -> None:
-    """300 steps: more than the window of the lockstep and more than one block of noise."""
     changes = CASES[case]
     what = network.experiment(**{**changes, "run": {**changes.get("run", {}), "processes": processes}})
     result = network.run(what)
     assert result.failures == []
-    assert result.trajectory is not None
-    assert result.trajectory.completeness.complete
-    assert result.trajectory.completeness.duplicates == 0
-    assert result.trajectory.completeness.out_of_order == 0
-    outcome = check(result.trajectory)
+    equals_the_twin(what, result.trajectory)
+
+
+def equals_the_twin(what: ValidExperiment, trajectory: Trajectory | None) -> None:
+    """300 steps: more than the window of the lockstep and more than one block of noise."""
+    assert trajectory is not None
+    assert trajectory.completeness.complete
+    assert trajectory.completeness.duplicates == 0
+    assert trajectory.completeness.out_of_order == 0
+    assert trajectory.completeness.refused == {}
+    outcome = check(trajectory)
     assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, 5 * 301)
 
     again = simulate(what)  # from the experiment alone: nothing of the bag is used
-    assert np.array_equal(again.states, result.trajectory.states)
-    assert np.array_equal(again.modes, result.trajectory.modes)
-    assert result.trajectory.agent_modes is not None
-    assert np.array_equal(result.trajectory.agent_modes[1:], np.repeat(again.modes[:, None], 5, axis=1))
+    assert np.array_equal(again.states, trajectory.states)
+    assert np.array_equal(again.modes, trajectory.modes)
+    assert trajectory.agent_modes is not None
+    assert np.array_equal(trajectory.agent_modes[1:], np.repeat(again.modes[:, None], 5, axis=1))
 
 
 @pytest.mark.parametrize("processes", [1, 2])
@@ -97,8 +105,7 @@ def test_a_network_on_another_processor(network: Any) -> None:
     """What it records is what the twin of this processor gives, from the experiment alone."""
     file = network.file(**CASES["discrete"])
     result = network.completed(network.record(file, "--json", **another_processor()))
-    states = read_bag(result["bag"]).states
-    assert np.array_equal(simulate(network.experiment(**CASES["discrete"])).states, states)
+    equals_the_twin(network.experiment(**CASES["discrete"]), read_bag(result["bag"]))
 
 
 @pytest.mark.parametrize("fork", [True, False])
@@ -106,12 +113,10 @@ def test_progress_the_other_executor_and_what_is_imported(network: Any, fork: bo
     """The executor that a ROS 2 without the events executor falls back to; every process names what it imports."""
     seen: list[int] = []
     environment = {"MSG_AGENTS_EXECUTOR": "single", "PYTHONPROFILEIMPORTTIME": "1"}
-    what = network.experiment(run={"processes": 2})
+    what = network.experiment(run={"processes": 2 if fork else 1})
     result = network.run(what, environment=environment, on_progress=seen.append, fork=fork)
     assert result.failures == []
-    assert result.trajectory is not None
-    assert check(result.trajectory).difference is None
-    assert result.trajectory.completeness.complete
+    equals_the_twin(what, result.trajectory)
 
     assert seen == sorted(seen)
     assert seen[-1] == 300
@@ -125,9 +130,9 @@ def test_progress_the_other_executor_and_what_is_imported(network: Any, fork: bo
     }
     if fork:
         assert {"rclpy", "numpy", "msg_agents", "msg_analysis"} <= modules.pop("fork_server")
-    nodes = {"agents_1_to_2", "agents_3_to_5", "recorder", "switcher"}
-    assert set(modules) == nodes
-    for name in nodes:
+    agents = {"agents_1_to_2", "agents_3_to_5"} if fork else {"agents_1_to_5"}
+    assert modules.keys() == agents | {"recorder", "switcher"}
+    for name in modules:
         if fork:
             assert "rclpy" not in modules[name], name
             assert len(modules[name]) < 10, modules[name]
@@ -149,9 +154,7 @@ def test_two_runs_at_the_same_time(network: Any) -> None:
         assert run.returncode == 0, stdout + stderr
     bags = sorted(directory for directory in out.iterdir() if directory.is_dir())
     assert len(bags) == 2
-    trajectories = [read_bag(bag) for bag in bags]
-    assert {trajectory.record.experiment.run.seed for trajectory in trajectories} == {1, 2}
-    for trajectory in trajectories:
-        assert trajectory.completeness.complete
-        assert trajectory.completeness.refused == {}
-        assert check(trajectory).difference is None
+    trajectories = {trajectory.record.experiment.run.seed: trajectory for trajectory in map(read_bag, bags)}
+    assert trajectories.keys() == {1, 2}
+    for seed, trajectory in trajectories.items():
+        equals_the_twin(network.experiment(run={"processes": 1, "seed": seed}), trajectory)
