@@ -23,14 +23,14 @@ LEADERS = {"problem": "tracking", "leaders": {"agents": [1, 4], "gain": 0.7, "re
 
 @pytest.mark.parametrize("noise", [*PAIRS, ALL], ids=json.dumps)
 def test_equals_the_twin_and_the_prediction(network: Any, noise: dict[str, float]) -> None:
-    """800 steps: the bits of the twin, and |z| < 4 for the system and 5 agents: 4e-4 false alarms a case."""
-    what = network.experiment(noise=noise, run={"duration": 40, "replicas": 8, "processes": 2})
+    """400 steps: the bits of the twin, and |z| < 4 for the system and 5 agents: 4e-4 false alarms a case."""
+    what = network.experiment(noise=noise, run={"duration": 20, "replicas": 16, "processes": 2})
     result = network.run(what)
     assert result.failures == []
     trajectory, twin = result.trajectory, simulate(what)
     assert trajectory is not None
     assert trajectory.completeness == twin.completeness
-    assert trajectory.completeness.expected == 5 * 801 * (2 if noise["broadcast"] else 1)
+    assert trajectory.completeness.expected == 5 * 401 * (2 if noise["broadcast"] else 1)
     outcome = check(trajectory)
     assert (outcome.difference, outcome.missing) == (None, 0)
     assert np.array_equal(trajectory.states, twin.states)

@@ -50,7 +50,8 @@ def small_disk(tmp_path: Path, rng: random.Random) -> Iterator[Path]:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_full_disk(network: Any, small_disk: Path, repetition: int) -> None:
     """The run ends, says why, and what was written can be read."""
-    file = network.file(run={"duration": 10_000, "processes": 2})
+    # 20,000 steps, of states that fill it in some 2,000.
+    file = network.file(run={"duration": 1000, "replicas": 8, "processes": 2})
     run = network.start("run", file, "--out", small_disk)
     _, stderr = run.communicate(timeout=120)
     assert run.returncode == 3, stderr

@@ -20,7 +20,7 @@ from msg_analysis.twin.check import check
 
 NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 # 20,000 steps: no test waits for them; of states that are soon seen in the bag
-LONG = {"duration": 1000, "replicas": 64, "processes": 2}
+LONG = {"duration": 1000, "replicas": 16, "processes": 2}
 
 
 def test_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:

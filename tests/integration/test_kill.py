@@ -16,7 +16,7 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 
 # 20,000 steps: no test waits for them; of states that are soon seen in the bag
-LONG = {"duration": 1000, "replicas": 64, "processes": 2}
+LONG = {"duration": 1000, "replicas": 16, "processes": 2}
 
 
 @pytest.mark.parametrize("kind", ["agent", "switcher"])
