@@ -238,6 +238,7 @@ class Periods:
         # Values by agent and step from the newest one at the beginning; noise by source and step from the end.
         known = [(j, 0) for j in range(m)]
         known += [(entry, offset - 1 if entry in sources else offset) for entry, offset in before.tolist()]
+        live = _Live(known, m)
         made = [0] * m
         rows: list[tuple[_Key, dict[_Key, float], float]] = []
         published = 2 * m if step.broadcast else 0
@@ -267,38 +268,77 @@ class Periods:
         stacked += [(e, offset if e in sources else made[owners[e]] + offset) for e, offset in after.tolist()]
         wanted = set(stacked).union(*(terms for _, terms, _ in rows))
         rows = [row for row in rows if row[0] in wanted]
-        place = {key: number for number, key in enumerate([*known, *(key for key, _, _ in rows)])}
-        # Sources that nobody has felt before have no terms, and variance 1.
-        for key in sorted(wanted - place.keys()):
-            assert key[0] in sources
-            place[key] = len(place)
-            rows.append((key, {}, 1.0))
-        return _composed(place, len(known), rows, [place[key] for key in stacked])
+        last_use = {key: number for number, (_, terms, _) in enumerate(rows) for key in terms}
+        last_use |= dict.fromkeys(stacked, len(rows))
+        for number, (key, terms, variance) in enumerate(rows):
+            live.add(key, terms, variance)
+            live.drop([used for used in (*terms, key) if last_use.get(used, -1) <= number])
+        return live.take(stacked)
 
 
 _Key = tuple[int, int]
 
 
-def _composed(
-    place: dict[_Key, int], entries: int, rows: list[tuple[_Key, dict[_Key, float], float]], stacked: list[int]
-) -> Period:
-    """The period with the values at the places ``stacked``, of the stack (S ``entries``) and the rows made since.
+class _Live:
+    """Values as combinations of the stack at the beginning of a period, and the covariance of the noise added since.
 
-    A row is a combination of others plus noise of its own: the values of the rows are X = B z + T X + w with the stack
-    z and independent noise w, so that X = (I - T)^-1 (B z + w).
+    Keys are (entry, step), see ``Periods``; noise sources are numbers of variance 1, new where not known yet.
     """
-    terms = np.zeros((len(rows), len(place)))
-    for row, (_, of_row, _) in zip(terms, rows, strict=True):
-        for key, weight in of_row.items():
-            row[place[key]] = weight
-    solved = np.linalg.inv(np.eye(len(rows)) - terms[:, entries:])
-    every = np.zeros((len(place), len(place)))  # of the stack and of the noise of every row
-    every[:entries, :entries] = np.eye(entries)
-    every[entries:, :entries] = solved @ terms[:, :entries]
-    every[entries:, entries:] = solved
-    found = every[stacked]
-    noise = found[:, entries:]
-    return Period(found[:, :entries].copy(), (noise * [variance for _, _, variance in rows]) @ noise.T)
+
+    def __init__(self, stack: list[_Key], agents: int) -> None:
+        self._agents, self._entries = agents, len(stack)
+        entries = self._entries
+        # Of every value its combination of the stack, and after it the covariance of its noise with that of the others.
+        self._rows = np.eye(2 * entries, 3 * entries)
+        self._rows[entries:] = 0.0
+        self._noise = self._rows[:, entries:]
+        self._place = {key: place for place, key in enumerate(stack)}
+        self._free = list(range(entries, 2 * entries))[::-1]
+
+    def add(self, key: _Key, terms: dict[_Key, float], variance: float) -> None:
+        """Add a combination of others, plus noise of its own."""
+        rows = [self._find(used) for used in terms]
+        if len(rows) == 1:  # what is sent or received, as often as not
+            (row,), (weight,) = rows, terms.values()
+            found = weight * self._rows[row]
+            own = weight * found[self._entries + row]
+        else:
+            weights = np.array(list(terms.values()))
+            found = weights @ self._rows[rows]
+            own = found[self._entries :][rows] @ weights
+        place = self._new(key)  # may make the arrays larger
+        noise = found[self._entries :]
+        self._rows[place, : len(found)] = found
+        self._noise[: len(noise), place] = noise
+        self._noise[place, place] = own + variance
+
+    def drop(self, keys: list[_Key]) -> None:
+        """Drop values that are no longer used."""
+        for key in keys:
+            if key in self._place:
+                self._free.append(self._place.pop(key))
+
+    def take(self, keys: list[_Key]) -> Period:
+        """The period that ends with this stack."""
+        rows = [self._find(key) for key in keys]
+        found = self._rows[rows]
+        return Period(found[:, : self._entries].copy(), found[:, self._entries :][:, rows].copy())
+
+    def _find(self, key: _Key) -> int:
+        if key not in self._place and self._agents <= key[0] < 2 * self._agents:
+            place = self._new(key)
+            self._rows[place] = self._noise[:, place] = 0.0
+            self._noise[place, place] = 1.0
+        return self._place[key]
+
+    def _new(self, key: _Key) -> int:
+        if not self._free:
+            size = len(self._rows)
+            self._rows = np.pad(self._rows, ((0, size), (0, size)))
+            self._noise = self._rows[:, self._entries :]
+            self._free = list(range(2 * size))[: size - 1 : -1]
+        self._place[key] = self._free.pop()
+        return self._place[key]
 
 
 def _shared_sources(step: StepModel) -> BoolArray:
