@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+from started_processes import started_processes
 
 from msg_agents.processes.environment import node_environment
 
@@ -14,12 +17,27 @@ Endpoints = Mapping[str, Sequence[Sequence[str]]]
 
 def assert_endpoints(readers: Endpoints, writers: Endpoints, domain: int) -> None:
     """Within 20 s, these topics have exactly these readers and writers: node and reliability of each, sorted."""
+    with watched_endpoints(readers, writers, domain):
+        pass
+
+
+@contextmanager
+def watched_endpoints(readers: Endpoints, writers: Endpoints, domain: int) -> Iterator[None]:
+    """The same of a network that is started meanwhile: the visitor is there before it, so the run may be short."""
     wanted = json.dumps([readers, writers])
     command = [sys.executable, "-P", "-c", VISITOR, wanted]
-    visitor = subprocess.run(
-        command, env=node_environment(domain), capture_output=True, text=True, timeout=60, check=False
-    )
-    assert json.loads(visitor.stdout) == json.loads(wanted), visitor.stderr
+    with started_processes() as started:
+        started.append(
+            visitor := subprocess.Popen(
+                command, env=node_environment(domain), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
+        )
+        assert visitor.stdout is not None
+        assert visitor.stderr is not None
+        assert visitor.stdout.readline() == "ready\n"
+        yield
+        found = json.loads(visitor.stdout.readline())
+        assert found == json.loads(wanted), (found, visitor.stderr.read())
 
 
 def assert_delivery(heard: str, hearers: Sequence[int], domain: int) -> None:
@@ -34,9 +52,11 @@ def assert_delivery(heard: str, hearers: Sequence[int], domain: int) -> None:
 
 VISITOR = """
 import json, sys, time, rclpy
-wanted, found, end = json.loads(sys.argv[1]), [], time.monotonic() + 20
+wanted, found = json.loads(sys.argv[1]), []
 rclpy.init()
 node = rclpy.create_node("visitor")
+print("ready", flush=True)
+end = time.monotonic() + 20
 looks = node.get_subscriptions_info_by_topic, node.get_publishers_info_by_topic
 while found != wanted and time.monotonic() < end:
     time.sleep(0.1)
