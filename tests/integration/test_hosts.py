@@ -156,14 +156,6 @@ def whole(lan: Lan, texts: dict[str, tuple[str, str]], processes: dict[str, set[
     assert logs == {"base": {"recorder", "switcher"}, **processes}
 
 
-def test_three_hosts(lan: Lan) -> None:
-    """The demo network across them equals the twin to the last bit, and agrees with the prediction."""
-    prepare(lan, 50)
-    texts = ended(lan.start_all(), 0)
-    whole(lan, texts)
-    assert json.loads(texts["base"][0])["verdict"] == "agrees"
-
-
 def test_hosts_of_unlike_processors(lan: Lan) -> None:
     """In discrete time, where W is an exponential, and with a start that is drawn."""
     switching = {"transition": [[0.9, 0.1], [0.4, 0.6]]}
@@ -172,10 +164,13 @@ def test_hosts_of_unlike_processors(lan: Lan) -> None:
 
 
 def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: random.Random) -> None:
-    """Its cable is pulled, or its interface goes down: everybody waits, then all goes on, and nothing is lost."""
+    """Its cable is pulled, or its interface goes down: everybody waits, then all goes on, and nothing is lost.
+
+    The demo network across three hosts equals the twin to the last bit, and agrees with the prediction.
+    """
     prepare(lan, 200)
     host, cable = rng.choice(NAMES), rng.random() < 0.5
-    hosts = lan.start_all("--no-analyse")
+    hosts = lan.start_all("--write-report", "never")
     lan.network.wait_until_moving("base")
     time.sleep(rng.uniform(0, 0.5))
     assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
@@ -183,7 +178,9 @@ def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: rand
     time.sleep(5)
     assert all(process.poll() is None for process in hosts.values()), (host, cable)
     lan.plug(host, "up", cable=cable)
-    whole(lan, ended(hosts, 0))
+    texts = ended(hosts, 0)
+    whole(lan, texts)
+    assert json.loads(texts["base"][0])["verdict"] == "agrees"
 
 
 @pytest.mark.timeout(300)
@@ -206,41 +203,41 @@ def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("pace", ["lockstep", "realtime"])
 def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, pace: str) -> None:
-    """A lease of 5 s instead of a minute; it is cut off for 12 s, so that both sides have given each other up."""
+    """A lease of 3 s instead of a minute; it is cut off for 7 s, so that both sides have given each other up.
+
+    In real time: the clocks of these hosts are one clock, so 0 is in every interval, and nobody is warned.
+    """
     run = {} if pace == "lockstep" else {"dt": 0.1, "replicas": 32}  # fewer and larger messages: soon seen in the bag
-    prepare(lan, 250 if pace == "lockstep" else 30, run={"pace": pace, **run})
+    prepare(lan, 200 if pace == "lockstep" else 18, run={"pace": pace, **run})
     command = [str(PROGRAM), "host", str(lan.run_file), str(lan.hosts_file), "--profile"]
     profile = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    short, count = re.subn(r"(<leaseDuration>\s*<sec>)60", r"\g<1>5", profile)
-    assert count == 1
+    for key, before, after in (("leaseDuration", 60, 3), ("leaseAnnouncement", 3, 1)):
+        profile, count = re.subn(rf"(<{key}>\s*<sec>){before}<", rf"\g<1>{after}<", profile)
+        assert count == 1
     file = lan.network.directory / "short.xml"
-    file.write_text(short)
+    file.write_text(profile)
     setting = dict.fromkeys(PROFILE_VARIABLES, str(file)) | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
     hosts = lan.start_all("--no-analyse", "--patience", "60", **dict.fromkeys(NAMES, setting))
     lan.network.wait_until_moving("base")
     assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
     lan.plug("left", "down", cable=True)
-    time.sleep(12)
+    time.sleep(7)
     lan.plug("left", "up", cable=True)
-    whole(lan, ended(hosts, 0, timeout=120))
-
-
-def test_clocks_of_one_machine_agree(lan: Lan) -> None:
-    """The clocks of these hosts are one clock: 0 is in every interval, and nobody is warned."""
-    prepare(lan, 5, run={"pace": "realtime"})
-    texts = ended(lan.start_all("--no-analyse"), 0)
-    clocks = json.loads(texts["base"][0])["clocks"]
-    assert [entry["node"] for entry in clocks] == [f"agent_{i}" for i in range(1, 6)]
-    assert all(low <= 0 <= high for low, high in (entry["ahead_ms"] for entry in clocks))
-    assert not any("are not that of the switcher" in stderr for _, stderr in texts.values())
-    assert json.loads(texts["left"][0])["clocks"] is None
+    texts = ended(hosts, 0, timeout=120)
+    whole(lan, texts)
+    clocks = {name: json.loads(stdout)["clocks"] for name, (stdout, _) in texts.items()}
+    if pace == "realtime":
+        assert [entry["node"] for entry in clocks["base"]] == [f"agent_{i}" for i in range(1, 6)]
+        assert all(low <= 0 <= high for low, high in (entry["ahead_ms"] for entry in clocks["base"]))
+        assert not any("are not that of the switcher" in stderr for _, stderr in texts.values())
+        assert clocks["left"] is None
 
 
 def test_a_clock_that_is_ahead_is_found(lan: Lan) -> None:
     """That of the left host is 200 ms ahead of the others, by a library; dt / speed is 50 ms."""
     clock = SetClock(lan.network.directory)
     clock.set_ahead(0.2)
-    prepare(lan, 5, run={"pace": "realtime", "processes": 1})
+    prepare(lan, 3, run={"pace": "realtime", "processes": 1})
     texts = ended(lan.start_all("--no-analyse", left=clock.environment), 0)
     for entry in json.loads(texts["base"][0])["clocks"]:
         low, high = entry["ahead_ms"]
