@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -14,13 +13,15 @@ from typing import Any
 import pytest
 import yaml
 from scipy import stats
+from user_namespace import give_up_rights
 
 from msg_agents.channel.namespaces import open_hosts
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.errors import NotAvailableError
 
+THREE = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
 # 20,000 steps: no test waits for them; of states that are soon seen in the bag
-ENDLESS = {"duration": 1000, "replicas": 64}
+ENDLESS = {"graphs": THREE, "run": {"duration": 1000, "replicas": 64}}
 LEVEL = 1e-6  # false-alarm rate of the test of a loss; the losses have a fixed seed, the numbers of packets do not
 MARK_OF_TESTS = b"MSG_AGENTS_TEST="
 PROGRAM = Path(sys.executable).with_name("msg-agents")
@@ -41,8 +42,8 @@ def channel_file(network: Any, **document: Any) -> Path:
     return path
 
 
-def start(network: Any, run: dict[str, Any], *options: str, **channel: Any) -> subprocess.Popen[str]:
-    file = network.file(run=run)
+def start(network: Any, changes: dict[str, Any], *options: str, **channel: Any) -> subprocess.Popen[str]:
+    file = network.file(**changes)
     arguments = ("--out", network.directory / "runs", "--json", *options, "--channel", channel_file(network, **channel))
     return network.start("run", file, *arguments)
 
@@ -84,11 +85,11 @@ def holders(inodes: set[int], mark: str) -> list[str]:
 
 @pytest.fixture
 def hosts(network: Any) -> Iterator[set[int]]:
-    """Namespaces that a test notes; at its end, nothing holds them, so the kernel has removed them."""
+    """Namespaces of a channel of three agents, noted by a test; at its end, nothing holds them: they are removed."""
     noted: set[int] = set()
     yield noted
     network.wait_for(lambda: not network.processes(), 30, "the end of all processes")
-    assert len(noted) == 6
+    assert len(noted) == 4
     assert holders(noted, network.mark) == []
 
 
@@ -101,9 +102,13 @@ def totals(result: dict[str, Any], what: str) -> int:
     return sum(pair[what] for pair in result["channel"]["pairs"])
 
 
+def pairs_of(result: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
+    return {(pair["sender"], pair["receiver"]): pair for pair in result["channel"]["pairs"]}
+
+
 def test_lockstep_over_a_bad_channel_equals_the_twin(network: Any) -> None:
     """Losses are repaired, so that only the time differs; they are as frequent as the file says."""
-    run = start(network, {"duration": 1}, seed=3, default={"loss": 0.1, "delay_ms": 1, "jitter_ms": 0.5})
+    run = start(network, {"run": {"duration": 1}}, seed=3, default={"loss": 0.1, "delay_ms": 1, "jitter_ms": 0.5})
     result = network.completed(run)
     assert result["verdict"] is not None
     channel = result["channel"]
@@ -122,7 +127,7 @@ def test_real_time_over_a_bad_channel(network: Any) -> None:
     """Old values are used where new ones are lost; nothing is missing in the log."""
     run = start(
         network,
-        {"duration": 3, "pace": "realtime"},
+        {"run": {"duration": 3, "pace": "realtime", "processes": 1}},
         "--write-report",
         "never",
         hosts={"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}},
@@ -132,43 +137,38 @@ def test_real_time_over_a_bad_channel(network: Any) -> None:
     result = network.completed(run)
     used = read_bag(result["bag"]).used
     assert used is not None
-    pairs = {(pair["sender"], pair["receiver"]): pair for pair in result["channel"]["pairs"]}
+    pairs = pairs_of(result)
     assert pairs["left", "right"]["lost"] > 0
     assert any(line.startswith("Of the messages between agents, ") for line in result["channel"]["findings"])
     assert pairs["base", "right"]["lost"] == pairs["left", "base"]["lost"] == 0
 
 
-@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
-def test_only_active_links_carry_packets(network: Any, pace: str) -> None:
-    """Lockstep goes on all the same: the graph is that of the slowest agent, whose values then reach it."""
-    run = start(network, {"duration": 3, "pace": pace}, "--no-analyse", graph=True)
-    result = network.completed(run)
-    pairs = {(pair["sender"], pair["receiver"]): pair for pair in result["channel"]["pairs"]}
+def assert_active_links_only(result: dict[str, Any]) -> None:
+    pairs = pairs_of(result)
     assert pairs["agent_1", "agent_3"]["cut"] > 0  # by no link in any graph: multicast only
     assert pairs["agent_1", "agent_2"]["cut"] == 0  # in both graphs
     assert all(pairs["base", f"agent_{i}"]["cut"] == pairs[f"agent_{i}", "base"]["cut"] == 0 for i in range(1, 6))
 
 
-def test_a_limited_rate(network: Any) -> None:
-    hosts = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}
-    limit = {"rate_mbit": 2, "queue": 1000}
-    run = start(network, {"duration": 3, "processes": 1}, "--no-analyse", "--no-fork", hosts=hosts, default=limit)
-    result = network.completed(run)
-    assert totals(result, "queued") > 0
-    assert result["channel"]["findings"] == []
-
-
-def test_a_rate_that_is_too_low_is_named(network: Any) -> None:
+def test_real_time_where_only_active_links_carry_packets(network: Any) -> None:
+    """The rate of one of them is too low, which is named."""
     slow = {"sender": "agent_1", "receiver": "agent_2", "rate_mbit": 0.2, "queue": 0}
-    run = start(network, {"duration": 3, "pace": "realtime"}, "--no-analyse", pairs=[slow])
-    result = network.completed(run)
-    assert totals(result, "dropped") > 0
+    changes = {"run": {"duration": 3, "pace": "realtime"}}
+    result = network.completed(start(network, changes, "--no-analyse", graph=True, pairs=[slow]))
+    assert_active_links_only(result)
+    assert totals(result, "dropped") == pairs_of(result)["agent_1", "agent_2"]["dropped"] > 0
     (line,) = result["channel"]["findings"]
     assert "of the packets from agent_1 to agent_2 were dropped by the full queue" in line
 
 
+def test_lockstep_where_only_active_links_carry_packets(network: Any) -> None:
+    """It goes on all the same: the graph is that of the slowest agent, whose values then reach it."""
+    assert_active_links_only(network.completed(start(network, {"run": {"duration": 3}}, "--no-analyse", graph=True)))
+
+
 def test_a_killed_agent_comes_back_on_its_host(network: Any, hosts: set[int]) -> None:
-    run = start(network, {"duration": 80}, "--no-analyse", default={"delay_ms": 0.5})
+    changes = {"graphs": THREE, "run": {"duration": 50}}
+    run = start(network, changes, "--no-analyse", default={"delay_ms": 2})  # 1000 steps of at least 4 ms
     wait_until_moving(network, hosts)
     victim = next(process for process in network.processes("agent") if process.agent == 3)
     victim.kill()
@@ -213,10 +213,10 @@ def test_a_killed_run_leaves_nothing_behind(network: Any, hosts: set[int], numbe
 
 def test_without_rights_nothing_is_started(network: Any) -> None:
     """In a user namespace that gives none: one line that says what to do."""
-    if shutil.which("unshare") is None:
-        pytest.skip("no command unshare: install it (Debian: apt-get install util-linux)")
     arguments = ["run", network.file(), "--out", network.directory / "runs", "--channel", channel_file(network)]
-    done = subprocess.run(["unshare", "--user", PROGRAM, *arguments], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [str(PROGRAM), *arguments], capture_output=True, text=True, timeout=60, preexec_fn=give_up_rights
+    )
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     (line,) = (line for line in done.stderr.splitlines() if line.startswith("error:"))
@@ -225,20 +225,23 @@ def test_without_rights_nothing_is_started(network: Any) -> None:
     assert not list((network.directory / "runs").glob("*"))
 
 
-def test_a_user_without_rights_can_use_namespaces_of_his_own(network: Any) -> None:
-    """The command that the error names, with one namespace more, in which the user is not root."""
-    command = ["unshare", "--user", "--map-root-user", "--net"]
-    if subprocess.run([*command, "true"], capture_output=True).returncode:
-        pytest.skip("this machine does not let users make namespaces")
-    arguments = ["run", network.file(run={"duration": 2}), "--out", network.directory / "runs", "--json"]
-    done = subprocess.run(
-        [*command, PROGRAM, *arguments, "--no-analyse", "--channel", channel_file(network)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    assert totals(json.loads(done.stdout), "sent") > 0
+def test_a_limited_rate(network: Any) -> None:
+    """Where users can make namespaces, without rights: by the command that the error names.
+
+    It is run in one namespace more, in which the user is not root.
+    """
+    unshared = ["unshare", "--user", "--map-root-user", "--net"]
+    possible = subprocess.run([*unshared, "true"], capture_output=True).returncode == 0
+    hosts = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}
+    file = channel_file(network, hosts=hosts, default={"rate_mbit": 2, "queue": 1000})
+    experiment = network.file(run={"duration": 3, "processes": 1})
+    options = ("--no-analyse", "--no-fork", "--json", "--out", network.directory / "runs", "--channel", file)
+    command = [*(unshared if possible else []), PROGRAM, "run", experiment, *options]
+    result = network.completed(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+    assert totals(result, "queued") > 0
+    assert result["channel"]["findings"] == []
+    if not possible:
+        pytest.skip("this machine does not let users make namespaces: run with the rights of the tests")
 
 
 def test_bad_channel_files_and_options_that_need_other_programs(network: Any) -> None:
@@ -246,7 +249,7 @@ def test_bad_channel_files_and_options_that_need_other_programs(network: Any) ->
     _, stderr = run.communicate(timeout=60)
     assert run.returncode == 2
     assert "channel.yaml: 2 problems" in stderr
-    run = start(network, {"pace": "realtime"}, "--use-sim-time")
+    run = start(network, {"run": {"pace": "realtime"}}, "--use-sim-time")
     _, stderr = run.communicate(timeout=60)
     assert run.returncode == 2
     assert "--use-sim-time: not with --channel" in stderr
