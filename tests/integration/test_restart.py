@@ -67,9 +67,10 @@ def test_killed_and_back(network: Any, repetition: int, rng: random.Random) -> N
     for number, kinds in enumerate(rng.sample(FAULTS, len(FAULTS))):
         wait_for_all(network)
         early, again = number == 0 and repetition > 0 and rng.random() < 0.3, rng.random() < 0.5
-        if not early:
-            wait_for_more(network, recorded, 50_000)
-        time.sleep(rng.uniform(0.0, 0.3))
+        if early:
+            time.sleep(rng.uniform(0.0, 0.3))
+        else:  # of some 5 MB, however fast they come
+            wait_for_more(network, recorded, rng.randrange(50_000, 400_000))
         for kill, kind in enumerate(kinds):
             if again and kill:
                 time.sleep(rng.uniform(0.0, 0.5))
