@@ -98,13 +98,25 @@ def test_a_worker_is_killed_in_the_middle(network: Any, cluster: tuple[str, list
     check_against_the_twin(network, result["points"][::3])
 
 
-@pytest.mark.timeout(300)  # three waits, on a machine that has much else to do
-def test_networks_interrupted_and_resumed(network: Any) -> None:
-    """Two runs; the false-alarm rate of the verdict is 1 %, with fixed seeds: none."""
+@pytest.mark.timeout(300)  # waits of several sweeps, on a machine that has much else to do
+def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
+    """Sweeps in one directory: ended by SIGTERM, killed, resumed with a network that fails, resumed without.
+
+    The networks are forked. Where what forks them is killed, the next one is not forked: its result is the same. The
+    false-alarm rate of the verdict is 1 %, with fixed seeds: none.
+    """
     out = network.directory / "out"
-    over = {"switching.generator": generators(0.5, 2.0), "run.duration": [15, 300]}
-    path = sweep_file(network, kind="network", over=over, combine="zip")
-    process = start(path, "--workers", "2", "--out", out, "--json")
+
+    def started(*durations: int, workers: tuple[str, ...] = ()) -> subprocess.Popen[str]:
+        rates = {15: 0.5, 300: 2.0, 10_000: 0.5, 20: 1.0}
+        over = {
+            "switching.generator": generators(*(rates[each] for each in durations)),
+            "run.duration": list(durations),
+        }
+        return start(sweep_file(network, kind="network", over=over, combine="zip"), *workers, "--out", out, "--json")
+
+    two = ("--workers", "2")
+    process = started(15, 300, workers=two)
     network.wait_for(lambda: lines(out / "points.jsonl") == 1, 100, "the shorter run")
     process.terminate()  # as a queue of a cluster does; Ctrl-C: tests/analysis/cli/test_sweep.py
     stdout, stderr = process.communicate(timeout=100)
@@ -113,21 +125,16 @@ def test_networks_interrupted_and_resumed(network: Any) -> None:
     assert "Traceback" not in stderr
     assert network.processes() == []
     assert "interrupted: 1 of 2 points are kept" in stderr
-    process = start(path, "--workers", "2", "--out", out, "--json")
-    stdout, stderr = process.communicate(timeout=100)
-    assert process.returncode == 0, stderr
-    result = json.loads(stdout)
-    assert (result["done"], result["kept"], result["verdict"]) == (2, 1, "agrees")
-    assert list((out / "runs").iterdir()) == []  # they agree: their bags are not kept
-    check_against_the_twin(network, result["points"])
 
+    process = started(15, 10_000, workers=two)
+    network.wait_for(lambda: network.processes("recorder"), 60, "a network")
+    process.kill()
+    process.communicate()
+    network.wait_for(lambda: not network.processes(), 60, "the end of all processes")
+    assert lines(out / "points.jsonl") == 1
 
-def test_networks_are_forked(network: Any) -> None:
-    """Where what forks them is killed, the next one is not forked: its result is the same. Fixed seeds: no alarm."""
-    out = network.directory / "out"
-    over = {"switching.generator": generators(0.5), "run.duration": [15, 10_000, 20]}
-    process = start(sweep_file(network, kind="network", over=over), "--out", out, "--json")
-    network.wait_for(lambda: lines(out / "points.jsonl") == 1, 60, "the first network")
+    process = started(15, 300, 10_000, 20)
+    network.wait_for(lambda: lines(out / "points.jsonl") == 2, 100, "the first network")
     network.wait_for(lambda: network.processes("recorder"), 60, "the second one")
     (server,) = network.processes("run_server")
     (run,) = network.processes("run")
@@ -140,25 +147,23 @@ def test_networks_are_forked(network: Any) -> None:
     stdout, stderr = process.communicate(timeout=100)
     assert process.returncode == 3, stderr + stdout
     result = json.loads(stdout)
-    assert [row["status"] for row in result["points"]] == ["done", "failed", "done"]
-    assert result["points"][1]["reason"].startswith("stopped by Ctrl-C")
+    assert result["kept"] == 1
+    assert [row["status"] for row in result["points"]] == ["done", "done", "failed", "done"]
+    assert result["points"][2]["reason"].startswith("stopped by Ctrl-C")
+    check_against_the_twin(network, [row for row in result["points"] if row["status"] == "done"])
     assert not (out / "runs" / "report.html").exists()
-    check_against_the_twin(network, result["points"][::2])
+    (left,) = (out / "runs").iterdir()  # the others agree: their bags are not kept
+
+    process = started(15, 300)
+    stdout, stderr = process.communicate(timeout=100)
+    assert process.returncode == 0, stderr
+    result = json.loads(stdout)
+    assert (result["done"], result["kept"], result["verdict"]) == (2, 2, "agrees")
+    assert list((out / "runs").iterdir()) == [left]
 
 
 def parent(process: Any) -> int:
     return int(Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[1])
-
-
-def test_a_killed_sweep_leaves_no_network(network: Any) -> None:
-    out = network.directory / "out"
-    over = {"switching.generator": generators(0.5), "run.duration": [2000]}
-    process = start(sweep_file(network, kind="network", over=over), "--workers", "2", "--out", out)
-    network.wait_for(lambda: network.processes("recorder"), 60, "a network")
-    process.kill()
-    process.communicate()
-    network.wait_for(lambda: not network.processes(), 60, "the end of all processes")
-    assert lines(out / "points.jsonl") == 0
 
 
 @pytest.mark.timeout(300)
@@ -169,7 +174,7 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
         emulation.Run(3, "smallest", 5.0, 1.0, 1.0, leader=2, duration=20.0),
     ]
     figures = network.directory / "figures"
-    arguments = ["figures", "--emulate", "--format", "svg", "--out", str(figures)]
+    options = ["--emulate", "--format", "svg", "--out", str(figures)]
     code = [
         "from functools import partial",
         "from pathlib import Path",
@@ -180,11 +185,11 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
         "from msg_analysis.paper import emulation, examples",
         "from msg_analysis.paper.emulation import Run",
         f"emulation.runs_of = lambda number: [run for run in {runs} if run.example == number]",
-        "examples.EXAMPLES |= {k: partial(example, 5) for k, example in examples.EXAMPLES.items()}  # coarse curves",
+        "examples.EXAMPLES |= {k: partial(example, 3) for k, example in examples.EXAMPLES.items()}  # coarse curves",
         "forked_workers.install()",
-        "for _ in range(2):  # the second time, nothing runs",
+        "for number in ('all', '1'):  # the second time, nothing runs",
         "    try:",
-        f"        main({arguments!r})",
+        f"        main(['figures', number, *{options!r}])",
         "    except SystemExit as end:",
         f"        points = Path({str(figures / 'emulation/points.jsonl')!r}).read_text()",
         "        print('ended', end.code, points.count('\\n'))",
@@ -193,8 +198,8 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
     result = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert result.returncode == 0, result.stderr
     first, second, rest = result.stdout.split("ended 0 2\n")
-    for text in (first, second):
-        assert "7 points of 2 networks: all agree with theory (Holm over all points, level 0.01" in text
+    for text, counts in ((first, "7 points of 2 networks"), (second, "6 points of 1 networks")):
+        assert f"{counts}: all agree with theory (Holm over all points, level 0.01" in text
     assert rest == ""
     rows = (figures / "example_1_emulated.csv").read_text().splitlines()
     assert rows[2].startswith("network,quantity,agent")
