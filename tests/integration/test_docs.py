@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -14,17 +15,39 @@ from pages import ROOT, blocks, console, experiments, missing
 DOCS = ROOT / "docs"
 
 
-def shell(script: str, place: Path) -> subprocess.CompletedProcess[str]:
-    """Typed in a wide terminal, with the commands on the path; one of ours that needs no shell is run without."""
+def started(command: str, place: Path) -> subprocess.Popen[str]:
+    """Typed in a wide terminal, with the commands on the path; one of ours that needs no shell is started without."""
     programs = Path(sys.executable).parent
     environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
-    if re.fullmatch(r"msg-(agents|analysis) [\w./ -]+", script):
-        name, *arguments = script.split()
-        command = [programs / name, *arguments]
+    if found := re.fullmatch(r"(msg-(?:agents|analysis)) ([\w./ -]+?)(?: > ([\w.]+))?", command):
+        words = [programs / found[1], *found[2].split()]
     else:
-        command = ["bash", "-e", "-c", script]
+        words = ["bash", "-e", "-c", command]
         environment["PATH"] = f"{programs}{os.pathsep}{os.environ['PATH']}"
-    return subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=100)
+    with (place / found[3]).open("w") if found and found[3] else nullcontext(subprocess.PIPE) as stdout:
+        return subprocess.Popen(words, cwd=place, env=environment, stdout=stdout, stderr=subprocess.PIPE, text=True)
+
+
+def ended(process: subprocess.Popen[str], code: int = 0) -> str:
+    """What it printed."""
+    stdout, stderr = process.communicate(timeout=100)
+    assert process.returncode == code, stderr
+    return stdout
+
+
+def script(text: str, place: Path) -> None:
+    """Line by line; those that end with "&" go on until "wait"."""
+    subprocess.run(["bash", "-n", "-c", text], check=True)
+    meanwhile: list[subprocess.Popen[str]] = []
+    for line in filter(None, text.splitlines()):
+        if line.endswith(" &"):
+            meanwhile.append(started(line.removesuffix(" &"), place))
+        elif line == "wait":
+            while meanwhile:
+                ended(meanwhile.pop(0))
+        else:
+            ended(started(line, place))
+    assert meanwhile == []
 
 
 @pytest.mark.timeout(300)
@@ -42,16 +65,12 @@ def test_tutorial(network, domain: int) -> None:
         if shown.command.startswith(("msg-analysis info", "msg-analysis predict")):
             continue
         if "runs/loud" in shown.command and not (network.directory / "runs/loud").exists():
-            played = shell(by_hand, network.directory)
-            assert played.returncode == 0, played.stderr
-        result = shell(shown.command, network.directory)
-        assert result.returncode == (1 if "runs/loud" in shown.command else 0), result.stderr
-        assert missing(shown.lines, result.stdout) == []
+            script(by_hand, network.directory)
+        printed = ended(started(shown.command, network.directory), 1 if "runs/loud" in shown.command else 0)
+        assert missing(shown.lines, printed) == []
 
 
 @pytest.mark.parametrize("name", ["discrete", "tracking"])
 def test_example(name: str, network) -> None:
     (shown,) = [shown for shown in console(DOCS / "examples.md") if shown.command == f"msg-agents run {name}"]
-    result = shell(shown.command, network.directory)
-    assert result.returncode == 0, result.stderr
-    assert missing(shown.lines, result.stdout) == []
+    assert missing(shown.lines, ended(started(shown.command, network.directory))) == []
