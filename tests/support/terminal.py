@@ -11,7 +11,7 @@ import subprocess
 import termios
 import time
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 
 def take_terminal() -> None:
@@ -23,9 +23,9 @@ def take_terminal() -> None:
 
 
 class Terminal:
-    """A program on a terminal of its own."""
+    """A program on a terminal of its own; its ``stdout`` may be elsewhere."""
 
-    def __init__(self, *command: str | Path, columns: int = 80, rows: int = 24) -> None:
+    def __init__(self, *command: str | Path, columns: int = 80, rows: int = 24, stdout: IO[str] | None = None) -> None:
         self._master, slave = pty.openpty()
         termios.tcsetwinsize(slave, (rows, columns))
         self.before = termios.tcgetattr(slave)
@@ -35,7 +35,7 @@ class Terminal:
         self.process = subprocess.Popen(
             command,
             stdin=slave,
-            stdout=slave,
+            stdout=stdout or slave,
             stderr=slave,
             preexec_fn=take_terminal,
             # readline adds its own, also to the environment of pytest's workers, and they would fix the size
