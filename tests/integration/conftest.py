@@ -169,14 +169,17 @@ class Network:
         """Files of Fast DDS in shared memory that the nodes have mapped: a killed node would leave them behind."""
         return {path for node in self.nodes() for path in _mapped(node.pid)}
 
-    def start(self, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
-        """Start ``msg-agents`` with these arguments."""
+    def start(
+        self, *arguments: str | Path, first: Callable[[], None] | None = None, **environment: str
+    ) -> subprocess.Popen[str]:
+        """Start ``msg-agents`` with these arguments; ``first``, of tests/support, is called in its process before."""
         command = subprocess.Popen(
             [str(PROGRAM), *(str(argument) for argument in arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             env=os.environ | {"NO_COLOR": "1", **environment},
+            preexec_fn=first,
         )
         self.commands.append(command)
         return command

@@ -163,9 +163,9 @@ def test_the_player_does_not_wait_for_a_watcher_that_has_left(
 def test_a_watcher_that_is_stopped_holds_nobody_up(network: Any, domain: int) -> None:
     """By default nobody waits for it: it misses states, and says how many steps that makes."""
     bag = network.directory / "bag"
-    write_trajectory(simulate(network.experiment(run={"duration": 400})), bag)
+    write_trajectory(simulate(network.experiment(run={"duration": 200})), bag)
     live = network.start("live")
-    play = network.start("play", bag, "--rate", "50", "--await", "live")
+    play = network.start("play", bag, "--rate", "25", "--await", "live")
     for _ in range(4):  # by then it has acknowledged the experiment
         wait_for_steps(live)
     live.send_signal(signal.SIGSTOP)
