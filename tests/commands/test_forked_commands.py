@@ -21,14 +21,19 @@ LIBRARIES = (*forked_commands.PREPARED, "dask", "distributed", "matplotlib.pyplo
 
 
 def test_libraries_set_no_variable_that_is_read_at_a_start() -> None:
-    """Else each command after their import would be executed, at several times the cost."""
+    """Else each command after their import would be executed, at several times the cost.
+
+    What forks the commands has imported most of them, and would have ended if they did; the others are imported here.
+    """
     code = f"""
 import importlib, json, os
 for name in {LIBRARIES}:
     importlib.import_module(name)
 print(json.dumps(dict(os.environ)))
 """
-    process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    command = [sys.executable, "-P", "-c", code]
+    with forked_commands.installed():
+        process = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     after = json.loads(process.stdout.splitlines()[-1])
     assert forked_commands.read_at_start(after) == forked_commands.read_at_start(os.environ)
 

@@ -27,6 +27,7 @@ LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"
 NETWORK = {"run", "demo", "doctor", "play", "live", "markers", "agent", "switcher", "recorder"}
 OVERVIEWS = [(program, option) for program in ("msg-analysis", "msg-agents") for option in ("--help", "--version")]
 NEW = "NEW"  # a name that is not there yet
+SWEEP = ["sweep.yaml", "--workers", "1", "--out", "swept"]  # its results are kept for the next time
 WORDS = {  # what each of the others is given
     ("msg-analysis", "predict"): ["EXPERIMENT"],
     ("msg-analysis", "plan"): ["EXPERIMENT"],
@@ -44,7 +45,7 @@ WORDS = {  # what each of the others is given
     ("msg-analysis", "transient"): ["EXPERIMENT", "--times", "0,1"],
     ("msg-analysis", "facts"): ["EXPERIMENT"],
     ("msg-analysis", "schema"): [],
-    ("msg-analysis", "sweep"): ["SWEEP", "--workers", "1", "--out", NEW],
+    ("msg-analysis", "sweep"): SWEEP,
     ("msg-agents", "examples"): [],
     ("msg-agents", "new"): [NEW, "--agents", "4"],
     ("msg-agents", "runs"): ["FOLDER"],
@@ -73,7 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def outcomes(folder: Path, *jobs: tuple[tuple[str, str], str]) -> Iterator[tuple[tuple[str, str], str, int, str, str]]:
     """Command, kind, exit code, stdout, stderr; a kind is "plain", "json", or what stdout is (many_commands)."""
     places = {"EXPERIMENT": LINE_RING, "BAG": "bag", "RESULT": "result.json", "RECORD": "run.json"}
-    places |= {"HOSTS": "hosts.yaml", "SWEEP": "sweep.yaml", "FOLDER": "."}
+    places |= {"HOSTS": "hosts.yaml", "FOLDER": "."}
     lines = []
     for (program, name), kind in jobs:
         words = [str(places.get(word, word)) for word in WORDS.get((program, name), [])]
@@ -125,7 +126,7 @@ def test_stdout_that_has_few_characters(folder: Path) -> None:
 
 
 def test_commands_on_a_stdout_that_has_few_characters(folder: Path) -> None:
-    words = (["tabulate", "result.json"], ["info", "bag"], ["sweep", "sweep.yaml", "--workers", "1", "--out", "ascii"])
+    words = (["tabulate", "result.json"], ["info", "bag"], ["sweep", *SWEEP])
     lines = [["msg-analysis", one, "ascii"] for one in words]
     found = many_commands.outcomes(lines, folder, forked_workers.NEEDED, COLUMNS="80")
     for (name, *_), (code, stdout, stderr) in zip(words, found, strict=True):

@@ -6,6 +6,7 @@ whose output test_pages.py compares are left to it.
 
 from __future__ import annotations
 
+import functools
 import re
 import shlex
 import shutil
@@ -78,6 +79,7 @@ def lines(page: Path) -> Iterator[str]:
         yield from re.findall(r"(?<!\[)`([^`\n]+)`", text)
 
 
+@functools.cache
 def commands() -> list[str]:
     found = []
     for page in PAGES:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import ill_machines
 import pytest
 
 from msg_agents.discovery.profiles import LOOPBACK_PROFILE
@@ -23,7 +24,6 @@ NAMES = [
     *("static_peers", "middleware", "ros_domain_id", "free_domains", "round_trip"),
 ]
 OF_MACHINE = {*NAMES[:10], "socket_buffers", "rclpy", "free_domains"}
-FULL = 'mount -t tmpfs -o size=64k none /dev/shm && head -c 65536 /dev/zero > /dev/shm/full; exec "$@"'
 
 
 def examined(process: subprocess.Popen[str]) -> tuple[int, dict[str, Any]]:
@@ -97,45 +97,43 @@ def test_a_foreign_profile(plain_shell: Any, tmp_path: Path) -> None:
     assert (code, checks["round_trip"]["status"]) == (0, "ok")
 
 
-def refused(network: Any, name: str, enter: list[str], **variables: str) -> None:
-    """The doctor has this error, and a run the same, before anything is started."""
-    environment = os.environ | {"NO_COLOR": "1"} | variables
-    streams: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    code, checks = examined(subprocess.Popen([*enter, PROGRAM, "doctor", "--json"], env=environment, **streams))
+def refused(network: Any, name: str, first: Callable[[], None] | None = None, **variables: str) -> None:
+    """The doctor has this error, and a run the same, before anything is started; ``first`` makes their machine ill."""
+    code, checks = examined(network.start("doctor", "--json", first=first, **variables))
     assert (code, checks[name]["status"], checks["round_trip"]["status"]) == (2, "error", "warning")
-    run = [*enter, PROGRAM, "run", network.file(), "--no-record"]
-    outcome = subprocess.run(run, env=environment, capture_output=True, text=True, timeout=60)
-    assert (outcome.returncode, outcome.stdout) == (2, "")
-    assert outcome.stderr == f"error: {checks[name]['text']}\n"
+    run = network.start("run", network.file(), "--no-record", first=first, **variables)
+    stdout, stderr = run.communicate(timeout=60)
+    assert (run.returncode, stdout) == (2, "")
+    assert stderr == f"error: {checks[name]['text']}\n"
 
 
 def test_a_foreign_middleware(plain_shell: Any) -> None:
-    refused(plain_shell, "middleware", [], RMW_IMPLEMENTATION="rmw_none_cpp")
+    refused(plain_shell, "middleware", RMW_IMPLEMENTATION="rmw_none_cpp")
 
 
 def test_a_sourced_foreign_ros(plain_shell: Any, tmp_path: Path) -> None:
-    refused(plain_shell, "middleware", [], PYTHONPATH=str(other_rclpy(tmp_path)), ROS_DISTRO="foxy")
+    refused(plain_shell, "middleware", PYTHONPATH=str(other_rclpy(tmp_path)), ROS_DISTRO="foxy")
 
 
 def test_no_discovery(plain_shell: Any) -> None:
-    refused(plain_shell, "discovery_range", [], ROS_AUTOMATIC_DISCOVERY_RANGE="OFF")
+    refused(plain_shell, "discovery_range", ROS_AUTOMATIC_DISCOVERY_RANGE="OFF")
 
 
-def unshared(*words: str) -> list[str]:
-    """A command's beginning that gives it namespaces of its own."""
-    enter = ["unshare", *words]
-    if not shutil.which("unshare") or subprocess.run([*enter, "true"], capture_output=True).returncode:
+def need_unshare(*words: str) -> None:
+    enter = ["unshare", *words, "true"]
+    if not shutil.which("unshare") or subprocess.run(enter, capture_output=True).returncode:
         pytest.skip(f"this machine: cannot do {' '.join(enter)} (needs root and unshare)")
-    return enter
 
 
 def test_a_full_shared_memory(plain_shell: Any) -> None:
-    refused(plain_shell, "shared_memory", unshared("--mount", "sh", "-c", FULL, "sh"))
+    need_unshare("--mount")
+    refused(plain_shell, "shared_memory", ill_machines.full_shared_memory)
 
 
 def test_no_loopback(plain_shell: Any) -> None:
     """A new network namespace has an interface that is down."""
-    refused(plain_shell, "loopback", unshared("--net"))
+    need_unshare("--net")
+    refused(plain_shell, "loopback", ill_machines.no_loopback)
 
 
 def test_few_descriptors(plain_shell: Any) -> None:

@@ -30,7 +30,7 @@ def test_what_the_page_says(tmp_path: Path) -> None:
     (tmp_path / "runs").mkdir()
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     process = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=100
+        [sys.executable, "-P", "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=100
     )
     assert process.returncode == 0, process.stderr
     assert "<Comparison, run of 'line_ring': agrees;" in process.stdout

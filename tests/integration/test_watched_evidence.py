@@ -24,6 +24,7 @@ LAWS: dict[str, dict[str, Any]] = {
     "real time, loss and noise": {"noise": AIR, "run": {"pace": "realtime", "speed": 10}},
 }
 
+
 def evidence_of(trajectory: Trajectory) -> float:
     """Of the comparison, without departures."""
     return whole_sums(trajectory, predict(trajectory.record.experiment, trajectory.record.step_model)).evidence()

@@ -307,10 +307,13 @@ def main() -> None:
     setproctitle("commands of tests")  # it finds its place only before the environment is changed
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.path.append(str(SUPPORT))
+    before = read_at_start(os.environ)
     for name in PREPARED:
         importlib.import_module(name)
     importlib.import_module(NODE_SERVER).prepare()
     _use_libraries()
+    if (after := read_at_start(os.environ)) != before:
+        sys.exit(f"libraries have changed variables that are read at a start: {after.items() ^ before.items()}")
     show_stacks_when_asked()
     serve(socket.socket(fileno=int(sys.argv[1])), run, _prepare_for)
 

@@ -1,4 +1,4 @@
-"""A fault of a whole run, which its record does not know: to be called first in the process that all are forked from."""
+"""A fault of a run that its record does not know: to be called first in the process that all are forked from."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import rclpy
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 from msg_agents_interfaces.msg import ActiveGraph, AgentState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
@@ -28,7 +28,7 @@ def main(file: str, count: int, topics: list[str]) -> None:
     node = rclpy.create_node("plain")
     left, silent = count, set(topics)
     with Path(file).open("wb") as stream:
-        writer = Writer(stream)
+        writer = Writer(stream, chunk_size=4096, compression=CompressionType.NONE)  # the file grows as messages come
         writer.start()
         schema = writer.register_schema("any", "", b"")
 

@@ -1,0 +1,30 @@
+"""Machines that are ill: to be called first in a process, which then has namespaces of its own (needs root)."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+from pathlib import Path
+
+CLONE_NEWNS, CLONE_NEWNET = 0x20000, 0x40000000  # linux/sched.h
+MS_REC, MS_PRIVATE = 1 << 14, 1 << 18  # linux/mount.h
+ROOM = 2**16  # bytes
+
+
+def full_shared_memory() -> None:
+    _done("unshare", CLONE_NEWNS)
+    _done("mount", b"none", b"/", None, MS_REC | MS_PRIVATE, None)  # what is mounted here is mounted here only
+    _done("mount", b"none", b"/dev/shm", b"tmpfs", 0, f"size={ROOM}".encode())
+    with contextlib.suppress(OSError), Path("/dev/shm/full").open("wb", buffering=0) as file:
+        while file.write(bytes(ROOM)):
+            pass
+
+
+def no_loopback() -> None:
+    """An interface that is down is there."""
+    _done("unshare", CLONE_NEWNET)
+
+
+def _done(function: str, *arguments: int | bytes | None) -> None:
+    if getattr(ctypes.CDLL(None, use_errno=True), function)(*arguments):
+        raise OSError(ctypes.get_errno(), function)
