@@ -153,8 +153,10 @@ def test_command_runs(command: str, twins: Path, tmp_path: Path, monkeypatch: py
     (tmp_path / "star_ring.yaml").write_text(experiments(ROOT / "docs/tutorial.md")["star_ring"])
     (tmp_path / "bad.yaml").write_text(BAD)
     program, *arguments = shlex.split(re.sub(r"--duration \d+", f"--duration {DURATION}", command.partition(" > ")[0]))
-    if arguments[0] == "run" and "--duration" not in arguments:
-        arguments += ["--duration", DURATION]
+    if arguments[0] == "run":
+        arguments += ["--write-report", "never"]
+        if "--duration" not in arguments:
+            arguments += ["--duration", DURATION]
     made = [after for word, after in pairwise(arguments) if word == "--out"]
     if arguments[0] != "new":
         shutil.copy("line_ring.yaml", "lab.yaml")

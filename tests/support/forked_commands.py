@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from msg_agents.cli.servers.node_server import serve_waiting
+from msg_agents.processes.environment import start_environment
 from msg_agents.processes.fork_server import leave_one_waiting, serve
 from msg_agents.processes.hung_process import show_stacks_when_asked
 from msg_analysis.common.forked_processes import ALL_FORKED, LONGEST, adopt_orphans
@@ -242,7 +243,10 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
         return importlib.import_module(RUN_SERVER).main  # type: ignore[no-any-return]
     sys.argv = command
     if command[1:2] in (["run"], ["host"], ["doctor"]):
+        os.environ.update(start_environment())  # for what will wait
         leave_one_waiting(serve_waiting, request["kept"])
+        os.environ.clear()
+        os.environ.update(request["environment"])
     if command[1:2] == ["sweep"]:
         importlib.import_module("forked_workers").install()
     place, name = PROGRAMS[Path(command[0]).name]
