@@ -39,7 +39,7 @@ from msg_analysis.protocol import Protocol
 
 class Broken(Protocol):
     def step(self, k, mode, state, heard, noise):
-        mark = Path(os.environ["HANGING"])
+        mark = Path(os.environ["MSG_AGENTS_HANGING"])
         if k == 1000 and self.agent == 2 and not mark.exists():
             mark.touch()
             lock = threading.Lock()
@@ -128,7 +128,7 @@ def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, re
     packages = _install(network, HANGING)
     monkeypatch.syspath_prepend(packages)
     what = network.experiment(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
-    environment = {"PYTHONPATH": str(packages), "HANGING": str(network.directory / "mark")}
+    environment = {"PYTHONPATH": str(packages), "MSG_AGENTS_HANGING": str(network.directory / "mark")}
     result = network.run(what, restarts=restarts, environment=environment)
     words = "agents_3_to_5: hung, its main thread has not run for 3 s (stacks in log/agents_3_to_5.log)"
     assert [line.startswith(words) for line in result.restarts] == ([True] if restarts else [])
