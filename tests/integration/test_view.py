@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from browser import CUT, FAINT, Log
 from terminal import Terminal
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
+PAGE = re.compile(r"live page at (http://127\.0\.0\.1:\d+/)")
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 
 
@@ -32,9 +34,9 @@ def terminal(network: Any) -> Iterator[Any]:
         each.close()
 
 
-def _long(network: Any) -> Path:
+def _long(network: Any, **run: Any) -> Path:
     """Paced, so that it takes long enough to be looked at on any machine: 40 s."""
-    return network.file(run={"pace": "realtime", "speed": 2, "duration": 80})  # type: ignore[no-any-return]
+    return network.file(run={"pace": "realtime", "speed": 2, "duration": 80} | run)  # type: ignore[no-any-return]
 
 
 def _bottom(screen: Terminal) -> int:
@@ -48,7 +50,7 @@ def _plain(text: str) -> str:
 
 def test_panel_and_ctrl_c(network: Any, terminal: Any) -> None:
     """Graph, steps and errors; smaller windows get less; Ctrl-C ends the run in order and leaves the terminal tidy."""
-    screen = terminal(PROGRAM, "run", _long(network), "--out", network.directory / "runs")
+    screen = terminal(PROGRAM, "run", _long(network, processes=2), "--out", network.directory / "runs")
     screen.wait_for("starting")
     screen.wait_for("predicted 1.", seconds=60)
     screen.read(0.5)
@@ -66,19 +68,6 @@ def test_panel_and_ctrl_c(network: Any, terminal: Any) -> None:
     assert screen.mode() == screen.before
 
 
-def test_json_on_a_terminal_is_json_elsewhere(network: Any, terminal: Any) -> None:
-    """The panel goes to stderr: stdout is one object."""
-    out = network.directory / "result"
-    options = ("--out", network.directory / "runs", "--json", "--write-report", "never")
-    with out.open("w") as stdout:
-        screen = terminal(PROGRAM, "run", network.file(), *options, stdout=stdout)
-    assert screen.read_to_the_end() in (0, 1)
-    assert json.loads(out.read_text())["steps"] == 300
-    assert "net: 5 agents, lockstep" in _plain(screen.text)
-    assert re.search(r"note: ROS_DOMAIN_ID (\d+): to watch the run, msg-agents live --domain \1\b", _plain(screen.text))
-    assert "verdict" not in screen.text
-
-
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
     """In a window of its own."""
@@ -89,7 +78,7 @@ def page(browser: Any) -> Iterator[Any]:
 def _address(process: subprocess.Popen[str]) -> str:
     assert process.stderr is not None
     for line in process.stderr:
-        if found := re.search(r"live page at (http://127\.0\.0\.1:\d+/)", line):
+        if found := PAGE.search(line):
             return found[1]
     raise AssertionError("no page")
 
@@ -101,19 +90,31 @@ def _follow(page: Any, address: str) -> Log:
     return log
 
 
-def test_page_of_a_run(network: Any, page: Any) -> None:
-    """Steps, graph, states and errors come in; the end is told, with the verdict and the numbers of the comparison."""
-    file = network.file(run={"processes": 2})
-    run = network.start("run", file, "--out", network.directory / "runs", "--json", "--web", "0")
+def test_page_of_a_run(network: Any, terminal: Any, page: Any) -> None:
+    """Steps, graph, states and errors come in; the end is told, with the verdict and the numbers of the comparison.
+
+    The panel goes to stderr, a terminal: stdout, which is elsewhere, is one object.
+    """
+    file, out = network.file(run={"processes": 2}), network.directory / "result"
+    options = ("--out", network.directory / "runs", "--json", "--web", "0")
     log = Log(page)
-    page.goto(address := _address(run))
-    page.wait_for_selector("body[data-over=yes]")
+    with out.open("w") as stdout, ThreadPoolExecutor() as reader:
+        screen = terminal(PROGRAM, "run", file, *options, stdout=stdout)
+        address = network.wait_for(lambda: (screen.read(0.1), PAGE.search(screen.text))[1], 60, "the page")[1]
+        reading = reader.submit(screen.read_to_the_end)  # a full terminal would hold up the run
+        page.goto(address)
+        page.wait_for_selector("body[data-over=yes]")
+        code = reading.result()
     assert log.complaints == []
     assert set(log.requests) == {address, f"{address}events", f"{address}report"}
-    stdout, stderr = run.communicate(timeout=60)
-    result = json.loads(stdout)
-    assert "Traceback" not in stderr
-    assert {0: "agrees", 1: "disagrees"}[run.returncode] == page.get_attribute("#state", "class")
+    result = json.loads(out.read_text())
+    assert result["steps"] == 300
+    said = _plain(screen.text)
+    assert "net: 5 agents, lockstep" in said
+    assert re.search(r"note: ROS_DOMAIN_ID (\d+): to watch the run, msg-agents live --domain \1\b", said)
+    assert "verdict" not in said
+    assert "Traceback" not in said
+    assert {0: "agrees", 1: "disagrees"}[code] == page.get_attribute("#state", "class")
     assert "The run has ended" in page.inner_text("#state")
     assert page.inner_text("#step") == "300 of 300"
     assert page.inner_text("#graph") in ("line", "ring")
