@@ -84,7 +84,7 @@ def test_verb_hands_all_arguments_to_the_executable(tmp_path: Path) -> None:
 
 def test_verb_without_an_executable(tmp_path: Path) -> None:
     """As with wheels: the module, in this Python."""
-    code = [sys.executable, "-P", "-c", parsed("run", str(tmp_path / "missing.yaml"))]
+    code = [sys.executable, "-P", "-c", parsed("prepare", str(tmp_path / "missing.yaml"))]
     environment = os.environ | {"AMENT_PREFIX_PATH": str(tmp_path)}
     process = subprocess.run(code, capture_output=True, text=True, timeout=60, env=environment)
     assert (process.returncode, process.stdout) == (2, "")

@@ -213,6 +213,7 @@ class Network:
         stdout, stderr = run.communicate(timeout=150)
         assert run.returncode == 0, stderr + stdout
         assert "Traceback" not in stderr
+        assert stdout.count("\n") == 1
         result: dict[str, Any] = json.loads(stdout)
         assert result["failures"] == []
         saved = Path(result["bag"]) / "result.json"

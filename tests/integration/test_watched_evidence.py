@@ -43,7 +43,7 @@ def test_watchers_have_the_evidence_of_the_comparison(
 
     monkeypatch.setattr(early_end, "RunObserver", observer)
     changes = LAWS[law]
-    experiment = network.experiment(**changes | {"run": {"duration": 20, "processes": 2} | changes.get("run", {})})
+    experiment = network.experiment(**changes | {"run": {"duration": 10, "processes": 2} | changes.get("run", {})})
     result = network.run(experiment, until=Until(0.001))
     assert (result.failures, result.until["ended_early"]) == ([], False)
     wanted = evidence_of(result.trajectory)
