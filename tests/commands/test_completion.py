@@ -24,18 +24,25 @@ PAIR = {
 }
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A directory as users have them: experiments, results, a bag among others in runs/."""
-    monkeypatch.chdir(tmp_path)
+    place = tmp_path_factory.mktemp("place")
     for name in ("line.yaml", "ring.yml", "result.json", "notes.txt", ".hidden.yaml"):
-        (tmp_path / name).write_text("")
+        (place / name).write_text("")
     run = Experiment.parse(PAIR).simulate()
-    run.save(tmp_path / "runs" / "lab_1")
-    run.save(tmp_path / "runs" / "lab_2")
-    (tmp_path / "run.json").write_text(run.record.to_json())
-    (tmp_path / "empty").mkdir()
-    return tmp_path
+    run.save(place / "runs" / "lab_1")
+    run.save(place / "runs" / "lab_2")
+    (place / "run.json").write_text(run.record.to_json())
+    (place / "empty").mkdir()
+    return place
+
+
+@pytest.fixture
+def folder(place: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where one is."""
+    monkeypatch.chdir(place)
+    return place
 
 
 def complete(line: str, shell: str = "bash") -> list[str]:
@@ -83,8 +90,10 @@ def test_complete(folder: Path, shell: str, line: str, values: list[str]) -> Non
     assert complete(line, shell) == [f"plain,{value}" for value in values]
 
 
-def test_names_that_must_be_quoted_are_left_to_the_shell(folder: Path) -> None:
-    (folder / "two words.yaml").write_text("")
+def test_names_that_must_be_quoted_are_left_to_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("two words.yaml", "line.yaml"):
+        (tmp_path / name).write_text("")
     assert complete("msg-analysis predict t") == ["file,t"]
 
 

@@ -73,4 +73,5 @@ def test_tutorial(network, domain: int) -> None:
 @pytest.mark.parametrize("name", ["discrete", "tracking"])
 def test_example(name: str, network) -> None:
     (shown,) = [shown for shown in console(DOCS / "examples.md") if shown.command == f"msg-agents run {name}"]
-    assert missing(shown.lines, ended(started(shown.command, network.directory))) == []
+    printed = ended(started(f"{shown.command} --write-report never", network.directory))
+    assert missing(shown.lines, printed) == []
