@@ -138,7 +138,5 @@ def test_no_loopback(plain_shell: Any) -> None:
 
 def test_few_descriptors(plain_shell: Any) -> None:
     """Too few for two processes: the round trip says so, without a traceback."""
-    command = ["sh", "-c", 'ulimit -n 16; exec "$@"', "sh", PROGRAM, "doctor", "--json"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    code, checks = examined(process)
+    code, checks = examined(plain_shell.start("doctor", "--json", first=ill_machines.few_descriptors))
     assert (code, checks["round_trip"]["status"]) == (2, "error")

@@ -38,7 +38,7 @@ while not found or last not in "".join(marker.text for marker in found[-1].marke
     rclpy.spin_once(node, timeout_sec=1.0)
 print(json.dumps([plain(array) for array in found]))
 """
-STEPS = 5000  # long enough to be found by who watches
+STEPS, SPEED = 400, 5  # 4 s: long enough to be found by who watches
 
 
 def by_space(array: dict[str, Any], namespace: str) -> list[dict[str, Any]]:
@@ -55,7 +55,8 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
         assert listener.stdout.readline() == "ready\n"
         markers = network.start("markers", "--replica", "2", "--frame", "lab")
         assert "waiting for one" in markers.stderr.readline()
-        result = network.run(network.experiment(run={"duration": STEPS * 0.05, "processes": 2}), domain=domain)
+        run = {"duration": STEPS * 0.05, "processes": 2, "pace": "realtime", "speed": SPEED}
+        result = network.run(network.experiment(run=run), domain=domain)
         assert result.failures == []
         pictures = json.loads(listener.communicate(timeout=60)[0])
         stderr = markers.communicate(timeout=60)[1]
@@ -69,7 +70,7 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
     (agents,), (links,), (title,) = (by_space(pictures[-1], name) for name in ("agents", "links", "title"))
     trajectory = result.trajectory
     mode = trajectory.modes[-1]
-    assert title["text"] == f"net  step {STEPS}  t = 250  {('line', 'ring')[mode]}"
+    assert title["text"] == f"net  step {STEPS}  t = 20  {('line', 'ring')[mode]}"
     places = [(point["x"], point["y"]) for point in agents["points"]]
     assert len(set(places)) == 5
     ends = [places.index((point["x"], point["y"])) for point in links["points"]]

@@ -1,9 +1,10 @@
-"""Machines that are ill: to be called first in a process, which then has namespaces of its own (needs root)."""
+"""Machines that are ill: to be called first in a process; in namespaces of its own where that needs root."""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import resource
 from pathlib import Path
 
 CLONE_NEWNS, CLONE_NEWNET = 0x20000, 0x40000000  # linux/sched.h
@@ -23,6 +24,11 @@ def full_shared_memory() -> None:
 def no_loopback() -> None:
     """An interface that is down is there."""
     _done("unshare", CLONE_NEWNET)
+
+
+def few_descriptors() -> None:
+    """Too few for two processes of a network."""
+    resource.setrlimit(resource.RLIMIT_NOFILE, (16, 16))
 
 
 def _done(function: str, *arguments: int | bytes | None) -> None:
