@@ -112,6 +112,7 @@ def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
         over = {
             "switching.generator": generators(*(rates[each] for each in durations)),
             "run.duration": list(durations),
+            "run.pace": ["realtime" if each == 10_000 else "lockstep" for each in durations],  # it costs less
         }
         return start(sweep_file(network, kind="network", over=over, combine="zip"), *workers, "--out", out, "--json")
 
