@@ -16,6 +16,8 @@ from scipy import stats
 from user_namespace import give_up_rights
 
 from msg_agents.channel.namespaces import open_hosts
+from msg_agents.processes.status_file import read_steps
+from msg_agents.running.supervisor import STEPS
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.errors import NotAvailableError
 
@@ -174,6 +176,20 @@ def test_a_killed_agent_comes_back_on_its_host(network: Any, hosts: set[int]) ->
     victim.kill()
     result = network.completed(run)
     assert len(result["restarts"]) == 1
+
+
+@pytest.mark.parametrize("pace", ["lockstep", "realtime"])
+def test_a_killed_agent_finds_those_to_which_the_graph_cuts_its_link(network: Any, pace: str) -> None:
+    """Agent 1 hears one of the others in each graph; sojourns are longer than the window of the lockstep."""
+    graphs = {"first": {"path": [1, 2, 3]}, "second": {"path": [2, 3, 1]}}
+    rare = {"generator": [[-0.2, 0.2], [0.2, -0.2]]}
+    changes = {"graphs": graphs, "switching": rare, "run": {"duration": 10, "pace": pace}}
+    run = start(network, changes, "--no-analyse", graph=True)
+    network.wait_for(network.nodes, 60, "processes")
+    steps = network.run_file().with_name(STEPS)
+    network.wait_for(lambda: min(read_steps(steps) or [-1]) > 0, 60, "steps")
+    next(process for process in network.processes("agent") if process.agent == 1).kill()
+    assert len(network.completed(run)["restarts"]) == 1
 
 
 def test_a_killed_channel_ends_the_run(network: Any, hosts: set[int]) -> None:

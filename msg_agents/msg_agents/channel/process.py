@@ -130,6 +130,8 @@ def _gate(orders: dict[str, Any]) -> Callable[[int, int], bool]:
 
     def is_open(sender: int, receiver: int) -> bool:
         mode = active.mode
-        return mode < 0 or joined[mode][sender][receiver]
+        return (
+            mode < 0 or joined[mode][sender][receiver] or active.lets_through(sender) or active.lets_through(receiver)
+        )
 
     return is_open

@@ -15,9 +15,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +41,20 @@ from msg_analysis.model.experiment.topology import heard_links
 from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.theory.prediction import predict
 
+STANDS = 1.5  # s without a step in lockstep after which the graph cuts nothing, until one is made
 CUT_LEASE = 600.0  # s; that the graph cuts a link is no reason to give a host up
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RunChannel:
     """The channel of one run. The hosts are open."""
 
     channel: Channel
     hosts: dict[str, Host]
+    _active: ActiveGraphFile | None = field(default=None, init=False)  # if packets follow the graph
+    _lockstep: bool = field(default=False, init=False)
+    _steps: list[int] = field(default_factory=list, init=False)  # of the agents, and since when [s]
+    _since: float = field(default=0.0, init=False)
 
     @property
     def agents(self) -> list[tuple[int, ...]]:
@@ -62,17 +68,33 @@ class RunChannel:
         peers = " ".join(host.address for host in self.hosts.values())
         return channel_environment(profile) | {PEERS_VARIABLE: peers}
 
-    def start(self, supervisor: Supervisor, plans: Sequence[ProcessPlan], wiring: Wiring) -> None:
+    def start(self, supervisor: Supervisor, plans: Sequence[ProcessPlan], wiring: Wiring, *, lockstep: bool) -> None:
         """Start its process, and say on which host each of the others is to be."""
+        self._lockstep = lockstep
         control = supervisor.start_channel()
         counts = supervisor.channel_account
         active_graph = counts.with_name("active_graph") if self.channel.graph else None
         if active_graph is not None:
-            ActiveGraphFile.create(active_graph)
+            self._active = ActiveGraphFile.create(active_graph, len(self.hosts))
             supervisor.options = {SWITCHER: ("--active-graph", str(active_graph))}
         supervisor.namespaces = {plan.name: self.hosts[self.channel.host_of(plan.agents)].namespace for plan in plans}
         joined = self.channel.joined(wiring.links) if self.channel.graph else None
         hand_over(control, self.channel, self.hosts, counts, active_graph, joined)
+
+    def look(self, supervisor: Supervisor) -> None:
+        """Let processes that were started again find all others, as at the start of the run; in lockstep, let it go on.
+
+        There an agent also waits for those to which the graph cuts its link for longer than the window of the lockstep,
+        and the graph changes only when all go on.
+        """
+        if self._active is None:
+            return
+        if supervisor.steps != self._steps or not self._lockstep:
+            self._steps, self._since = supervisor.steps, time.monotonic()
+        stands = time.monotonic() > self._since + STANDS
+        starting = {self.channel.host_of(child.plan.agents) for child in supervisor.starting_again}
+        for place, host in enumerate(self.hosts):
+            self._active.let_through(place, all_packets=stands or host in starting)
 
     def to_json(self, supervisor: Supervisor, experiment: ValidExperiment) -> dict[str, Any]:
         """Its hosts, and what it did, as in the result of the run."""

@@ -40,7 +40,7 @@ from msg_agents.processes.process_plan import (
 )
 from msg_agents.recovery.checkpoint import entry_size, room_for
 from msg_agents.running.event_log import EventLog
-from msg_agents.running.run_channel import run_channel
+from msg_agents.running.run_channel import RunChannel, run_channel
 from msg_agents.running.run_folder import make_bag_directory, workshop
 from msg_agents.running.run_result import RunResult
 from msg_agents.running.supervisor import ACCOUNTS, CLOCKS, CRASHED, LATE, STEPS, Supervisor
@@ -198,7 +198,7 @@ def run_network(
                         hosts=linked.agents if linked else (),
                     )
                     if linked:
-                        linked.start(supervisor, plans, record.model)
+                        linked.start(supervisor, plans, record.model, lockstep=experiment.run.pace == "lockstep")
                     if around.introducer:
                         around.introducer.introduce(partners(plans, record.model.listens()))
                     if pin and experiment.run.pace == "lockstep":
@@ -209,7 +209,15 @@ def run_network(
                         view.begin(record, checkpoints if share is None else None, ending.observer if ending else None)
                         view.started(supervisor.by_node)
                         _watch(
-                            supervisor, experiment, result, restarts, kept, view, ending, follow_clock=not use_sim_time
+                            supervisor,
+                            experiment,
+                            result,
+                            restarts,
+                            kept,
+                            view,
+                            ending,
+                            linked,
+                            follow_clock=not use_sim_time,
                         )
                         view.end()
                     result.until = ending.to_json() if ending else None
@@ -246,6 +254,7 @@ def _watch(
     interruption: Interruption,
     view: View,
     ending: EarlyEnd | None,
+    linked: RunChannel | None,
     *,
     follow_clock: bool,  # whether the nodes' clock is that of this machine
 ) -> None:
@@ -257,6 +266,8 @@ def _watch(
     events, warned = EventLog(result.events), None
     will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others are not told
     while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
+        if linked:
+            linked.look(supervisor)
         time.sleep(FIRST_POLL if will_begin and began is None else POLL)
         supervisor.read_status()
         if ending and ending.look(min(supervisor.steps, default=-1), view.note):

@@ -298,6 +298,11 @@ class Supervisor:
         return [child for child in running if child.age_of_account > SILENCE]
 
     @property
+    def starting_again(self) -> list[Child]:
+        """Restarted children that have not found all others yet: they write no account before."""
+        return [child for child in self.running if child.number > 1 and child.age_of_account == math.inf]
+
+    @property
     def over(self) -> bool:
         """Whether all have done their part: no process leaves before, and the switcher only after it has said so."""
         ended = {child.plan.name for child in self.children if child.ended_well}

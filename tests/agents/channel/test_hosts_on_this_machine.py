@@ -170,18 +170,20 @@ def test_a_full_queue_drops(run: Callable[..., Running]) -> None:
 
 
 def test_the_active_graph_cuts(run: Callable[..., Running], tmp_path: Path) -> None:
-    """In graph 1 all are joined, in graph 2 left and right are not."""
-    graph = ActiveGraphFile.create(tmp_path / "graph")
+    """In graph 1 all are joined, in graph 2 left and right are not, unless one of them is let through."""
+    graph = ActiveGraphFile.create(tmp_path / "graph", 3)
     joined = np.ones((2, 3, 3), dtype=bool)
     joined[1, 1, 2] = joined[1, 2, 1] = False
     channel = run(joined=joined, graph=tmp_path / "graph")
-    for mode in (-1, 1, 0, 1):
+    for number, (mode, host) in enumerate([(-1, 0), (1, 0), (0, 0), (1, 0), (1, 1), (1, 2), (1, 0)]):
         graph.tell(mode)
-        channel.send("left", "right", bytes([mode + 1]))
+        for place in range(3):
+            graph.let_through(place, all_packets=place == host)
+        channel.send("left", "right", bytes([number]))
         channel.send("left", "base", b"next")
         assert channel.sockets["base"].recv(100) == b"next"  # what came before it has been decided
-    assert [channel.sockets["right"].recv(100) for _ in range(2)] == [b"\0", b"\1"]
-    assert channel.end()["left", "right"]["cut"] == 2
+    assert [channel.sockets["right"].recv(100) for _ in range(4)] == [b"\0", b"\2", b"\4", b"\5"]
+    assert channel.end()["left", "right"]["cut"] == 3
 
 
 def test_hosts_are_gone_with_their_descriptors(hosts: dict[str, Host]) -> None:
