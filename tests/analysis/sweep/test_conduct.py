@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -182,6 +183,16 @@ def cubes(number: int, _stopping: Any) -> int:
     return number**3
 
 
+@pytest.fixture
+def environment() -> Iterator[None]:
+    """As it was: Dask sets variables of its workers in this process, and what later tests start would have them."""
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.mark.usefixtures("environment")
 def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
     """Real workers: each death is that of a process, and a new one takes its place."""
     with Workers(2) as pool, closing(pool.outcomes(cubes, list(range(30)))) as batches:
