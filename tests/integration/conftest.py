@@ -31,9 +31,11 @@ from started_processes import started_processes
 pytest.importorskip("rclpy")
 
 from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.processes.status_file import read_steps
 from msg_agents.running.run_folder import PREFIX
 from msg_agents.running.run_result import RunResult
 from msg_agents.running.runner import run_network
+from msg_agents.running.supervisor import STEPS
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.model.experiment.experiment import ValidExperiment
@@ -240,8 +242,18 @@ class Network:
         return value
 
     def wait_until_moving(self, out: str = "runs") -> None:
-        """The run is in the middle: what is there of the bag is more than its head."""
+        """The run is in the middle: what is there of the bag is more than its head.
+
+        The recorder writes once a second, so runs of fewer than some thousand steps may be over by then.
+        """
         self.wait_for(lambda: self.recorded_bytes(out) > 50_000, 60, "recorded states")
+
+    def wait_for_steps(self) -> Path:
+        """Every agent has made a step, which the run knows within 0.3 s; the file in which their steps are."""
+        self.wait_for(self.nodes, 60, "processes")
+        steps: Path = self.run_file().with_name(STEPS)
+        self.wait_for(lambda: min(read_steps(steps) or [-1]) > 0, 60, "steps")
+        return steps
 
 
 @pytest.fixture(scope="module", autouse=True)

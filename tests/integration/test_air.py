@@ -66,7 +66,7 @@ def test_killed_agents_come_back_with_their_noise(network: Any) -> None:
     run = {"duration": 120, "replicas": 64, "processes": 3}
     file = network.file(noise=ALL, run=run)
     process = network.record(file, "--restarts", "3", "--json")
-    network.wait_until_moving()
+    network.wait_for_steps()
     for _ in range(2):
         victims = network.wait_for(lambda: network.processes("agent"), 30, "a living agent")
         random.Random(1).choice(victims).kill(signal.SIGKILL)

@@ -16,8 +16,6 @@ from scipy import stats
 from user_namespace import give_up_rights
 
 from msg_agents.channel.namespaces import open_hosts
-from msg_agents.processes.status_file import read_steps
-from msg_agents.running.supervisor import STEPS
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.errors import NotAvailableError
 
@@ -95,8 +93,8 @@ def hosts(network: Any) -> Iterator[set[int]]:
     assert holders(noted, network.mark) == []
 
 
-def wait_until_moving(network: Any, hosts: set[int]) -> None:
-    network.wait_until_moving()
+def wait_for_steps(network: Any, hosts: set[int]) -> None:
+    network.wait_for_steps()
     hosts |= namespaces(network)
 
 
@@ -171,7 +169,7 @@ def test_lockstep_where_only_active_links_carry_packets(network: Any) -> None:
 def test_a_killed_agent_comes_back_on_its_host(network: Any, hosts: set[int]) -> None:
     changes = {"graphs": THREE, "run": {"duration": 50}}
     run = start(network, changes, "--no-analyse", default={"delay_ms": 2})  # 1000 steps of at least 4 ms
-    wait_until_moving(network, hosts)
+    wait_for_steps(network, hosts)
     victim = next(process for process in network.processes("agent") if process.agent == 3)
     victim.kill()
     result = network.completed(run)
@@ -185,16 +183,14 @@ def test_a_killed_agent_finds_those_to_which_the_graph_cuts_its_link(network: An
     rare = {"generator": [[-0.2, 0.2], [0.2, -0.2]]}
     changes = {"graphs": graphs, "switching": rare, "run": {"duration": 10, "pace": pace}}
     run = start(network, changes, "--no-analyse", graph=True)
-    network.wait_for(network.nodes, 60, "processes")
-    steps = network.run_file().with_name(STEPS)
-    network.wait_for(lambda: min(read_steps(steps) or [-1]) > 0, 60, "steps")
+    network.wait_for_steps()
     next(process for process in network.processes("agent") if process.agent == 1).kill()
     assert len(network.completed(run)["restarts"]) == 1
 
 
 def test_a_killed_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
     run = start(network, ENDLESS, "--no-analyse")
-    wait_until_moving(network, hosts)
+    wait_for_steps(network, hosts)
     (channel,) = network.processes("channel")
     channel.kill()
     stdout, stderr = run.communicate(timeout=60)
@@ -207,7 +203,7 @@ def test_a_killed_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
 
 def test_a_stopped_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
     run = start(network, ENDLESS, "--no-analyse")
-    wait_until_moving(network, hosts)
+    wait_for_steps(network, hosts)
     (channel,) = network.processes("channel")
     channel.kill(signal.SIGSTOP)
     _, stderr = run.communicate(timeout=90)
@@ -219,7 +215,7 @@ def test_a_stopped_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_a_killed_run_leaves_nothing_behind(network: Any, hosts: set[int], number: signal.Signals) -> None:
     run = start(network, ENDLESS, "--no-analyse")
-    wait_until_moving(network, hosts)
+    wait_for_steps(network, hosts)
     run.send_signal(number)
     run.communicate(timeout=60)
     assert run.returncode == (3 if number == signal.SIGINT else -signal.SIGKILL)

@@ -23,7 +23,7 @@ def test_stopped_recorder(network: Any, repetition: int, rng: random.Random) -> 
     """At full speed everybody waits for it in the end, and nothing is lost."""
     file = network.file(run={"duration": 400, "processes": 2})
     run = network.record(file, "--json")
-    network.wait_until_moving()
+    network.wait_for_steps()
     time.sleep(rng.uniform(0.0, 1.0))
     (recorder,) = network.processes("recorder")
     recorder.kill(signal.SIGSTOP)

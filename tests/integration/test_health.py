@@ -14,7 +14,6 @@ from typing import Any
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.status_file import read_steps
-from msg_agents.running.supervisor import STEPS
 from msg_analysis.twin.simulate import new_record
 
 # Prints every DiagnosticArray of /diagnostics, level and values included, a line each; to stderr what agents report.
@@ -131,9 +130,7 @@ def test_an_agent_that_was_not_given_the_end(network: Any) -> None:
     """It was stopped when the run ended: nothing is missing, so the run does not wait for it for ever."""
     file = network.file(run={"duration": 6, "pace": "realtime", "processes": "one_per_agent"})
     run = network.record(file, "--json")
-    network.wait_for(network.nodes, 60, "processes")
-    steps = network.run_file().with_name(STEPS)
-    network.wait_for(lambda: min(read_steps(steps) or [-1]) > 0, 60, "steps")
+    steps = network.wait_for_steps()
     (recorder,) = network.processes("recorder")
     recorder.kill(signal.SIGSTOP)  # so the run does not end
     network.wait_for(lambda: min(read_steps(steps)) == 120, 60, "the last steps")

@@ -118,7 +118,7 @@ def test_a_protocol_that_is_not_linear_in_real_time(network: Any) -> None:
 
 def killed_and_back(network: Any, run: subprocess.Popen[str], victims: Callable[[], list[Any]]) -> Trajectory:
     """Kill these in the middle of a run, at once; its trajectory."""
-    network.wait_until_moving()
+    network.wait_for_steps()
     for victim in network.wait_for(victims, 30, "a living agent"):
         victim.kill(signal.SIGKILL)
     stdout, stderr = run.communicate(timeout=180)

@@ -27,7 +27,6 @@ from started_processes import started_processes
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.status_file import read_steps
-from msg_agents.running.supervisor import STEPS
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.run.trajectory import Trajectory
@@ -183,8 +182,7 @@ def test_an_agent_stands_still_and_the_clock_is_set_back(network: Any) -> None:
     clock = SetClock(network.directory)
     file = network.file(run=REALTIME | {"duration": 35, "processes": 2})
     run = network.record(file, "--json", **clock.environment)
-    network.wait_until_moving()
-    steps = network.run_file().with_name(STEPS)
+    steps = network.wait_for_steps()
     (agent, *_) = network.processes("agent")
     agent.kill(signal.SIGSTOP)
     time.sleep(3.0)

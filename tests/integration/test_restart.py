@@ -131,7 +131,7 @@ def test_who_comes_back_repeats_only_what_peers_may_lack(network: Any) -> None:
             stack.callback(listener.kill)  # or it would be waited for, whatever has failed
             assert listener.stdout is not None
             assert listener.stdout.readline() == "ready\n"
-            network.wait_until_moving()
+            network.wait_for_steps()
             for agent in (2, 3):
                 (victim,) = [process for process in network.processes("agent") if process.agent == agent]
                 victim.kill()

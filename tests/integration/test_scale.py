@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
 from visitor import watched_endpoints
 
+from msg_agents.processes.status_file import read_steps
+from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 
 
@@ -34,9 +38,9 @@ def test_complete_and_equal_to_the_twin(network: Any, rows: int, columns: int, p
 
 def test_a_killed_process_of_many_agents_comes_back(network: Any) -> None:
     """What its agents had told each other directly has gone with it."""
-    run = {"duration": 100, "start": "zero", "processes": 2, "replicas": 16}
+    run = {"duration": 200, "start": "zero", "processes": 2, "replicas": 16}
     process = network.record(network.file(**grid(6, 5), run=run), "--restarts", "1", "--json")
-    network.wait_until_moving()
+    network.wait_for_steps()
     network.processes("agent")[0].kill()
     assert len(network.completed(process)["restarts"]) == 1
 
@@ -80,19 +84,28 @@ def back_on(network: Any, victim: Any, cores: set[int]) -> None:
         others = [p for p in network.processes("agent") if p.agent == victim.agent and p != victim]
         return any(cores_of(process.pid) == cores for process in others)
 
-    network.wait_for(back, 10, "the agent on its core again")
+    network.wait_for(back, 60, "the agent on its core again")
 
 
 def test_processes_of_one_agent_that_hear_all_others(network: Any) -> None:
-    """Each keeps to one core, where there are more of them than cores; so does the one that comes back."""
-    run = {"duration": 25, "start": "zero", "processes": "one_per_agent", "replicas": 16}
+    """Each keeps to one core, where there are more of them than cores; so does the one that comes back.
+
+    Nobody waits for the planned end of the run, so it cannot be over too early.
+    """
+    run = {"duration": 1000, "start": "zero", "processes": "one_per_agent", "replicas": 16}
     process = network.record(network.file(**complete(17), run=run), "--restarts", "1", "--json")
-    network.wait_until_moving()
+    steps = network.wait_for_steps()
     kept = assert_cores(network, pinned=2 <= len(os.sched_getaffinity(0)) <= 17)
     victim = network.processes("agent")[-1]
     back_on(network, victim, kept[victim.agent])
-    result = network.completed(process)
+    before = max(read_steps(steps))
+    network.wait_for(lambda: min(read_steps(steps)) > before, 60, "steps of all after that")
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 3, stderr
+    result = json.loads(stdout)
     assert (len(result["restarts"]), result["strangers"]) == (1, [])
+    assert check(read_bag(result["bag"])).difference is None
 
 
 @pytest.mark.parametrize(
@@ -121,12 +134,12 @@ def test_processes_that_hear_most_of_a_network(
         "/agent_1/state": sorted(f"agent_{i}" for i in of_first),
         "/agent_24/state": sorted(f"agent_{i}" for i in of_last),
     }
-    run = {"duration": 40, "start": "zero", "processes": processes, "replicas": 16}
+    run = {"duration": 80, "start": "zero", "processes": processes, "replicas": 16}
     wanted = {topic: [[name, "RELIABLE"] for name in names] for topic, names in readers.items()}
     with watched_endpoints(wanted, {}, domain):
         options = ("--no-pin", "--restarts", "1", "--json", "--domain", str(domain))
         process = network.record(network.file(**experiment, run=run), *options)
-    network.wait_until_moving()
+    network.wait_for_steps()
     kept = assert_cores(network, pinned=False)
     victim = network.processes("agent")[-1]
     back_on(network, victim, kept[victim.agent])

@@ -190,15 +190,16 @@ def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Ex
 
     monkeypatch.setattr(running_errors.LiveEstimate, "report", fail)
     notes: list[str] = []
-    experiment = network.experiment(run={"duration": 200, "processes": 2})
+    four_seconds = {"pace": "realtime", "duration": 40, "speed": 10.0}  # the errors are looked at once a second
+    experiment = network.experiment(run=four_seconds | {"processes": 2})
     result = network.run(experiment, until=Until(0.5), on_note=notes.append)
     complete(result)
-    assert len(result.trajectory.modes) == 4000
+    assert len(result.trajectory.modes) == 800
     assert not result.until["ended_early"]
     assert result.until["reason"].startswith(
         f"not known: the errors cannot be followed any more ({type(error).__name__}"
     )
-    assert any("the run goes on to step 4000" in note for note in notes)
+    assert any("the run goes on to step 800" in note for note in notes)
 
 
 def test_too_late(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
