@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import functools
 import gc
+import itertools
+import math
 import os
 import signal
 import sys
@@ -34,7 +36,11 @@ if sys.platform == "linux":
     for option, size in ((M_TRIM_THRESHOLD, 2**28), (M_TOP_PAD, 2**26), (M_MMAP_THRESHOLD, 2**25)):
         getattr(ctypes.CDLL(None), "mallopt", lambda *_: 0)(option, size)
 
+NETWORKS = 0.6
+"""Part of the time of all tests that those with networks take: of so many workers, they are the first tests."""
+
 INTEGRATION = Path(__file__).parent / "integration"
+ANALYSIS = Path(__file__).parent / "analysis"
 
 MACHINE = "this machine: "
 """How the reason of a skipped test begins if nothing that can be installed would help."""
@@ -49,19 +55,22 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Networks wait a good part of their time, so they run beside tests that compute; the longest ones first.
+    """Networks wait a good part of their time, so they run beside tests that compute, to the end of both.
 
-    Workers begin with equal parts of the list, in order: of two of them, one has all the networks of both.
+    Each worker begins with an equal part of the list. Some begin with networks, the longest ones first; what is left
+    when all of them have run only computes, and keeps all cores busy.
     """
-    pairs = max(1, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) // 2)
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    with_networks = math.ceil(workers * NETWORKS)
     networks = sorted((item for item in items if _has_network(item.path)), key=_limit, reverse=True)
-    others = [item for item in items if not _has_network(item.path)]
-    items[:] = [
-        item
-        for pair in range(pairs)
-        for kind in (networks, others)
-        for item in kind[pair * len(kind) // pairs : (pair + 1) * len(kind) // pairs]
-    ]
+    modules = [list(module) for _, module in itertools.groupby(networks, key=lambda item: item.path)]
+    others = iter(sorted((item for item in items if not _has_network(item.path)), key=_only_computes))
+    ordered: list[pytest.Item] = []
+    for worker in range(workers):
+        own = modules[worker::with_networks] if worker < with_networks else []
+        ordered += itertools.chain.from_iterable(own)
+        ordered += itertools.islice(others, max(0, len(items) * (worker + 1) // workers - len(ordered)))
+    items[:] = [*ordered, *others]
 
 
 def pytest_collection_finish() -> None:
@@ -73,6 +82,11 @@ def pytest_collection_finish() -> None:
 @functools.cache
 def _has_network(path: Path) -> bool:
     return INTEGRATION in path.parents
+
+
+def _only_computes(item: pytest.Item) -> bool:
+    """It neither waits nor has a browser, so several of these keep all cores busy at the end."""
+    return ANALYSIS in item.path.parents and "browser" not in item.path.stem
 
 
 def _limit(item: pytest.Item) -> float:

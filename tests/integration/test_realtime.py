@@ -156,10 +156,10 @@ def test_without_a_clock(network: Any, option: list[str]) -> None:
 def test_killed_and_back(network: Any, repetition: int) -> None:
     """An agent and the switcher are killed; whoever takes over keeps to the epoch and catches up."""
     rng = random.Random(f"realtime {repetition}")
-    what = network.experiment(run={**REALTIME, "duration": 35, "replicas": 16, "processes": 3})
+    what = network.experiment(run={**REALTIME, "duration": 25, "replicas": 16, "processes": 3})
 
     def kill() -> None:
-        network.wait_until_moving()
+        network.wait_for_steps()
         for kind in ("agent", "switcher"):
             time.sleep(rng.uniform(0.0, 1.0))
             victims = network.wait_for(lambda kind=kind: network.processes(kind), 30, f"a living {kind}")
