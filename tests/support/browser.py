@@ -110,6 +110,20 @@ class Tab:
         page.goto(address)
         return page, self._log
 
+    @contextmanager
+    def phone(self, address: str) -> Iterator[tuple[Any, Any]]:
+        """The page with this address on the screen of a phone, and a session that can send touches."""
+        page, _ = self.open("about:blank", width=390, height=800)
+        session = page.context.new_cdp_session(page)
+        screen = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+        session.send("Emulation.setTouchEmulationEnabled", {"enabled": True})
+        session.send("Emulation.setDeviceMetricsOverride", screen)
+        page.goto(address)
+        try:
+            yield page, session
+        finally:
+            session.detach()
+
 
 @contextmanager
 def chromium() -> Iterator[Any]:
