@@ -120,3 +120,11 @@ def browser() -> Iterator[Any]:
 
     with chromium() as found:
         yield found
+
+
+@pytest.fixture(scope="session")
+def tab(browser: Any) -> Any:
+    """A page of this browser, which is used again and again."""
+    from browser import Tab
+
+    return Tab(browser)

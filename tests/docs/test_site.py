@@ -6,15 +6,18 @@ import contextlib
 import re
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from browser import CUT_OR_SCROLLED, FAINT, Log
+from browser import CUT_OR_SCROLLED, FAINT, Log, Tab
 from click.testing import CliRunner
 from mkdocs.__main__ import cli
 from pages import EXPERIMENTS, ROOT, blocks
 
+SCHEMES = ("default", "slate")
+READ = ("index", "examples", "commands", "theory", "api", "which_page")
+"""Pages with tables, graphs, code in several languages, equations and the API."""
 LOADS = {"img": "src", "script": "src", "iframe": "src", "source": "src", "link": "href"}
 
 
@@ -104,15 +107,13 @@ def test_graphs_of_the_examples(site: Path) -> None:
     assert all(colours.count(f"{used}:") == 2 for used in set(re.findall(r"--graph-\d", text)))  # light and dark
 
 
-def test_example_report(browser: Any, site: Path) -> None:
+def test_example_report(tab: Tab, site: Path) -> None:
     """In its page and in its own tab: by the commands of the page, in its scheme, drawn without a complaint."""
     report = site / "reports/line_ring.html"
     commands = next(blocks(ROOT / "docs/example_report.md", "sh")).splitlines()
     assert f"<code>{' &amp;&amp; '.join(commands)}</code>" in report.read_text(encoding="utf-8")
     # The scheme is not emulated, as that wins in frames.
-    page = browser.new_page(viewport={"width": 1280, "height": 900}, color_scheme="null")
-    log = Log(page)
-    page.goto((site / "example_report.html").as_uri())
+    page, log = tab.open((site / "example_report.html").as_uri(), width=1280, scheme="null")
     page.locator("iframe.report").scroll_into_view_if_needed()
     inside = page.frame_locator("iframe.report")
     inside.locator("body[data-ready=yes]").wait_for()
@@ -133,47 +134,59 @@ def test_example_report(browser: Any, site: Path) -> None:
     assert alone.url == report.as_uri()
     assert [url for url in log.requests if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
     assert log.complaints == []
-    page.context.close()
+    alone.close()
+    page.evaluate("localStorage.clear()")
+
+
+class Seen(NamedTuple):
+    """What was found when all pages were opened, one after the other."""
+
+    log: Log
+    first: str
+    """Address of the first result of a search."""
+    wide: list[str]
+    """Pages wider than a phone."""
+    poor: dict[str, list[Any]]
+    """By colour scheme: texts that are faint or cut, with page and width."""
 
 
 @pytest.fixture(scope="module")
-def texts(browser: Any, site: Path) -> dict[str, Any]:
-    """Pages with tables, graphs, code in several languages, equations and the API, opened."""
-    opened = {}
-    for name in ("index", "examples", "commands", "theory", "api", "which_page"):
-        opened[name] = page = browser.new_page(viewport={"width": 390, "height": 844})
-        page.goto((site / f"{name}.html").as_uri())
-        page.add_style_tag(content="* { transition: none !important; }")
-    return opened
-
-
-@pytest.mark.parametrize("scheme", ["default", "slate"])
-def test_texts_can_be_read(texts: dict[str, Any], scheme: str) -> None:
-    """No text is faint or cut."""
-    for name, page in texts.items():
-        page.evaluate(f"document.body.dataset.mdColorScheme = '{scheme}'")
-        for width in (390, 1280):
-            page.set_viewport_size({"width": width, "height": 844})
-            assert page.evaluate(FAINT) == [], (name, width)
-            assert page.evaluate(CUT_OR_SCROLLED) == [], (name, width)
-
-
-def test_in_a_browser(browser: Any, site: Path, pages: dict[Path, Links]) -> None:
-    """Opened from the disk: no request to anywhere, no error, nothing wider than a phone, and the search finds."""
-    wide = []
-    page = browser.new_page(viewport={"width": 390, "height": 844})
-    log = Log(page)
+def seen(tab: Tab, site: Path, pages: dict[Path, Links]) -> Seen:
+    assert {site / f"{name}.html" for name in READ} <= set(pages)
+    page, log = tab.open("about:blank", width=390, height=844)
+    wide, poor = [], {scheme: [] for scheme in SCHEMES}
     for file in pages:
+        page.set_viewport_size({"width": 390, "height": 844})
         page.goto(file.as_uri())
         if page.evaluate("document.documentElement.scrollWidth > document.documentElement.clientWidth"):
             wide.append(file.name)
+        if file.parent != site or file.stem not in READ:
+            continue
+        page.add_style_tag(content="* { transition: none !important; }")
+        for width in (390, 1280):
+            page.set_viewport_size({"width": width, "height": 844})
+            for scheme, found in poor.items():
+                page.evaluate(f"document.body.dataset.mdColorScheme = '{scheme}'")
+                for script in (FAINT, CUT_OR_SCROLLED):
+                    found += [(file.name, width, one) for one in page.evaluate(script)]
     page.set_viewport_size({"width": 1280, "height": 900})
     page.goto((site / "index.html").as_uri())
     page.locator(".md-search__input").fill("supermodularity")
     first = page.locator(".md-search-result__link").first
     first.wait_for(timeout=30_000)
-    assert "leaders.html" in str(first.get_attribute("href"))
-    assert [url for url in log.requests if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
-    assert log.complaints == []
-    assert wide == []
-    page.close()
+    return Seen(log, str(first.get_attribute("href")), wide, poor)
+
+
+def test_in_a_browser(seen: Seen) -> None:
+    """Opened from the disk: no request to anywhere, no error, nothing wider than a phone, and the search finds."""
+    assert "leaders.html" in seen.first
+    addresses = seen.log.requests
+    assert [url for url in addresses if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
+    assert seen.log.complaints == []
+    assert seen.wide == []
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_texts_can_be_read(seen: Seen, scheme: str) -> None:
+    """No text is faint or cut, on a phone and at a desk."""
+    assert seen.poor[scheme] == []

@@ -72,14 +72,57 @@ class Log:
     def __init__(self, page: Any) -> None:
         self.complaints: list[str] = []
         self.requests: list[str] = []
-        page.on("console", self._said)
-        page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        page.on("request", lambda request: self.requests.append(request.url))
+        self._page = page
+        self._heard = {
+            "console": self._said,
+            "pageerror": lambda error: self.complaints.append(str(error)),
+            "request": lambda request: self.requests.append(request.url),
+        }
+        for event, hear in self._heard.items():
+            page.on(event, hear)
         page.set_default_timeout(WAIT)
+
+    def end(self) -> None:
+        for event, hear in self._heard.items():
+            self._page.remove_listener(event, hear)
 
     def _said(self, message: Any) -> None:
         if message.type not in ("info", "log", "debug"):
             self.complaints.append(message.text)
+
+
+class Tab:
+    """A page for one address after the other: its process need not start and compile the same scripts each time."""
+
+    def __init__(self, browser: Any) -> None:
+        self._page = browser.new_page()
+        self._log = Log(self._page)
+
+    def open(self, address: str, *, width: int, height: int = 900, scheme: str = "light") -> tuple[Any, Log]:
+        """The page with this address, of this size and colour scheme, and the log from here on."""
+        page = self._page
+        self._log.end()
+        page.goto("about:blank")  # nothing more comes from the page before
+        page.set_viewport_size({"width": width, "height": height})
+        page.emulate_media(color_scheme=scheme)
+        page.mouse.move(0, 0)
+        self._log = Log(page)
+        page.goto(address)
+        return page, self._log
+
+    @contextmanager
+    def phone(self, address: str) -> Iterator[tuple[Any, Any]]:
+        """The page with this address on the screen of a phone, and a session that can send touches."""
+        page, _ = self.open("about:blank", width=390, height=800)
+        session = page.context.new_cdp_session(page)
+        screen = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+        session.send("Emulation.setTouchEmulationEnabled", {"enabled": True})
+        session.send("Emulation.setDeviceMetricsOverride", screen)
+        page.goto(address)
+        try:
+            yield page, session
+        finally:
+            session.detach()
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import CUT, FAINT, Log
+from browser import CUT, FAINT, Log, Tab
 from PIL import Image
 
 from msg_analysis.inference.verdict.compare import compare
@@ -44,10 +44,8 @@ def _trajectory(agents: int, **run: Any) -> Trajectory:
     return simulate(ValidExperiment.parse(_document(agents, **run)))
 
 
-def _open(browser: Any, path: Path) -> tuple[Any, Log]:
-    page = browser.new_page(viewport={"width": 1000, "height": 900})
-    log = Log(page)
-    page.goto(path.as_uri())
+def _open(tab: Tab, path: Path) -> tuple[Any, Log]:
+    page, log = tab.open(path.as_uri(), width=1000)
     page.wait_for_selector("body[data-ready=yes]")
     return page, log
 
@@ -90,12 +88,16 @@ def reports(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Pat
 
 
 @pytest.mark.parametrize("agents", [5, 100])
-def test_small_and_large(browser: Any, reports: Callable[..., tuple[Path, Trajectory]], agents: int) -> None:
-    """Hover shows values; agents are chosen by numbers and by a click; paper has everything."""
+def test_small_and_large(tab: Tab, reports: Callable[..., tuple[Path, Trajectory]], agents: int) -> None:
+    """Figures are drawn when near, on paper all are; hover shows values; agents are chosen by numbers and a click."""
     path, _ = reports(agents, **({} if agents == 5 else HUNDRED))
     assert path.stat().st_size < 3_000_000
-    page, log = _open(browser, path)
-    _check(page, log, path)
+    page, log = _open(tab, path)
+    figures, drawn = page.locator(".figure").count(), page.locator(".figure:not(:empty)").count()
+    assert 4 <= drawn < figures - 4
+    page.locator("#innovations").scroll_into_view_if_needed()
+    page.locator("[aria-label^='Variance of the innovations'] .figure:not(:empty)").wait_for()
+    assert page.locator(".figure:empty").count() > 0
 
     rows = page.locator("#node-table tbody tr:visible")
     page.fill("#agents", "2, 4-5")
@@ -132,22 +134,27 @@ def test_small_and_large(browser: Any, reports: Callable[..., tuple[Path, Trajec
     page.click("#all-agents")
 
     page.locator("details").last.evaluate("one => one.open = false")
+    page.evaluate(
+        """() => window.addEventListener("beforeprint", () => {
+            window.pictured = document.querySelectorAll(".plot.pictured img").length;
+        })"""
+    )
     paper = page.pdf(format="A4")
     assert paper.startswith(b"%PDF")
     assert paper.count(b"/Subtype /Image") >= 5
     assert page.locator(".plot.pictured").count() == 0  # as before
     assert page.locator("details[open]").count() == 1
-    assert log.complaints == []
-    page.close()
+    assert page.evaluate("window.pictured") == figures
+    _check(page, log, path)
 
 
-def test_agents_by_name(browser: Any, tmp_path: Path) -> None:
+def test_agents_by_name(tab: Tab, tmp_path: Path) -> None:
     """Both fields take names and numbers, and the figures show names, whatever is in them."""
     names = ["Bad Ems", "<b>Ulm</b>", "$$x$$", "Kiel", "1"]
     trajectory = simulate(ValidExperiment.parse(_document(5) | {"names": names}))
     path = tmp_path / "report.html"
     write_report(compare(trajectory), trajectory, path)
-    page, log = _open(browser, path)
+    page, log = _open(tab, path)
     _check(page, log, path)
     page.fill("#agents", "Kiel, Bad Ems ,3; 1")
     assert page.locator("#node-table tbody tr:visible td:first-child").all_inner_texts() == [
@@ -163,7 +170,6 @@ def test_agents_by_name(browser: Any, tmp_path: Path) -> None:
     assert "Kiel" not in page.input_value("#shown-agents").split(", ")
     assert page.locator("main b, svg b", has_text="Ulm").count() == 0
     assert log.complaints == []
-    page.close()
 
 
 @pytest.fixture(scope="module")
@@ -185,10 +191,12 @@ def disagrees(kinds: Callable[[Any], Path]) -> Path:
     return kinds(_disagreeing)
 
 
-def test_screens_of_all_kinds(browser: Any, disagrees: Path) -> None:
+def test_screens_of_all_kinds(tab: Tab, disagrees: Path) -> None:
     """On large and small screens, light and dark, nothing is cut or faint; the keyboard reaches all controls."""
     path = disagrees
-    page, log = _open(browser, path)
+    page, log = _open(tab, path)
+    _check(page, log, path)
+    assert "The gain of edge 1-4 in both directions" in page.inner_text("body")
     for one in page.locator("details").all():
         one.evaluate("one => one.open = true")
     for width in (1280, 390):
@@ -218,18 +226,21 @@ def test_screens_of_all_kinds(browser: Any, disagrees: Path) -> None:
 
     page.focus("a")
     reached = set()
-    while page.evaluate("document.activeElement !== document.body"):
-        reached.add(page.evaluate("document.activeElement.id || document.activeElement.textContent"))
+    at = "((one) => one !== document.body && [one.id || one.textContent])(document.activeElement)"
+    while found := page.evaluate(at):
+        reached.add(*found)
         page.keyboard.press("Tab")
     controls = page.locator("a, button, input, select, summary").all()
     assert {one.get_attribute("id") or one.text_content() for one in controls} <= reached
-    page.close()
 
 
-def test_a_finger_scrolls_the_page(browser: Any, disagrees: Path) -> None:
+def test_a_finger_scrolls_the_page(tab: Tab, disagrees: Path) -> None:
     """Only the frame of the overview is moved by it, until a tool is chosen."""
-    page = browser.new_page(viewport={"width": 390, "height": 800}, has_touch=True, is_mobile=True)
-    page.goto(disagrees.as_uri())
+    with tab.phone(disagrees.as_uri()) as (page, touch):
+        _finger(page, touch)
+
+
+def _finger(page: Any, touch: Any) -> None:
     page.wait_for_selector("body[data-ready=yes]")
     _draw_all(page)
     actions = page.evaluate(
@@ -245,20 +256,18 @@ def test_a_finger_scrolls_the_page(browser: Any, disagrees: Path) -> None:
     box = overview.bounding_box()
     y, middle = box["y"] + 20, box["x"] + 76 + (box["width"] - 90) / 2
     before = page.evaluate("Bokeh.documents[0].get_model_by_name('time').start")
-    touch = page.context.new_cdp_session(page)
     for kind, shift in (("touchStart", 0), ("touchMove", 10), ("touchMove", 30), ("touchMove", 50), ("touchEnd", 50)):
         points = [] if kind == "touchEnd" else [{"x": middle + shift, "y": y}]
         touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
     after = page.evaluate("Bokeh.documents[0].get_model_by_name('time').start")
     assert after > before
     assert page.evaluate("document.documentElement.scrollWidth <= 390")
-    page.close()
 
 
-def test_trajectories(browser: Any, reports: Callable[..., tuple[Path, Trajectory]]) -> None:
+def test_trajectories(tab: Tab, reports: Callable[..., tuple[Path, Trajectory]]) -> None:
     """Agents are switched on and off, and every part of the run can be seen, with the keyboard alone."""
     path, trajectory = reports(5, **LONG)
-    page, log = _open(browser, path)
+    page, log = _open(tab, path)
 
     def drawn(name: str, column: str) -> Any:
         return page.evaluate(f"Bokeh.documents[0].get_model_by_name('{name}').data['{column}']")
@@ -314,37 +323,14 @@ def test_trajectories(browser: Any, reports: Callable[..., tuple[Path, Trajector
     page.click("#show-none")
     settled("model('states').data.agent.length == 0")
     assert log.complaints == []
-    page.close()
-
-
-def test_figures_are_drawn_when_they_are_near(browser: Any, reports: Callable[..., tuple[Path, Trajectory]]) -> None:
-    """Those far below are not, until they are printed: on paper there are all."""
-    path, _ = reports(5)
-    page, log = _open(browser, path)
-    figures, drawn = page.locator(".figure").count(), page.locator(".figure:not(:empty)").count()
-    assert 4 <= drawn < figures - 4
-    page.locator("#innovations").scroll_into_view_if_needed()
-    page.locator("[aria-label^='Variance of the innovations'] .figure:not(:empty)").wait_for()
-    assert page.locator(".figure:empty").count() > 0
-    page.evaluate(
-        """() => window.addEventListener("beforeprint", () => {
-            window.pictured = document.querySelectorAll(".plot.pictured img").length;
-        })"""
-    )
-    page.pdf(format="A4")
-    assert page.evaluate("window.pictured") == figures
-    assert log.complaints == []
-    page.close()
 
 
 @pytest.mark.parametrize(("agents", "run"), [(5, LONG), (100, HUNDRED)])
-def test_replicas(
-    browser: Any, reports: Callable[..., tuple[Path, Trajectory]], agents: int, run: dict[str, Any]
-) -> None:
+def test_replicas(tab: Tab, reports: Callable[..., tuple[Path, Trajectory]], agents: int, run: dict[str, Any]) -> None:
     """Each that has room can be chosen with the keyboard; its values are those of the run, to 16 bits of their span."""
     path, trajectory = reports(agents, **run)
     assert path.stat().st_size < 3_000_000
-    page, log = _open(browser, path)
+    page, log = _open(tab, path)
     offered = page.locator("#replica option").all_inner_texts()
     assert len(offered) == (16 if agents == 5 else 4)
     caption = page.locator("#trajectories figcaption")
@@ -368,7 +354,6 @@ def test_replicas(
     width = int(re.findall(r"every (\d+) steps", caption.inner_text())[0]) if agents == 100 else 1
     assert width == -(-(len(trajectory.values)) // 306) if agents == 100 else "every" in caption.inner_text()
     assert log.complaints == []
-    page.close()
 
 
 def _in_real_time() -> tuple[Any, Trajectory]:
@@ -422,15 +407,14 @@ def _tracking() -> tuple[Any, Trajectory]:
     ("make", "words"),
     [
         (_in_real_time, ["age of values used", "Real time"]),
-        (_disagreeing, ["The gain of edge 1-4 in both directions"]),
         (_incomplete, ["too early to compute"]),
         (_pooled, ["bag_2", "1, 2, 3"]),
         (_tracking, ["the leader, agent 2, is held at the reference 3", "Probabilities"]),
     ],
 )
-def test_every_kind(browser: Any, kinds: Callable[[Any], Path], make: Any, words: list[str]) -> None:
+def test_every_kind(tab: Tab, kinds: Callable[[Any], Path], make: Any, words: list[str]) -> None:
     path = kinds(make)
-    page, log = _open(browser, path)
+    page, log = _open(tab, path)
     _check(page, log, path)
     text = page.inner_text("body")
     for word in words:
@@ -438,4 +422,3 @@ def test_every_kind(browser: Any, kinds: Callable[[Any], Path], make: Any, words
     page.set_viewport_size({"width": 390, "height": 900})
     page.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     assert page.evaluate(CUT) == []
-    page.close()

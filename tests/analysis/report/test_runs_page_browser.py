@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import FAINT, Log
+from browser import FAINT, Log, Tab
 
 from msg_analysis import Experiment
 from msg_analysis.report.html.runs_page import write_runs_page
@@ -61,18 +61,16 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place / "index.html"
 
 
-def opened(browser: Any, file: Path, width: int, scheme: str) -> tuple[Any, Log]:
-    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    log = Log(page)
-    page.goto(file.as_uri())
+def opened(tab: Tab, file: Path, width: int, scheme: str) -> tuple[Any, Log]:
+    page, log = tab.open(file.as_uri(), width=width, height=800, scheme=scheme)
     page.wait_for_selector("body[data-ready=yes]")
     return page, log
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1280, 390])
-def test_nothing_is_cut_or_pale(browser: Any, file: Path, width: int, scheme: str) -> None:
-    page, log = opened(browser, file, width, scheme)
+def test_nothing_is_cut_or_pale(tab: Tab, file: Path, width: int, scheme: str) -> None:
+    page, log = opened(tab, file, width, scheme)
     page.focus("#plot")
     page.keyboard.press("End")
     assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -81,11 +79,10 @@ def test_nothing_is_cut_or_pale(browser: Any, file: Path, width: int, scheme: st
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor") != "rgb(255, 255, 255)"
     assert dark == (scheme == "dark")
     assert (log.complaints, log.requests) == ([], [file.as_uri()])
-    page.close()
 
 
-def test_filters_order_and_difference(browser: Any, file: Path) -> None:
-    page, log = opened(browser, file, 1280, "light")
+def test_filters_order_and_difference(tab: Tab, file: Path) -> None:
+    page, log = opened(tab, file, 1280, "light")
     rows = page.locator("#runs tbody tr:visible")
     assert rows.count() == 11
     # The two newest of the experiment with most runs, and what differs between them.
@@ -119,12 +116,11 @@ def test_filters_order_and_difference(browser: Any, file: Path) -> None:
     page.click("#swap")
     assert page.locator("#b option:checked").inner_text() == "line_20261130_120000"
     assert log.complaints == []
-    page.close()
 
 
-def test_keys_reach_everything(browser: Any, file: Path) -> None:
+def test_keys_reach_everything(tab: Tab, file: Path) -> None:
     """The plot takes arrows and Enter; filters, heads of the table and boxes are stations of Tab."""
-    page, log = opened(browser, file, 1280, "dark")
+    page, log = opened(tab, file, 1280, "dark")
     reached = []
     for _ in range(40):
         page.keyboard.press("Tab")
@@ -149,4 +145,3 @@ def test_keys_reach_everything(browser: Any, file: Path) -> None:
     ]
     assert page.evaluate("getComputedStyle(plot).outlineStyle") == "solid"
     assert log.complaints == []
-    page.close()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from browser import CUT, FAINT, Log
+from browser import CUT, FAINT, Tab
 
 from msg_analysis.report.figures.sideways import shifted
 from msg_analysis.report.html.sweep_page import write_sweep_page
@@ -40,14 +40,12 @@ def page_of(directory: Path, over: dict[str, list[Any]], fails: Any = None) -> P
 
 
 @pytest.mark.parametrize("keys", [1, 3])
-def test_keys_and_pointer(browser: Any, tmp_path: Path, keys: int) -> None:
+def test_keys_and_pointer(tab: Tab, tmp_path: Path, keys: int) -> None:
     """Lines over each key; a heat map over two; beside each other for the values of a third."""
     every = {"switching.rates.<b>$$x$$.ring": [0.1, 1, 10], "noise.loss": [0, 0.5, 0.9], "run.dt": [0.05, 0.1]}
     over = dict(list(every.items())[:keys])
     path = page_of(tmp_path, over, fails=0.1 if keys == 3 else None)
-    page = browser.new_page(viewport={"width": 390, "height": 800}, color_scheme="dark" if keys == 3 else "light")
-    log = Log(page)
-    page.goto(path.as_uri())
+    page, log = tab.open(path.as_uri(), width=390, height=800, scheme="dark" if keys == 3 else "light")
     page.wait_for_selector("body[data-ready=yes]")
     assert page.locator("[data-name^=map_]").count() == {1: 0, 3: 2}[keys]
     assert page.locator("#along input").count() == {1: 0, 3: 3}[keys]
@@ -78,7 +76,6 @@ def test_keys_and_pointer(browser: Any, tmp_path: Path, keys: int) -> None:
         assert "<i>broke</i>" in page.inner_text(".verdict")
     assert log.complaints == []
     assert log.requests == [path.as_uri()]
-    page.close()
 
 
 def test_names_of_keys_and_columns() -> None:
