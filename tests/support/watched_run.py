@@ -6,7 +6,7 @@ import random
 
 from msg_analysis.bags import trajectory_writer
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.online.running_errors import LiveEstimate
+from msg_analysis.inference.online.running_errors import LiveEstimate, LiveReport
 from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.theory.prediction import Prediction
@@ -19,7 +19,9 @@ def messages_of(trajectory: Trajectory) -> list[tuple[str, bytes]]:
     return [(topic, content) for topic, content, _, _ in trajectory_writer._messages(trajectory)]
 
 
-def watch(live: LiveEstimate, messages: list[tuple[str, bytes]], *, disorder: float = 0.0, every: int = 200) -> None:
+def watch(
+    live: LiveEstimate, messages: list[tuple[str, bytes]], *, disorder: float = 0.0, every: int = 200
+) -> LiveReport:
     """Give the messages to a watcher, which looks from time to time; ``disorder``: steps by which states are late."""
     experiment, rng = live.record.experiment, random.Random(1)
     whole, said = state_frame(live.record, whole=True), state_frame(live.record, whole=False)
@@ -40,7 +42,7 @@ def watch(live: LiveEstimate, messages: list[tuple[str, bytes]], *, disorder: fl
         live.add(agent - 1, step, mode, payload, data, published=published)
         if number % every == every - 1:
             live.report()
-    live.report()
+    return live.report()
 
 
 def watched(trajectory: Trajectory, *, disorder: float = 0.0, every: int = 200) -> LiveEstimate:

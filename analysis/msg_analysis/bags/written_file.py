@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ from msg_analysis.bags.format.mcap_writer import McapWriter
 from msg_analysis.bags.format.metadata import ChannelCount, FileCount, bag_information, dump
 from msg_analysis.bags.format.storage_options import Storage
 from msg_analysis.types import IntArray
-from msg_analysis.wire.topics import Topic
+from msg_analysis.wire.topics import Qos, Topic
 
 # As in rosbag2: small enough that a killed recorder loses little, large enough that the readers' work per chunk does
 # not matter. With a third of it, reading takes a fifth longer.
@@ -98,7 +99,7 @@ class WrittenFile:
     def _add_channel(self, topic: Topic, schema: int) -> None:
         offered = topic.qos.offered()
         self.count.channels[topic.name] = ChannelCount(topic.name, topic.type.full_name, topic.type.type_hash, offered)
-        metadata = {"offered_qos_profiles": dump(offered), "topic_type_hash": topic.type.type_hash}
+        metadata = {"offered_qos_profiles": _offered(topic.qos), "topic_type_hash": topic.type.type_hash}
         self._numbers[topic.name] = self.mcap.register_channel(topic.name, "cdr", schema, metadata)
 
     @property
@@ -168,3 +169,9 @@ class WrittenFile:
     def _add_information(self) -> None:
         information = bag_information([*self._earlier, self.count], self._custom)
         self.mcap.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(information)})
+
+
+@functools.cache
+def _offered(qos: Qos) -> str:
+    """Of all agents' topics the same."""
+    return dump(qos.offered())

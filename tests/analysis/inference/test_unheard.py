@@ -38,23 +38,25 @@ def claimed(trajectory, what):
 def by_hand(trajectory, receiver, sender):
     """(messages, unheard) of one link, message by message."""
     step = predict(trajectory.record.experiment).step
-
+    prefix, modes = trajectory.prefix, trajectory.agent_modes[:, receiver].tolist()
+    read, sent = trajectory.made[:, receiver].tolist(), trajectory.made[:, sender].tolist()
+    rows = trajectory.used[:, receiver].tolist()
     lists = [step.neighbours(graph, receiver).tolist() for graph in range(step.modes)]
 
     def used(k):
-        neighbours = lists[trajectory.agent_modes[k + 1, receiver]]
-        return trajectory.used[k, receiver, neighbours.index(sender)] if sender in neighbours else None
+        neighbours = lists[modes[k + 1]]
+        return rows[k][neighbours.index(sender)] if sender in neighbours else None
 
     def there(n, k):
         """Whether message n was there at step k; of equal times, only if it or a newer one was used."""
-        if n > trajectory.prefix:
+        if n > prefix:
             return False
-        time, published = trajectory.made[k + 1, receiver], trajectory.made[n, sender]
+        time, published = read[k + 1], sent[n]
         return published < time or (published == time and (used(k + step.delay) or -1) >= n)
 
     messages = unheard = k = 0
-    last = trajectory.prefix - step.delay - 1
-    for n in range(1, trajectory.prefix + 1):
+    last = prefix - step.delay - 1
+    for n in range(1, prefix + 1):
         k = next((at for at in range(k, last) if there(n, at)), last)
         if k == last or k < max(step.delay + step.holds, 1) or there(n + 1, k):
             continue

@@ -204,15 +204,13 @@ class Brute:
         maps, k, m = self.maps(), self.size, self.m
         moments = law[:, None, None] * self.start(x)
         found = [self.errors(moments.sum(axis=0)[:m, :m])]
+        own, drawn = maps[:, :, :k], maps[:, :, k:]
+        added = law[:, None, None] * drawn @ drawn.transpose(0, 2, 1)
+        centre = np.eye(k)
+        centre[:, :m] -= 1 / m
         for _ in range(steps):
-            now = np.zeros_like(moments)
-            for mode, matrix in enumerate(maps):
-                own, drawn = matrix[:, :k], matrix[:, k:]
-                now[mode] = own @ moments[mode] @ own.T + law[mode] * drawn @ drawn.T
-            moments = np.tensordot(chain, now, axes=(0, 0))
+            moments = np.tensordot(chain, own @ moments @ own.transpose(0, 2, 1) + added, axes=(0, 0))
             if self.experiment.problem == "consensus":  # the common part grows and does not count
-                centre = np.eye(k)
-                centre[:, :m] -= 1 / m
                 moments = centre @ moments @ centre.T
             found.append(self.errors(moments.sum(axis=0)[:m, :m]))
         return np.array(found)

@@ -152,12 +152,13 @@ def test_the_past_is_stationary(case):
     what = CASES[case]
     model, prediction = build_run_model(what), predict(what)
     centre = np.eye(4) - (0.25 if what.problem == "consensus" else 0.0)
+    weights, noise = centre @ model.weights, centre @ model.noise @ centre
     for mode in range(2):
         pasts = many_pasts(what.time)[mode]
         moments = np.zeros((1000, 4, 4))
         for graphs in pasts.T:
-            w = centre @ model.weights[graphs]
-            moments = w @ moments @ w.transpose(0, 2, 1) + centre @ model.noise[graphs] @ centre
+            w = weights[graphs]
+            moments = w @ moments @ w.transpose(0, 2, 1) + noise[graphs]
         exact = prediction.emulated.by_mode[mode] / model.stationary[mode]
         error = moments.std(axis=0) / np.sqrt(1000)
         assert (np.abs(moments.mean(axis=0) - exact) <= 5 * error + 1e-4 * np.abs(exact).max()).all()

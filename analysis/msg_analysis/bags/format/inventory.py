@@ -19,6 +19,8 @@ Also the check of a file's summary, which the library reads without looking at i
 
 from __future__ import annotations
 
+import copy
+import functools
 import io
 import struct
 import zlib
@@ -151,8 +153,14 @@ def channel_count(channel: Channel, type_name: str) -> ChannelCount:
 
 def offered_profiles(channel: Channel) -> list[Any]:
     """The QoS profiles that the publishers of a channel offered, as rosbag2 writes them; empty if not readable."""
+    return copy.deepcopy(_profiles(channel.metadata.get("offered_qos_profiles", "")))
+
+
+@functools.lru_cache(maxsize=16)
+def _profiles(text: str) -> list[Any]:
+    """All agents have the same text."""
     try:
-        profiles = load_yaml(channel.metadata.get("offered_qos_profiles", ""))
+        profiles = load_yaml(text)
     except (ValueError, yaml.YAMLError):
         return []
     return profiles if isinstance(profiles, list) else []

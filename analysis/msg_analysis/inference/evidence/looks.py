@@ -42,12 +42,14 @@ class Looks:
     @property
     def begins(self) -> IntArray:
         """(T,): first step between each look and the one before it."""
-        return np.append(0, self.ends[:-1])
+        begins = np.zeros_like(self.ends)
+        begins[1:] = self.ends[:-1]
+        return begins
 
     @property
     def lengths(self) -> IntArray:
         """(T,): steps between each look and the one before it."""
-        return np.diff(self.ends, prepend=0)
+        return self.ends - self.begins
 
     def after(self, steps: IntArray) -> IntArray:
         """The look that comes next after each of these steps, from 0."""
