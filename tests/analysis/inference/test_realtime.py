@@ -176,13 +176,13 @@ IN_DETAIL = [
 
 @pytest.mark.parametrize("case", ["consensus", "noise by graph"])
 def test_calibration(late_timers, case):
-    """p-values of 30 late runs of 200 steps are even, intervals cover, verdicts agree.
+    """p-values of 30 late runs of 400 steps are even, intervals cover, verdicts agree.
 
     Kolmogorov-Smirnov at 2e-4 for each of 17 tests, coverage and verdicts at 1e-4 by the binomial law: a right program
     fails a case with probability below 0.5 %.
     """
     late = lateness(late_timers)
-    runs = [late_timers.run(CASES[case].with_run(dt=0.2, seed=seed), timing_seed=seed, **late) for seed in range(30)]
+    runs = [late_timers.run(CASES[case].with_run(seed=seed), timing_seed=seed, **late) for seed in range(30)]
     results = [compare(run) for run in runs]
     collected = [{test.name: test.p for test in result.tests} for result in results]
     names = ["system error", *(f"error of agent {i}" for i in (1, 2, 3)), "covariance"]

@@ -108,8 +108,7 @@ def test_keys_of_a_sweep(tmp_path: Path) -> None:
     assert axis_name("noise.process[2]", sweep.names) == "process noise of agent Bonn [noise.process[2]]"
     assert column_words("continuous.node_errors[3]", sweep.names) == "error of agent Kiel, continuous time"
     out = tmp_path / "out"
-    command = ["sweep", str(file), "--workers", "1", "--out", str(out), "--column", "node_errors[3]"]
-    result = CliRunner().invoke(main, command)
+    result = CliRunner().invoke(main, ["sweep", str(file), "--out", str(out), "--column", "node_errors[3]"])
     assert result.exit_code == 0, result.output
     page = (out / "sweep.html").read_text(encoding="utf-8")
     assert "process noise of agent Bonn" in page
