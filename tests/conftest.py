@@ -36,11 +36,10 @@ if sys.platform == "linux":
     for option, size in ((M_TRIM_THRESHOLD, 2**28), (M_TOP_PAD, 2**26), (M_MMAP_THRESHOLD, 2**25)):
         getattr(ctypes.CDLL(None), "mallopt", lambda *_: 0)(option, size)
 
-NETWORKS = 0.6
-"""Part of the time of all tests that those with networks take: of so many workers, they are the first tests."""
+WAITING = 0.6
+"""Part of the time of all tests that those which wait take: of so many workers, they are the first tests."""
 
-INTEGRATION = Path(__file__).parent / "integration"
-ANALYSIS = Path(__file__).parent / "analysis"
+TESTS = Path(__file__).parent
 
 MACHINE = "this machine: "
 """How the reason of a skipped test begins if nothing that can be installed would help."""
@@ -55,20 +54,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Networks wait a good part of their time, so they run beside tests that compute, to the end of both.
+    """Networks and other processes wait a good part of their time, so they run beside tests that compute, to the end.
 
-    Each worker begins with an equal part of the list. Some begin with networks, the longest ones first; what is left
-    when all of them have run only computes, and keeps all cores busy.
+    Each worker begins with an equal part of the list, the longest tests first. The first workers get what does not
+    wait, but others take over from the ends of their parts: so what a module makes only once, the site, is at the
+    beginning, and what only computes is last and keeps all cores busy.
     """
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    with_networks = math.ceil(workers * NETWORKS)
-    networks = sorted((item for item in items if _has_network(item.path)), key=_limit, reverse=True)
-    modules = [list(module) for _, module in itertools.groupby(networks, key=lambda item: item.path)]
-    others = iter(sorted((item for item in items if not _has_network(item.path)), key=_only_computes))
+    with_waiting = math.ceil(workers * WAITING)
+    waiting = sorted((item for item in items if _waits(item.path)), key=_limit, reverse=True)
+    modules = [list(module) for _, module in itertools.groupby(waiting, key=lambda item: item.path)]
+    others = iter(sorted((item for item in items if not _waits(item.path)), key=_only_computes))
     ordered: list[pytest.Item] = []
     for worker in range(workers):
-        own = modules[worker::with_networks] if worker < with_networks else []
-        ordered += itertools.chain.from_iterable(own)
+        if (place := worker - (workers - with_waiting)) >= 0:
+            ordered += itertools.chain.from_iterable(modules[place::with_waiting])
         ordered += itertools.islice(others, max(0, len(items) * (worker + 1) // workers - len(ordered)))
     items[:] = [*ordered, *others]
 
@@ -80,17 +80,17 @@ def pytest_collection_finish() -> None:
 
 
 @functools.cache
-def _has_network(path: Path) -> bool:
-    return INTEGRATION in path.parents
+def _waits(path: Path) -> bool:
+    return path.relative_to(TESTS).parts[0] in ("integration", "agents")
 
 
 def _only_computes(item: pytest.Item) -> bool:
-    """It neither waits nor has a browser, so several of these keep all cores busy at the end."""
-    return ANALYSIS in item.path.parents and "browser" not in item.path.stem
+    """It starts no command and no browser, and builds no site."""
+    return item.path.relative_to(TESTS).parts[0] == "analysis" and "browser" not in item.path.stem
 
 
 def _limit(item: pytest.Item) -> float:
-    """Seconds that a test may take, where it needs more than others."""
+    """Seconds that a test may take, where it needs or waits for longer than others."""
     mark = item.get_closest_marker("timeout")
     return mark.args[0] if mark else 0.0
 

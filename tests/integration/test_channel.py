@@ -123,6 +123,7 @@ def test_lockstep_over_a_bad_channel_equals_the_twin(network: Any) -> None:
     assert f"<td>agent_1</td><td>agent_2</td><td>{channel['pairs'][6]['sent']}</td>" in page
 
 
+@pytest.mark.timeout(150)
 def test_real_time_over_a_bad_channel(network: Any) -> None:
     """Old values are used where new ones are lost; nothing is missing in the log."""
     run = start(
@@ -201,6 +202,7 @@ def test_a_killed_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
     assert read_bag(result["bag"]).completeness.missing > 0
 
 
+@pytest.mark.timeout(150)
 def test_a_stopped_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
     run = start(network, ENDLESS, "--no-analyse")
     wait_for_steps(network, hosts)

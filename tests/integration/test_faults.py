@@ -19,6 +19,7 @@ from msg_analysis.twin.check import check
 PAUSE = 10.0  # s
 
 
+@pytest.mark.timeout(150)
 def test_stopped_recorder(network: Any, repetition: int, rng: random.Random) -> None:
     """At full speed everybody waits for it in the end, and nothing is lost."""
     file = network.file(run={"duration": 400, "processes": 2})

@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.status_file import read_steps
@@ -46,6 +48,7 @@ def heard_of(file: Path) -> set[str]:
     return {status["name"] for status in statuses(file)}
 
 
+@pytest.mark.timeout(150)
 def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
     """On /diagnostics, in the log of its neighbour, and to the user; then all goes on as if nothing had been.
 
@@ -126,6 +129,7 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
     assert moving
 
 
+@pytest.mark.timeout(150)
 def test_an_agent_that_was_not_given_the_end(network: Any) -> None:
     """It was stopped when the run ended: nothing is missing, so the run does not wait for it for ever."""
     file = network.file(run={"duration": 6, "pace": "realtime", "processes": "one_per_agent"})

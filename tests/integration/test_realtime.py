@@ -153,6 +153,7 @@ def test_without_a_clock(network: Any, option: list[str]) -> None:
     assert "did not discover: a publisher of /clock." in stderr
 
 
+@pytest.mark.timeout(150)
 def test_killed_and_back(network: Any, repetition: int) -> None:
     """An agent and the switcher are killed; whoever takes over keeps to the epoch and catches up."""
     rng = random.Random(f"realtime {repetition}")
@@ -174,6 +175,7 @@ def test_killed_and_back(network: Any, repetition: int) -> None:
     assert_possible(result.trajectory)
 
 
+@pytest.mark.timeout(150)
 def test_an_agent_stands_still_and_the_clock_is_set_back(network: Any) -> None:
     """Each by three seconds: the run says that it is behind, and catches up; then, that no step is due, and waits.
 

@@ -194,6 +194,7 @@ def stranger() -> str:
     return code
 
 
+@pytest.mark.timeout(150)
 def test_a_stranger(network: Any, domain: int) -> None:
     """A plain rclpy node sees graphs and states of a running network, and ends with it."""
     watching = start("python", "-P", "-c", stranger(), cwd=network.directory)

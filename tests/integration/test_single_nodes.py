@@ -135,6 +135,7 @@ def test_the_others_end_without_an_agent(network: Any) -> None:
     assert "complete: 'false'" in (bag / "metadata.yaml").read_text()
 
 
+@pytest.mark.timeout(150)
 def test_a_missing_agent_is_named_by_the_others(network: Any, run_file: Path) -> None:
     """The switcher gives up first: the agents are still there, so it misses nobody else."""
     others = [part for number in "1235" for part in ("--agent", number)]
