@@ -58,11 +58,11 @@ def short_run():
 
 
 CASES = {
-    "line_ring": {"duration": 60, "dt": 0.1, "replicas": 4},
-    "tracking": {"duration": 60, "dt": 0.1, "replicas": 4},
+    "line_ring": {"duration": 60, "replicas": 4},
+    "tracking": {"duration": 60, "replicas": 4},
     "discrete": {"duration": 400, "replicas": 4},
-    "zero start": {"duration": 60, "dt": 0.1, "replicas": 4, "start": "zero"},
-    "far start": {"duration": 30, "dt": 0.1, "replicas": 4, "start": [3.0, 0.0, 0.0, 1.0, -2.0]},
+    "zero start": {"duration": 60, "replicas": 4, "start": "zero"},
+    "far start": {"duration": 30, "replicas": 4, "start": [3.0, 0.0, 0.0, 1.0, -2.0]},
 }
 
 
@@ -88,13 +88,13 @@ def test_calibration(case):
 HARD = {
     "far": {"start": [50.0, -30.0, 20.0, -40.0]},
     "without noise": {"start": [50.0, -30.0, 20.0, -40.0], "noise": {"process": 0.0}},
-    "rare": {"rate": 1e-3, "duration": 100.0, "dt": 0.1},
+    "rare": {"rate": 1e-3, "duration": 100.0},
     "common noise": {"noise": {"process": [[1.0, 0.0, 0.0, 0.0]] * 4}},
 }
 
 
 def hard(case):
-    options = {"rate": 0.5, "duration": 10.0, "dt": 0.05, "start": "stationary", "noise": {"process": 1.0}} | HARD[case]
+    options = {"rate": 0.5, "duration": 10.0, "start": "stationary", "noise": {"process": 1.0}} | HARD[case]
     rate = options["rate"]
     return ValidExperiment.parse(
         {
@@ -103,7 +103,7 @@ def hard(case):
             "graphs": {"line": {"path": [1, 2, 3, 4]}, "pairs": {"edges": [[1, 2], [3, 4]]}},
             "switching": {"generator": [[-rate, rate], [rate, -rate]]},
             "noise": options["noise"],
-            "run": {key: options[key] for key in ("dt", "duration", "start")},
+            "run": {"dt": 0.05, "duration": options["duration"], "start": options["start"]},
         }
     )
 

@@ -58,7 +58,7 @@ def experiment(law: str, air: str, pace: str = "lockstep", **run: Any) -> ValidE
     discrete = document.get("time") == "discrete"
     chain = {"transition": [[0.9, 0.1], [0.3, 0.7]]} if discrete else {"generator": [[-1.0, 1.0], [2.0, -2.0]]}
     dt = 1.0 if discrete else 0.05
-    times = {"dt": dt, "duration": 280 * dt, "replicas": 2, "seed": 5, "pace": pace, "start": [1.0, -2.0, 0.5, 3.0]}
+    times = {"dt": dt, "duration": 340 * dt, "replicas": 2, "seed": 5, "pace": pace, "start": [1.0, -2.0, 0.5, 3.0]}
     noise = {"process": document.pop("process", 0.5), **AIRS[air]}
     return ValidExperiment.parse(document | {"switching": chain, "noise": noise, "run": times | run})
 
@@ -94,7 +94,7 @@ def test_a_past_ends_where_the_run_begins(pace: str) -> None:
 
 @pytest.mark.parametrize("law", ["consensus", "integral_action"])
 @pytest.mark.parametrize("air", ["all", "late and lost", "bursts", "hold"])
-@pytest.mark.parametrize("resumed", [0, 1, 255, 256, 270])
+@pytest.mark.parametrize("resumed", [0, 1, 255, 256, 300])
 def test_agents_alone_equal_the_whole(law: str, air: str, resumed: int) -> None:
     """Also those that go on from some step, and know nothing of what was before."""
     trajectory = run(law, air)
