@@ -1,10 +1,11 @@
 """Our own commands are forked from a process that has imported everything, instead of being executed.
 
-Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis``, ``dask``, fork servers and the nodes
-of tests (``python -P -c CODE``), if nothing is asked for but streams, a directory, a session, a function of this
-folder that is called first, a network namespace (``ip netns exec``), a PYTHONPATH to other packages, and variables that
-are read after the imports. It executes all else as ever. A forked process is a child of the process that asked, has the
-title of its command, and its mark can be read in its environment, as after exec.
+Where it is ``installed``, ``subprocess`` forks ``msg-agents``, ``msg-analysis``, ``dask``, fork servers, the nodes of
+tests (``python -P -c CODE``) and the workers of xdist (``python -u -c CODE``), if nothing is asked for but streams, a
+directory, a session, a function of this folder that is called first, a network namespace (``ip netns exec``), a
+PYTHONPATH to other packages, and variables that are read after the imports. It executes all else as ever. A forked
+process is a child of the process that asked, has the title of its command, and its mark can be read in its environment,
+as after exec.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ RUN_SERVER = "msg_agents.cli.servers.run_server"
 OF_NODE_SERVER = ["-m", NODE_SERVER]
 OF_RUN_SERVER = ["-P", "-m", RUN_SERVER]
 OF_NODE = ["-P", "-c"]
+OF_WORKER = ["-u", "-c"]  # as execnet starts it
 PROGRAMS = {
     "msg-agents": ("msg_agents.cli.entry_points", "msg_agents"),
     "msg-analysis": ("msg_analysis.cli.main", "main"),
@@ -77,6 +79,7 @@ READ_LATER = re.compile(
     "(MKL|OMP|OPENBLAS)_NUM_THREADS"
 )
 """Names of variables that are read after the imports, or are the same for all that is forked (libraries set KMP_)."""
+COMMANDS, NODES = "commands of tests", "nodes of tests"  # what a server forks; the latter ones have less memory to copy
 SUPPORT = Path(__file__).parent
 CLONE_NEWNET = 0x40000000  # linux/sched.h
 LONGEST_TITLE = 2000
@@ -129,7 +132,7 @@ def request_of(words: Sequence[str | bytes | os.PathLike[str]], arguments: Seque
     first = arguments[21]
     known = first is None or (Path(first.__code__.co_filename).parent == SUPPORT and first.__qualname__.isidentifier())
     unusual = not close or new_group != -1 or identity != [None, None, None, -1] or not known
-    of_python = command[1:4] == OF_RUN_SERVER or command[1:3] in (OF_NODE_SERVER, OF_NODE)
+    of_python = command[1:4] == OF_RUN_SERVER or command[1:3] in (OF_NODE_SERVER, OF_NODE, OF_WORKER)
     if unusual or not (of_ours or (of_python and command[0] == sys.executable)):
         return None
     lines = [f"{name}={value}" for name, value in os.environ.items()] if environment is None else environment
@@ -154,7 +157,7 @@ class _Forker:
     """Takes the place of ``_fork_exec`` in a process of the tests: its server starts when it is needed."""
 
     def __init__(self) -> None:
-        self._control: socket.socket | None = None
+        self.controls: dict[str, socket.socket] = {}
         self._whole, self._path = dict(os.environ), list(sys.path)  # as they are before any test changes them
         self._environment = read_at_start(self._whole)
 
@@ -162,8 +165,10 @@ class _Forker:
         request = request_of(arguments[0], arguments)
         if request is None:
             return FORK_EXEC(*arguments)  # type: ignore[misc]
-        if self._control is None:
-            self._control = self._start()
+        kind = NODES if request["command"][1:3] == OF_NODE_SERVER else COMMANDS
+        if kind not in self.controls:
+            self.controls[kind] = start_server(kind, self._whole)
+        control = self.controls[kind]
         request["packages"] = packages_of(request["environment"], self._path)
         at_start = read_at_start(request["environment"])
         if request["packages"]:
@@ -172,27 +177,34 @@ class _Forker:
         message = json.dumps([[request, list(range(len(descriptors)))]]).encode()
         if len(message) > LONGEST or at_start != self._environment:
             return FORK_EXEC(*arguments)  # type: ignore[misc]
-        socket.send_fds(self._control, [message], descriptors)
-        pid = int(self._control.recv(LONGEST))
-        assert self._control.recv(LONGEST) == ALL_FORKED
+        socket.send_fds(control, [message], descriptors)
+        pid = int(control.recv(LONGEST))
+        assert control.recv(LONGEST) == ALL_FORKED
         return pid
-
-    def _start(self) -> socket.socket:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        same = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", MARK: "0" * LENGTH_OF_MARK}
-        same["SPT_NOENV"] = "1"  # titles leave the environment readable
-        with theirs:
-            subprocess.Popen(
-                [sys.executable, "-P", __file__, str(theirs.fileno()), " " * LONGEST_TITLE],
-                env=self._whole | same,
-                pass_fds=[theirs.fileno()],
-            )
-        return ours
 
 
 @functools.cache
 def _forker() -> _Forker:
     return _Forker()
+
+
+def use(control: socket.socket) -> None:
+    """Fork commands from this server, instead of one that would have to start."""
+    _forker().controls[COMMANDS] = control
+
+
+def start_server(kind: str, environment: Mapping[str, str]) -> socket.socket:
+    """Start a server of this kind; the socket at which it is asked for processes."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    same = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", MARK: "0" * LENGTH_OF_MARK}
+    same["SPT_NOENV"] = "1"  # titles leave the environment readable
+    with theirs:
+        subprocess.Popen(
+            [sys.executable, "-P", __file__, str(theirs.fileno()), " " * LONGEST_TITLE, kind],
+            env={**environment, **same},
+            pass_fds=[theirs.fileno()],
+        )
+    return ours
 
 
 def run(request: dict[str, Any], descriptors: list[int]) -> None:
@@ -208,6 +220,7 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
     from setproctitle import setproctitle
 
     command: list[str] = request["command"]
+    server = _leave_server(descriptors) if command[1:3] == OF_WORKER else None
     if request["session"]:
         os.setsid()
     os.chdir(request["directory"])
@@ -229,9 +242,12 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
     random.seed()
     np.random.seed()
     of_python = [] if command[0] == sys.executable else [sys.executable]
-    shown = command[:3] if command[1:3] == OF_NODE else command  # ROS names a log file by it, where code cannot stand
+    of_code = command[1:3] in (OF_NODE, OF_WORKER)
+    shown = command[:3] if of_code else command  # ROS names a log file by it, where code cannot stand
     setproctitle(" ".join([*of_python, *shown]).rstrip())
-    if command[1:3] == OF_NODE:
+    if server is not None:
+        importlib.import_module("forked_commands").use(server)  # not this module, which is a program
+    if of_code:
         sys.argv = command[2:3] + command[4:]
         sys.modules["__main__"] = module = types.ModuleType("__main__")
         return functools.partial(exec, command[3], module.__dict__)
@@ -251,6 +267,17 @@ def become(request: dict[str, Any], descriptors: list[int]) -> Callable[[], None
         importlib.import_module("forked_workers").install()
     place, name = PROGRAMS[Path(command[0]).name]
     return lambda: sys.exit(getattr(importlib.import_module(place), name)())
+
+
+def _leave_server(unneeded: list[int]) -> socket.socket:
+    """Fork a server for the commands of this worker, which has imported everything and has no threads yet."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    if not os.fork():
+        for descriptor in [ours.detach(), *unneeded]:
+            os.close(descriptor)
+        serve(theirs, run, _prepare_for)
+    theirs.close()
+    return ours
 
 
 def _prepare_for(request: dict[str, Any]) -> None:
@@ -308,14 +335,16 @@ def main() -> None:
     """The server."""
     from setproctitle import setproctitle
 
-    setproctitle("commands of tests")  # it finds its place only before the environment is changed
+    kind = sys.argv[3]
+    setproctitle(kind)  # it finds its place only before the environment is changed
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.path.append(str(SUPPORT))
     before = read_at_start(os.environ)
-    for name in PREPARED:
-        importlib.import_module(name)
     importlib.import_module(NODE_SERVER).prepare()
-    _use_libraries()
+    if kind == COMMANDS:
+        for name in PREPARED:
+            importlib.import_module(name)
+        _use_libraries()
     if (after := read_at_start(os.environ)) != before:
         sys.exit(f"libraries have changed variables that are read at a start: {after.items() ^ before.items()}")
     show_stacks_when_asked()

@@ -28,7 +28,7 @@ STABLE_DT = 2 / (2 - 2 * math.cos(4 * math.pi / 5))  # 2 / lambda_max of the rin
 def changed(changes: dict[str, Any]) -> dict[str, Any]:
     """The good document with values at dotted keys replaced, or removed (...)."""
     document = copy.deepcopy(GOOD)
-    for key, value in changes.items():
+    for key, value in copy.deepcopy(changes).items():  # cases share parts of them
         *sections, last = key.split(".")
         place = document
         for section in sections:
