@@ -14,6 +14,7 @@ from typing import Any
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
+from msg_agents.processes.status_file import read_steps
 
 FAULTS = [["agent"], ["agent"] * 3, ["switcher"], ["agent", "switcher"]]
 RUN = {"duration": 300, "replicas": 16, "processes": 3}  # long enough to be killed in the middle, of each fault
@@ -53,6 +54,12 @@ def wait_for_all(network: Any) -> None:
 def wait_for_more(network: Any, recorded: int, more: int) -> None:
     """Until so many bytes more are recorded."""
     network.wait_for(lambda: network.recorded_bytes() > recorded + more, 60, "recorded states")
+
+
+def wait_for_more_steps(network: Any, steps: Path, more: int) -> None:
+    """Until every agent has made so many steps more than the first one has now; a run knows of steps within 0.3 s."""
+    reached = max(read_steps(steps), default=0)
+    network.wait_for(lambda: min(read_steps(steps), default=0) > reached + more, 60, "steps of all")
 
 
 def test_killed_and_back(network: Any, repetition: int, rng: random.Random) -> None:
@@ -131,12 +138,12 @@ def test_who_comes_back_repeats_only_what_peers_may_lack(network: Any) -> None:
             stack.callback(listener.kill)  # or it would be waited for, whatever has failed
             assert listener.stdout is not None
             assert listener.stdout.readline() == "ready\n"
-            network.wait_for_steps()
+            steps = network.wait_for_steps()
             for agent in (2, 3):
                 (victim,) = [process for process in network.processes("agent") if process.agent == agent]
                 victim.kill()
                 network.wait_for(lambda victim=victim: not victim.alive, 10, "its end")
-                wait_for_more(network, network.recorded_bytes(), 100_000)
+                wait_for_more_steps(network, steps, 500)
             result = network.completed(run)
             listener.terminate()
             newest, repeated = map(int, listener.stdout.read().split())
