@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import html
+import json
 import random
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -15,6 +17,8 @@ from typing import Any
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.status_file import read_steps
+from msg_analysis.bags.reader import read_bag
+from msg_analysis.twin.check import check
 
 FAULTS = [["agent"], ["agent"] * 3, ["switcher"], ["agent", "switcher"]]
 RUN = {"duration": 300, "replicas": 16, "processes": 3}  # long enough to be killed in the middle, of each fault
@@ -130,24 +134,29 @@ def test_who_comes_back_repeats_only_what_peers_may_lack(network: Any) -> None:
 
     Restarts are allowed by default.
     """
+    file = network.file(run={"duration": 2000, "processes": 5})  # nobody waits for that
     with free_domain() as domain:
-        run = network.record(network.file(run={"duration": 200, "processes": 5}), "--domain", str(domain), "--json")
         command = [sys.executable, "-P", "-c", LISTENER, "/agent_3/state"]
         listener = subprocess.Popen(command, env=node_environment(domain), stdout=subprocess.PIPE, text=True)
         with listener, ExitStack() as stack:
             stack.callback(listener.kill)  # or it would be waited for, whatever has failed
             assert listener.stdout is not None
             assert listener.stdout.readline() == "ready\n"
+            run = network.record(file, "--domain", str(domain), "--json")
             steps = network.wait_for_steps()
-            for agent in (2, 3):
-                (victim,) = [process for process in network.processes("agent") if process.agent == agent]
+            victims = {process.agent: process for process in network.processes("agent")}
+            for victim in (victims[2], victims[3]):
                 victim.kill()
                 network.wait_for(lambda victim=victim: not victim.alive, 10, "its end")
                 wait_for_more_steps(network, steps, 500)
-            result = network.completed(run)
+            run.send_signal(signal.SIGINT)
+            stdout, stderr = run.communicate(timeout=60)
             listener.terminate()
             newest, repeated = map(int, listener.stdout.read().split())
+    assert run.returncode == 3, stderr
+    result = json.loads(stdout)
     assert len(result["restarts"]) == 2
+    assert check(read_bag(result["bag"])).difference is None
     assert newest > 0
     # Once by itself, once for the latched request, and for each neighbour that asks meanwhile: at most 66 states each
     # time, and none where the listener finds it later.
