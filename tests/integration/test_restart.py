@@ -17,11 +17,12 @@ from typing import Any
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.processes.environment import node_environment
 from msg_agents.processes.status_file import read_steps
+from msg_agents.running.supervisor import STEPS
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.twin.check import check
 
 FAULTS = [["agent"], ["agent"] * 3, ["switcher"], ["agent", "switcher"]]
-RUN = {"duration": 300, "replicas": 16, "processes": 3}  # long enough to be killed in the middle, of each fault
+RUN = {"duration": 400, "replicas": 16, "processes": 3}  # long enough to be killed in the middle, of each fault
 KILLED = r"(agents?_\w+|switcher): killed by SIGKILL.*, started again$"
 LISTENER = """
 import os, signal, struct, sys, rclpy
@@ -55,12 +56,7 @@ def wait_for_all(network: Any) -> None:
     network.wait_for(lambda: len(network.nodes()) == RUN["processes"] + 2, 60, "all processes")
 
 
-def wait_for_more(network: Any, recorded: int, more: int) -> None:
-    """Until so many bytes more are recorded."""
-    network.wait_for(lambda: network.recorded_bytes() > recorded + more, 60, "recorded states")
-
-
-def wait_for_more_steps(network: Any, steps: Path, more: int) -> None:
+def wait_for_more(network: Any, steps: Path, more: int) -> None:
     """Until every agent has made so many steps more than the first one has now; a run knows of steps within 0.3 s."""
     reached = max(read_steps(steps), default=0)
     network.wait_for(lambda: min(read_steps(steps), default=0) > reached + more, 60, "steps of all")
@@ -74,23 +70,23 @@ def test_killed_and_back(network: Any, repetition: int, rng: random.Random) -> N
     """
     file, kills = network.file(run=RUN), sum(map(len, FAULTS)) + 1
     run = network.start("run", file, "--out", network.directory / "runs", "--json", "--restarts", str(kills))
-    recorded = 0
+    wait_for_all(network)
+    steps = network.run_file().with_name(STEPS)
     for number, kinds in enumerate(rng.sample(FAULTS, len(FAULTS))):
         wait_for_all(network)
         early, again = number == 0 and repetition > 0 and rng.random() < 0.3, rng.random() < 0.5
         if early:
             time.sleep(rng.uniform(0.0, 0.3))
-        else:  # of some 5 MB, however fast they come
-            wait_for_more(network, recorded, rng.randrange(50_000, 400_000))
+        else:  # of 8,000, however fast they come
+            wait_for_more(network, steps, rng.randrange(50, 400))
         for kill, kind in enumerate(kinds):
             if again and kill:
                 time.sleep(rng.uniform(0.0, 0.5))
             victim = rng.choice(network.wait_for(lambda kind=kind: network.processes(kind), 30, f"a living {kind}"))
             print("killed", "early" if early else "in the middle", victim.command[2:])
             victim.kill()
-        recorded = network.recorded_bytes()
     wait_for_all(network)
-    wait_for_more(network, recorded, 50_000)
+    wait_for_more(network, steps, 50)
     (server,) = network.processes("node_server")
     server.kill()
     victim = network.processes("agent")[0]
@@ -148,7 +144,7 @@ def test_who_comes_back_repeats_only_what_peers_may_lack(network: Any) -> None:
             for victim in (victims[2], victims[3]):
                 victim.kill()
                 network.wait_for(lambda victim=victim: not victim.alive, 10, "its end")
-                wait_for_more_steps(network, steps, 500)
+                wait_for_more(network, steps, 500)
             run.send_signal(signal.SIGINT)
             stdout, stderr = run.communicate(timeout=60)
             listener.terminate()
