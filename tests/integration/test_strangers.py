@@ -153,6 +153,8 @@ def listen(data):  # to the true agent, not to itself
 # Only the newest, and not reliable: whoever is as slow as this would hold back the whole network.
 newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 node.create_subscription(StateMsg, "agent_2/state", listen, newest, raw=True)
+for agent in (1, 3, 4):  # the run awaits a reader of all states
+    node.create_subscription(StateMsg, f"agent_{agent}/state", lambda _: None, newest, raw=True)
 while state.get_subscription_count() < 2 or not states.get_subscription_count():  # a neighbour, this process; recorder
     time.sleep(0.1)
 
@@ -198,7 +200,7 @@ def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Ra
     graphs = {"line": {"path": [1, 2, 3, 4]}, "ring": {"cycle": [1, 2, 3, 4]}}
     file = network.file(graphs=graphs, run={"duration": 1250, "processes": 2})
     with free_domain() as domain:
-        options = ("--out", network.directory / "runs", "--domain", str(domain), "--json")
+        options = ("--out", network.directory / "runs", "--domain", str(domain), "--await", "intruder", "--json")
         run = network.start("run", file, *options)
         network.wait_for(network.nodes, 30, "a node")
         intruder = subprocess.Popen(
