@@ -2,8 +2,8 @@
 
 A job is a list: program, arguments, and what its stdout is: "pipe", "full" (a full disk), "closed", "gone" (a pipe that
 nobody reads), "terminal", "ascii" (it has few characters), "limit" (files cannot grow beyond a few bytes), or "memory"
-(there is 1 GB of it). A job is killed after a minute. ``outcomes`` gives exit code, stdout, stderr of each. As a
-program, this is the process that forks: it answers each line, a request, by a line.
+(there is 1 GB of it). A job is killed after a minute. ``outcomes`` gives exit code, stdout, stderr of each. ``main`` is
+the process that forks: it answers each line, a request, by a line.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+import forked_commands
 import forked_workers
 
 PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.cli.main"}
@@ -50,6 +51,7 @@ BY_COMMAND = {  # what takes long to import, and no other command needs
     "figures": ("msg_analysis.paper.figures",),
     "spectrum": ("scipy.signal",),
 }
+CODE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); import many_commands; many_commands.main()"
 MEMORY = 1 << 30  # bytes
 LONGEST = 60  # s of a job
 
@@ -80,13 +82,14 @@ def outcomes(
 @functools.cache
 def _server() -> subprocess.Popen[str]:
     """It ends with this process, which holds the other end of its stdin."""
-    server = subprocess.Popen(
-        [sys.executable, "-W", "ignore", __file__],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-    )
+    with forked_commands.installed():
+        server = subprocess.Popen(
+            [sys.executable, "-P", "-c", CODE],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        )
     atexit.register(server.wait)
     atexit.register(server.terminate)
     return server
@@ -175,7 +178,3 @@ def main() -> None:
         for name in (*request["prepared"], *(name for command in commands for name in BY_COMMAND.get(command, ()))):
             importlib.import_module(name)
         print(json.dumps([run(*job) for job in request["jobs"]]), file=answers, flush=True)
-
-
-if __name__ == "__main__":
-    main()
