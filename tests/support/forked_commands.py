@@ -167,7 +167,7 @@ class _Forker:
             return FORK_EXEC(*arguments)  # type: ignore[misc]
         kind = NODES if request["command"][1:3] == OF_NODE_SERVER else COMMANDS
         if kind not in self.controls:
-            self.controls[kind] = start_server(kind, self._whole)
+            self.controls[kind] = self._start(kind)
         control = self.controls[kind]
         request["packages"] = packages_of(request["environment"], self._path)
         at_start = read_at_start(request["environment"])
@@ -182,6 +182,18 @@ class _Forker:
         assert control.recv(LONGEST) == ALL_FORKED
         return pid
 
+    def _start(self, kind: str) -> socket.socket:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        same = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", MARK: "0" * LENGTH_OF_MARK}
+        same["SPT_NOENV"] = "1"  # titles leave the environment readable
+        with theirs:
+            subprocess.Popen(
+                [sys.executable, "-P", __file__, str(theirs.fileno()), " " * LONGEST_TITLE, kind],
+                env=self._whole | same,
+                pass_fds=[theirs.fileno()],
+            )
+        return ours
+
 
 @functools.cache
 def _forker() -> _Forker:
@@ -191,20 +203,6 @@ def _forker() -> _Forker:
 def use(control: socket.socket) -> None:
     """Fork commands from this server, instead of one that would have to start."""
     _forker().controls[COMMANDS] = control
-
-
-def start_server(kind: str, environment: Mapping[str, str]) -> socket.socket:
-    """Start a server of this kind; the socket at which it is asked for processes."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    same = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", MARK: "0" * LENGTH_OF_MARK}
-    same["SPT_NOENV"] = "1"  # titles leave the environment readable
-    with theirs:
-        subprocess.Popen(
-            [sys.executable, "-P", __file__, str(theirs.fileno()), " " * LONGEST_TITLE, kind],
-            env={**environment, **same},
-            pass_fds=[theirs.fileno()],
-        )
-    return ours
 
 
 def run(request: dict[str, Any], descriptors: list[int]) -> None:
