@@ -222,6 +222,7 @@ def test_a_killed_run_leaves_nothing_behind(network: Any, hosts: set[int], numbe
     run.communicate(timeout=60)
     assert run.returncode == (3 if number == signal.SIGINT else -signal.SIGKILL)
     if number == signal.SIGKILL:
+        network.wait_for(lambda: not network.processes(), 60, "the end of all that it has started")
         network.traces.clear()  # whoever runs the next network clears its folder away
 
 
