@@ -65,8 +65,9 @@ def main() -> None:
     node = Node(options.name, options.domain)
     states = [] if options.latched else [state_topic(i + 1) for i in range(options.agents)]
     limits = [Policy.ResourceLimits(max_samples=100)] if options.pause or options.until else []
-    readers = {topic: node.read(topic) for topic in ("experiment", "graph", "progress", "end")}
-    readers |= {topic: node.read(topic, *limits) for topic in states}
+    others = Policy.IgnoreLocal.Participant  # it would take the end that it forges for that of the run, and leave
+    readers = {topic: node.read(topic, others) for topic in ("experiment", "graph", "progress", "end")}
+    readers |= {topic: node.read(topic, others, *limits) for topic in states}
     for topic in ("graph", "progress", "end", *states) if options.forge else ():
         node.write(topic)
     # What it forges must reach another node, not only itself: readers that it does not know yet would miss it.
