@@ -74,7 +74,7 @@ wheels-test: wheels ## Install the wheels where there is no compiler, run the de
 
 # Networks wait a good part of their time, for discovery for example: more at once than cores, each in a domain of its
 # own. Each worker gets neighbours in the list, so that most fixtures of a module are made once.
-SEVERAL_AT_ONCE := --numprocesses 5 --dist worksteal
+SEVERAL_AT_ONCE := --numprocesses 6 --dist worksteal
 
 # More options of pytest.
 TEST_OPTIONS ?=
