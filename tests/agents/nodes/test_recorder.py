@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import platform
+import subprocess
+import sys
 import time
 from array import array
 from collections import deque
@@ -108,3 +111,21 @@ def test_sojourns_are_recorded_once(recorder: Recorder) -> None:
     assert recorder.bag.messages == 1
     assert recorder.repeated == 2
     assert recorder.refused.total() == 3
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="this machine: another C library")
+def test_freed_memory_is_kept() -> None:
+    """The system is not asked again for the memory of eight arrays of 1 MB, made and freed 20 times: 2,048 pages."""
+    code = """
+import resource
+import numpy as np
+from msg_agents.nodes.recorder import keep_freed_memory
+keep_freed_memory()
+[np.ones(2**17) for _ in range(8)]
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(20):
+    [np.ones(2**17) for _ in range(8)]
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(shown.stdout) < 2048
