@@ -25,6 +25,7 @@ import rclpy
 
 from msg_agents.discovery.ros_domain import free_domain
 from msg_agents.nodes.network_node import NetworkNode
+from msg_agents.nodes.recorder import keep_freed_memory
 from msg_agents.nodes.ros.lean_node import LeanNode
 from msg_agents.processes.environment import node_environment
 from msg_agents.running.runner import run_network
@@ -91,6 +92,7 @@ def batches(record: RunRecord, steps: int, rounds: int) -> Iterator[bytes]:
 def recorder(agents: int, steps: int, rounds: int = 20) -> None:
     """Record so many steps, ``rounds`` of each agent in a batch, and print the memory on the way."""
     record = new_record(ring(agents, steps))
+    keep_freed_memory()  # as the recorder does
     receiver = StateReceiver(record, STATES, STATE, "/")
     shown = []
     with (
