@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import pieces, release
 from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.air_reception import lost_messages
@@ -150,7 +151,6 @@ def _first_state(
 ) -> tuple[float, str] | None:
     if logged is None or law is None:
         return None
-    there = ~(np.isnan(logged) | np.isnan(law)).any(axis=2)
 
     def describe(step: int, agent: int) -> str:
         here, expected = logged[step, agent], law[step, agent]
@@ -162,7 +162,15 @@ def _first_state(
             f"the law gives {float(expected[where])!r}"
         )
 
-    return _first(there & (logged != law).any(axis=2), describe)
+    for piece in pieces(logged):
+        here, expected = logged[piece], law[piece]
+        there = ~(np.isnan(here) | np.isnan(expected)).any(axis=2)
+        wrong = np.argwhere(there & (here != expected).any(axis=2))
+        release(law)
+        if len(wrong):
+            step, agent = piece.start + int(wrong[0, 0]), int(wrong[0, 1])
+            return step, describe(step, agent)
+    return None
 
 
 def _first_loss(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] | None:

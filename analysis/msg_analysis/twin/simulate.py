@@ -16,11 +16,13 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import uuid
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import large_zeros, release
 from msg_analysis.model.arithmetic.payload import from_payload, to_payload
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.experiment.protocol_binding import AgentProtocol
@@ -91,12 +93,14 @@ def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) ->
 def _all_at_once(record: RunRecord, model: StepModel, modes: IntArray) -> tuple[FloatArray, FloatArray | None]:
     """(N + 1, m, R) states, and what is published of them if that is something else, of a linear law."""
     experiment = record.experiment
-    states = np.empty((experiment.steps + 1, *record.start.shape))
+    shape = (experiment.steps + 1, *record.start.shape)
+    states = large_zeros(shape, np.float64, total=8 * math.prod(shape))
     states[0] = record.start
     known = 1
     for block in states_of_all(experiment, model, modes, record.start):
         states[known : known + len(block)] = block
         known += len(block)
+        release(states)
     return states, add_broadcast_noise(experiment, states) if experiment.noise.broadcast else None
 
 

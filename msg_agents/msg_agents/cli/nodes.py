@@ -251,8 +251,9 @@ def recorder(
     record = load_record(run_record)
 
     def nodes() -> list[NetworkNode]:
-        from msg_agents.nodes.recorder import Recorder
+        from msg_agents.nodes.recorder import Recorder, keep_freed_memory
 
+        keep_freed_memory()
         return [Recorder(record=record, directory=out, storage=storage(compression, split_size))]
 
     _run_nodes(nodes, record, **options)

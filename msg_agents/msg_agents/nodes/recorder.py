@@ -59,7 +59,6 @@ class Recorder(NetworkNode):
 
     def __init__(self, *, record: RunRecord, directory: Path, storage: Storage = DEFAULT_STORAGE) -> None:
         super().__init__("recorder", record=record)
-        keep_freed_memory()
         experiment = record.experiment
         # In the bag topics keep their own names, even if they are remapped: readers of bags look for these.
         self._root = self.get_namespace().rstrip("/") + "/"

@@ -11,6 +11,8 @@ import pytest
 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.common import large_arrays
+from msg_analysis.common.large_arrays import in_file
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.twin.check import check
@@ -55,6 +57,23 @@ def flip(states: FloatArray, *where: int) -> FloatArray:
     bits = changed.view(np.uint64)
     bits[where] ^= np.uint64(1)
     return changed
+
+
+def test_a_long_run(stored: Callable[..., Trajectory], twin: Trajectory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Logged and computed states are in files and compared in pieces, here of ten steps."""
+    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    monkeypatch.setattr(large_arrays, "BLOCK_NUMBERS", 60)
+    again = simulate(twin.record.experiment, record=twin.record)
+    assert in_file(again.states)
+    assert np.array_equal(again.states, twin.states)
+    changed = flip(flip(twin.states, 237, 1, 0), 310, 0, 1)
+    changed[100, 2] = np.nan
+    logged = stored(changed)
+    assert in_file(logged.states)
+    outcome = check(logged)
+    assert outcome.difference is not None
+    assert outcome.difference.startswith("agent 2 at step 237, replica 1: ")
+    assert outcome.missing == 1
 
 
 def test_equal(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
