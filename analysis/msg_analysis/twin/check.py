@@ -16,18 +16,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import pieces, release
+from msg_analysis.common.large_arrays import release
+from msg_analysis.common.long_work import tell
+from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.step.air_reception import lost_messages
+from msg_analysis.model.step.air import Air
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.twin.log_replay import replay
-from msg_analysis.twin.simulate import simulate
+from msg_analysis.twin.run_blocks import RunBlock, run_blocks
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 
@@ -67,170 +69,203 @@ def check(trajectory: Trajectory) -> Check:
     NotAvailableError
         the twin cannot repeat a run of this kind
     """
-    if trajectory.record.experiment.run.pace == "realtime":
-        return _check_realtime(trajectory)
-    twin = simulate(trajectory.record.experiment, record=trajectory.record)
-    # The states of step k follow from graphs and losses of earlier steps: the earliest difference is the cause.
-    found = [
-        _first_state(trajectory, trajectory.states, twin.states, "logged"),
-        _first_state(trajectory, trajectory.published, twin.published, "published"),
-        _first_loss(trajectory, twin),
-        _first_use(trajectory, twin),
-        _first_graph(trajectory, twin.modes),
-    ]
-    count = trajectory.completeness
-    return Check(count.received, count.missing + count.missing_modes, _earliest(found))
+    record, count = trajectory.record, trajectory.completeness
+    path = mode_path(record.experiment, record.model.initial)
+    if record.experiment.run.pace == "realtime":
+        difference, compared = _in_real_time(trajectory, path)
+        return Check(compared, count.expected - compared + count.missing_modes, difference)
+    record.experiment.require_available()
+    return Check(count.received, count.missing + count.missing_modes, _in_lockstep(trajectory, path))
 
 
-def _check_realtime(trajectory: Trajectory) -> Check:
-    experiment = trajectory.record.experiment
-    law, published = replay(trajectory)
-    path = mode_path(experiment, trajectory.record.model.initial)
-    found = [
-        _first_state(trajectory, trajectory.states, law, "logged"),
-        _first_state(trajectory, trajectory.published, published, "published"),
-        _first_early_use(trajectory),
-        _first_lost_use(trajectory),
-        _first_graph(trajectory, path),
-    ]
-    compared = int((trajectory.present & ~np.isnan(law).any(axis=2)).sum())
-    if published is not None and trajectory.published is not None:
-        compared += int((~np.isnan(published) & ~np.isnan(trajectory.published)).all(axis=2).sum())
-    count = trajectory.completeness
-    return Check(compared, count.expected - compared + count.missing_modes, _earliest(found))
+_Found = tuple[float, str] | None
+"""When the cause of a difference was there, a step, and the difference in words."""
 
 
-def _earliest(found: Sequence[tuple[float, str] | None]) -> str | None:
-    """The earliest of some (step, words), without the step."""
+def _in_lockstep(trajectory: Trajectory, path: IntArray) -> str | None:
+    """The first difference: states follow from graphs and losses of earlier steps; the earliest is the cause."""
+    for block in _with_progress(trajectory, run_blocks(trajectory.record, path)):
+        found = [
+            _first_state(trajectory, block.first, trajectory.states, block.states, "logged"),
+            _first_state(trajectory, block.first, trajectory.published, block.published, "published"),
+            _first_loss(trajectory, block, path),
+            _first_use(trajectory, block, path),
+            _first_graph(trajectory, block, path),
+        ]
+        if difference := _earliest(found):
+            return difference
+    return None
+
+
+def _in_real_time(trajectory: Trajectory, path: IntArray) -> tuple[str | None, int]:
+    """The first difference, and how many states could be compared."""
+    difference, compared, air = None, 0, Air(trajectory.record.experiment)
+    for block in _with_progress(trajectory, replay(trajectory)):
+        both = [(trajectory.states, block.states), (trajectory.published, block.published)]
+        for logged, law in both:
+            if logged is not None and law is not None:
+                compared += int((~np.isnan(logged[block.steps]) & ~np.isnan(law)).all(axis=2).sum())
+        difference = difference or _earliest(
+            [
+                _first_state(trajectory, block.first, trajectory.states, block.states, "logged"),
+                _first_state(trajectory, block.first, trajectory.published, block.published, "published"),
+                _first_early_use(trajectory, block),
+                _first_lost_use(trajectory, block, air),
+                _first_graph(trajectory, block, path),
+            ]
+        )
+    return difference, compared
+
+
+def _with_progress(trajectory: Trajectory, blocks: Iterable[RunBlock]) -> Iterable[RunBlock]:
+    """The blocks; the memory of what was read of the log is given back after each."""
+    log = (
+        trajectory.states,
+        trajectory.published,
+        trajectory.lost,
+        trajectory.used,
+        trajectory.made,
+        trajectory.agent_modes,
+    )
+    for block in blocks:
+        tell("comparing with the twin", block.first, len(trajectory.states))
+        yield block
+        for array in log:
+            if array is not None:
+                release(array)
+
+
+def _earliest(found: Iterable[_Found]) -> str | None:
+    """The earliest difference in words."""
     differences = [difference for difference in found if difference is not None]
     return min(differences, key=lambda difference: difference[0])[1] if differences else None
 
 
-def _first_graph(trajectory: Trajectory, modes: IntArray) -> tuple[float, str] | None:
-    graphs = [graph.name for graph in trajectory.record.experiment.graph_list]
-    return _first(
-        (trajectory.modes >= 0) & (trajectory.modes != modes),
-        lambda step: (
-            f"graph of step {step}: logged {graphs[trajectory.modes[step]]}, the seed gives {graphs[modes[step]]}"
-        ),
-    )
-
-
-def _first_early_use(trajectory: Trajectory) -> tuple[float, str] | None:
-    """The first value that was used in a state made before it, or at the same time."""
-    used, made, modes = trajectory.used, trajectory.made, trajectory.agent_modes
-    assert used is not None
-    assert made is not None
-    assert modes is not None
-    model = trajectory.record.model
-    # Where a state is missing its mode is -1, which picks the last graph: harmless, since ``used`` is -1 there too.
-    sender = neighbour_tables(model).senders[modes[1:], np.arange(model.agents)]
-    early = (used >= 0) & (made[1:] >= 0)[:, :, None] & (made[used, sender] >= made[1:, :, None])
-
-    def describe(step: int, agent: int, which: int) -> str:
-        return (
-            f"agent {agent + 1} at step {step + 1}: stamped {made[step + 1, agent] / 1e9} s of simulated time, and "
-            f"used step {used[step, agent, which]} of agent {sender[step, agent, which] + 1}, stamped "
-            f"{made[used[step, agent, which], sender[step, agent, which]] / 1e9} s"
-        )
-
-    found = _first(early, describe)
-    return found and (found[0] + 1, found[1])
-
-
-def _first(wrong: BoolArray, describe: Callable[..., str]) -> tuple[float, str] | None:
-    """Step (first index) and description of the first True entry; None if there is none."""
+def _first(wrong: BoolArray, when: float, describe: Callable[..., str]) -> _Found:
+    """The first True entry; ``when``: the time of the first row."""
     if not wrong.any():
         return None
     where = [int(i) for i in np.argwhere(wrong)[0]]
-    return where[0], describe(*where)
+    return when + where[0], describe(*where)
 
 
 def _first_state(
-    trajectory: Trajectory, logged: FloatArray | None, law: FloatArray | None, what: str
-) -> tuple[float, str] | None:
+    trajectory: Trajectory, first: int, logged: FloatArray | None, law: FloatArray | None, what: str
+) -> _Found:
+    """Of the states from step ``first`` on, of which ``law`` (K, m, R) has a block."""
     if logged is None or law is None:
         return None
+    here = logged[first : first + len(law)]
+    there = ~(np.isnan(here) | np.isnan(law)).any(axis=2)
 
-    def describe(step: int, agent: int) -> str:
-        here, expected = logged[step, agent], law[step, agent]
-        where = int(np.argmax(here != expected))
+    def describe(k: int, agent: int) -> str:
+        where = int(np.argmax(here[k, agent] != law[k, agent]))
         row, replica = divmod(where, trajectory.record.experiment.run.replicas)
         number = f", number {row + 1} of the state" if row else ""
         return (
-            f"agent {agent + 1} at step {step}, replica {replica + 1}{number}: {what} {float(here[where])!r}, "
-            f"the law gives {float(expected[where])!r}"
+            f"agent {agent + 1} at step {first + k}, replica {replica + 1}{number}: {what} "
+            f"{float(here[k, agent, where])!r}, the law gives {float(law[k, agent, where])!r}"
         )
 
-    for piece in pieces(logged):
-        here, expected = logged[piece], law[piece]
-        there = ~(np.isnan(here) | np.isnan(expected)).any(axis=2)
-        wrong = np.argwhere(there & (here != expected).any(axis=2))
-        release(law)
-        if len(wrong):
-            step, agent = piece.start + int(wrong[0, 0]), int(wrong[0, 1])
-            return step, describe(step, agent)
-    return None
+    return _first(there & (here != law).any(axis=2), first, describe)
 
 
-def _first_loss(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] | None:
-    if trajectory.lost is None or twin.lost is None or trajectory.agent_modes is None:
+def _first_graph(trajectory: Trajectory, block: RunBlock, path: IntArray) -> _Found:
+    graphs = [graph.name for graph in trajectory.record.experiment.graph_list]
+    logged, law = trajectory.modes[block.steps], path[block.steps]
+    return _first(
+        (logged >= 0) & (logged != law),
+        block.first,
+        lambda k: f"graph of step {block.first + k}: logged {graphs[logged[k]]}, the seed gives {graphs[law[k]]}",
+    )
+
+
+def _same_graph(trajectory: Trajectory, block: RunBlock, path: IntArray) -> BoolArray:
+    """(K, m, 1) in which steps an agent used the graph of the seed: under another one the neighbours differ."""
+    assert trajectory.agent_modes is not None
+    return np.asarray(trajectory.agent_modes[1:][block.steps] == path[block.steps, None])[:, :, None]
+
+
+def _first_loss(trajectory: Trajectory, block: RunBlock, path: IntArray) -> _Found:
+    if trajectory.lost is None or block.lost is None or trajectory.agent_modes is None:
         return None
-    model = trajectory.record.model
-    # Only states that are there and used the right graph: under another one the neighbours differ.
-    comparable = trajectory.agent_modes[1:] == twin.modes[:, None]
-    logged, law = trajectory.lost, twin.lost
+    logged, law = trajectory.lost[block.steps], block.lost
 
-    def describe(step: int, agent: int, which: int) -> str:
-        sender = int(model.neighbours(int(twin.modes[step]), agent)[which]) + 1
+    def describe(k: int, agent: int, which: int) -> str:
+        step = block.first + k
+        sender = int(trajectory.record.model.neighbours(int(path[step]), agent)[which]) + 1
         words = ("heard", "lost")
         return (
             f"the message of agent {sender} to agent {agent + 1} in step {step}: logged as "
-            f"{words[int(logged[step, agent, which])]}, the seed gives {words[int(law[step, agent, which])]}"
+            f"{words[int(logged[k, agent, which])]}, the seed gives {words[int(law[k, agent, which])]}"
         )
 
     # After the graph of this step, before the states of the next one.
-    found = _first(comparable[:, :, None] & (logged != law), describe)
-    return found and (found[0] + 0.5, found[1])
+    return _first(_same_graph(trajectory, block, path) & (logged != law), block.first + 0.5, describe)
 
 
-def _first_use(trajectory: Trajectory, twin: Trajectory) -> tuple[float, str] | None:
+def _first_use(trajectory: Trajectory, block: RunBlock, path: IntArray) -> _Found:
     """In lockstep, where values of several steps can be used: the first that is not the one which the seed gives."""
-    if trajectory.used is None or twin.used is None or trajectory.agent_modes is None:
+    if trajectory.used is None or block.used is None or trajectory.agent_modes is None:
         return None
-    logged, law = trajectory.used, twin.used
-    comparable = (trajectory.agent_modes[1:] == twin.modes[:, None])[:, :, None] & (logged >= 0) & (law >= 0)
+    logged, law = trajectory.used[block.steps], block.used
 
-    def describe(step: int, agent: int, which: int) -> str:
-        sender = int(trajectory.record.model.neighbours(int(twin.modes[step]), agent)[which]) + 1
+    def describe(k: int, agent: int, which: int) -> str:
+        step = block.first + k
+        sender = int(trajectory.record.model.neighbours(int(path[step]), agent)[which]) + 1
         return (
             f"the value of agent {sender} that agent {agent + 1} used in step {step}: logged as that of step "
-            f"{logged[step, agent, which]}, the seed gives step {law[step, agent, which]}"
+            f"{logged[k, agent, which]}, the seed gives step {law[k, agent, which]}"
         )
 
-    found = _first(comparable & (logged != law), describe)
-    return found and (found[0] + 0.5, found[1])
+    wrong = _same_graph(trajectory, block, path) & (logged >= 0) & (law >= 0) & (logged != law)
+    return _first(wrong, block.first + 0.5, describe)
 
 
-def _first_lost_use(trajectory: Trajectory) -> tuple[float, str] | None:
-    """In real time: the first message that was used although it was lost."""
-    experiment, used, modes = trajectory.record.experiment, trajectory.used, trajectory.agent_modes
-    if not experiment.noise.loss.any:
-        return None
-    assert used is not None
-    assert modes is not None
-    model, lost = trajectory.record.model, np.zeros(used.shape, dtype=np.bool_)
-    senders = neighbour_tables(model).senders[modes[1:], np.arange(model.agents)]
-    for i, j in np.argwhere(model.listens()).tolist():
-        gone = lost_messages(experiment, i, j, len(used) + 1)
-        at = (senders[:, i] == j) & (used[:, i] >= 0)
-        lost[:, i] |= at & gone[used[:, i]]
+def _uses(trajectory: Trajectory, block: RunBlock) -> tuple[int, IntArray, IntArray]:
+    """In real time: the first of these states that was made by a step; (K, m, D) ``used`` for them, and the senders."""
+    assert trajectory.used is not None
+    assert trajectory.agent_modes is not None
+    first, end = max(1, block.steps.start), block.steps.stop
+    modes = trajectory.agent_modes[first:end]
+    # Where a state is missing its mode is -1, which picks the last graph: harmless, since ``used`` is -1 there too.
+    senders = neighbour_tables(trajectory.record.model).senders[modes, np.arange(trajectory.record.model.agents)]
+    return first, trajectory.used[first - 1 : end - 1], senders
 
-    def describe(step: int, agent: int, which: int) -> str:
+
+def _first_early_use(trajectory: Trajectory, block: RunBlock) -> _Found:
+    """The first value that was used in a state made before it, or at the same time."""
+    assert trajectory.made is not None
+    first, used, senders = _uses(trajectory, block)
+    made, heard = trajectory.made[first : first + len(used)], trajectory.made[used, senders]
+
+    def describe(k: int, agent: int, which: int) -> str:
         return (
-            f"agent {agent + 1} at step {step + 1}: used the message with step {used[step, agent, which]} of agent "
-            f"{senders[step, agent, which] + 1}, which the seed loses"
+            f"agent {agent + 1} at step {first + k}: stamped {made[k, agent] / 1e9} s of simulated time, and "
+            f"used step {used[k, agent, which]} of agent {senders[k, agent, which] + 1}, stamped "
+            f"{heard[k, agent, which] / 1e9} s"
         )
 
-    found = _first(lost, describe)
-    return found and (found[0] + 1, found[1])
+    return _first((used >= 0) & (made >= 0)[:, :, None] & (heard >= made[:, :, None]), first, describe)
+
+
+def _first_lost_use(trajectory: Trajectory, block: RunBlock, air: Air) -> _Found:
+    """In real time: the first message that was used although it was lost."""
+    if not air.loss:
+        return None
+    first, used, senders = _uses(trajectory, block)
+    lost = np.zeros(used.shape, dtype=np.bool_)
+    number, within = np.divmod(used, STEPS_PER_BLOCK)
+    for i in range(used.shape[1]):
+        heard = used[:, i] >= 0
+        for j, n in {*zip(senders[:, i][heard].tolist(), number[:, i][heard].tolist(), strict=True)}:
+            these = heard & (senders[:, i] == j) & (number[:, i] == n)
+            lost[:, i][these] = air.losses(i, j, n)[within[:, i][these]]
+
+    def describe(k: int, agent: int, which: int) -> str:
+        return (
+            f"agent {agent + 1} at step {first + k}: used the message with step {used[k, agent, which]} of agent "
+            f"{senders[k, agent, which] + 1}, which the seed loses"
+        )
+
+    return _first(lost, first, describe)

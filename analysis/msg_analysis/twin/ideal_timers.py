@@ -21,9 +21,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import large_zeros
 from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.air_reception import used_steps
+from msg_analysis.model.step.air_reception import MessagesUsed
 from msg_analysis.model.step.phases import phases
 from msg_analysis.model.step.step_model import Wiring
 from msg_analysis.types import IntArray
@@ -31,9 +32,16 @@ from msg_analysis.types import IntArray
 
 def ideal_log(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """``agent_modes``, ``used`` and ``made`` of ``Trajectory`` for a run with these graphs (N,), from 0."""
-    phase, steps = phases(experiment), len(modes)
-    agent_modes = np.repeat(np.concatenate([[-1], modes])[:, None], model.agents, axis=1)
-    made = np.zeros((steps + 1, model.agents), dtype=np.int64)
-    for i in range(model.agents):
-        made[1:, i] = StepClock(experiment.step_length, float(phase[i])).times(np.arange(steps))
-    return agent_modes, used_steps(experiment, model, modes), made
+    agent_modes, made = ideal_times(experiment, modes)
+    return agent_modes, MessagesUsed(experiment, model).used(0, modes), made
+
+
+def ideal_times(experiment: ValidExperiment, modes: IntArray) -> tuple[IntArray, IntArray]:
+    """``agent_modes`` and ``made`` alone."""
+    shape = len(modes) + 1, experiment.agents
+    agent_modes, made = (large_zeros(shape, np.int64, total=8 * shape[0] * shape[1]) for _ in range(2))
+    agent_modes[0] = -1
+    agent_modes[1:] = modes[:, None]
+    for i, phase in enumerate(phases(experiment).tolist()):
+        made[1:, i] = StepClock(experiment.step_length, phase).times(np.arange(len(modes)))
+    return agent_modes, made

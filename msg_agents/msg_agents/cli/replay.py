@@ -262,12 +262,15 @@ def check(bag: Path | None, *, as_json: bool) -> None:
     Without BAG, the newest bag below ./runs is checked.
     """
     from msg_analysis.bags.reader import read_bag
+    from msg_analysis.cli.progress import WorkProgress
+    from msg_analysis.common.long_work import watched
     from msg_analysis.common.text.agent_names import with_names
     from msg_analysis.twin.check import check as check_trajectory
 
     path = bag or _newest_bag(Path("runs"))
-    run = read_bag(path)
-    outcome = check_trajectory(run)
+    with WorkProgress() as progress, watched(progress):
+        run = read_bag(path)
+        outcome = check_trajectory(run)
     if as_json:
         document = {"bag": str(path), "equal": outcome.difference is None, "compared": outcome.compared}
         print_json(document | {"missing": outcome.missing, "difference": outcome.difference})

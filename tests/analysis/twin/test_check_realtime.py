@@ -5,24 +5,38 @@ from __future__ import annotations
 import dataclasses
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.model.arithmetic.payload import from_payload, to_payload
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.agent_law import agent_law
 from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.trajectory import Completeness, Trajectory
 from msg_analysis.model.step.phases import phases
 from msg_analysis.model.step.process_noise import ProcessNoise
 from msg_analysis.model.step.step_model import build_step_model
 from msg_analysis.twin.check import check
+from msg_analysis.twin.log_replay import replay
 from msg_analysis.twin.simulate import new_record
 from msg_analysis.types import FloatArray
 
 DT = 50_000_000  # ns
+
+DOCUMENT: dict[str, Any] = {
+    "name": "checked",
+    "problem": "tracking",
+    "graphs": {"line": {"path": [1, 2, 3, 4]}, "ring": {"cycle": [1, 2, 3, 4]}},
+    "switching": {"generator": [[-1, 1], [1, -1]]},
+    "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0},
+    "noise": {"process": {"line": [1, 2, 0, 0.5], "ring": [[0.1 * (1 + i + j) for j in range(4)] for i in range(4)]}},
+    "run": {"dt": 0.05, "duration": 20, "replicas": 2, "seed": 5, "pace": "realtime"},
+}
 
 
 def emulate(experiment: ValidExperiment, seed: int) -> Trajectory:
@@ -68,20 +82,7 @@ def emulate(experiment: ValidExperiment, seed: int) -> Trajectory:
 
 @pytest.fixture(scope="module")
 def run() -> Trajectory:
-    experiment = ValidExperiment.parse(
-        {
-            "name": "checked",
-            "problem": "tracking",
-            "graphs": {"line": {"path": [1, 2, 3, 4]}, "ring": {"cycle": [1, 2, 3, 4]}},
-            "switching": {"generator": [[-1, 1], [1, -1]]},
-            "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0},
-            "noise": {
-                "process": {"line": [1, 2, 0, 0.5], "ring": [[0.1 * (1 + i + j) for j in range(4)] for i in range(4)]}
-            },
-            "run": {"dt": 0.05, "duration": 20, "replicas": 2, "seed": 5, "pace": "realtime"},
-        }
-    )
-    return emulate(experiment, 1)
+    return emulate(ValidExperiment.parse(DOCUMENT), 1)
 
 
 def stored(trajectory: Trajectory, directory: Path) -> Trajectory:
@@ -156,3 +157,46 @@ def test_gaps(run: Trajectory, tmp_path: Path) -> None:
     difference = check(stored(dataclasses.replace(run, states=states), tmp_path / "again")).difference
     assert difference is not None
     assert difference.startswith("agent 4 at step 390, replica 1")
+
+
+def test_each_step_is_that_of_the_agent(run: Trajectory) -> None:
+    """Whatever was logged: any states, graphs and values used, old or lost, some missing, with noise on the air."""
+    noise = {"process": 1.0, "broadcast": 0.2, "link": 0.3, "loss": 0.2}
+    record = new_record(ValidExperiment.parse(DOCUMENT | {"noise": noise}))
+    random, (count, m, replicas) = np.random.default_rng(7), run.states.shape
+    states, published = random.normal(size=(2, count, m, replicas))
+    states[random.random((count, m)) < 0.05] = np.nan
+    published[random.random((count, m)) < 0.05] = np.nan
+    graphs = random.integers(-1, 2, (count, m))
+    assert run.used is not None
+    used = np.arange(count - 1)[:, None, None] - random.geometric(0.3, run.used.shape)
+    used = np.where(random.random(used.shape) < 0.1, -1, np.maximum(used, -1))
+    log = dataclasses.replace(
+        run, record=record, states=states, published=published, agent_modes=graphs, used=used, made=run.made
+    )
+    blocks = list(replay(log))
+    found = np.concatenate([block.states for block in blocks])
+    said = np.concatenate([block.published for block in blocks if block.published is not None])
+    assert [block.first for block in blocks] == [0, 256, 400]
+    assert np.array_equal(found[0], record.start)
+    compared = 0
+    for i in range(m):
+        law = agent_law(record, record.model, i)
+        for k in range(count):
+            if np.isnan(states[k, i]).any():
+                assert np.isnan(said[k, i]).all()
+                continue
+            assert np.array_equal(said[k, i], from_payload(law.published(k, to_payload(states[k, i]))))
+        for k in range(count - 1):
+            mode = int(graphs[k + 1, i])
+            senders, steps = law.neighbours(mode), used[k, i, : len(law.neighbours(mode))].tolist()
+            heard = [published[step, j] for step, j in zip(steps, senders, strict=True)]
+            inputs = [states[k, i], *(value for value, step in zip(heard, steps, strict=True) if step >= 0)]
+            if mode < 0 or np.isnan(inputs).any():
+                assert np.isnan(found[k + 1, i]).all()
+                continue
+            law.resume(k, to_payload(states[k, i]))
+            made = law.advance(mode, [to_payload(value) for value in heard], steps)
+            assert np.array_equal(found[k + 1, i], from_payload(made)), (k, i)
+            compared += 1
+    assert compared > 700

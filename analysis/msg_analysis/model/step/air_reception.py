@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import TypeVar
 
@@ -106,49 +106,38 @@ def _of_steps(block: Callable[[int], Array], steps: IntArray) -> Array:
     return np.concatenate(parts)  # type: ignore[return-value]
 
 
-def add_broadcast_noise(experiment: ValidExperiment, states: FloatArray) -> FloatArray:
-    """(N + 1, m, R) what the agents publish of x(0..N), their values."""
-    air, published = Air(experiment), np.empty(states.shape)
-    for first in range(0, len(states), STEPS_PER_BLOCK):
-        now = states[first : first + STEPS_PER_BLOCK]
-        for i in range(states.shape[1]):
-            noise = air.broadcast_noise(i, first // STEPS_PER_BLOCK, first + len(now))
-            published[first : first + len(now), i] = now[:, i] + noise
-    return published
+def add_broadcast_noise(air: Air, states: FloatArray, first: int) -> FloatArray:
+    """(K, m, R) what the agents publish of x(first), ..., their values."""
+    noise, steps = partial(air.broadcast_noise, until=first + len(states)), np.arange(first, first + len(states))
+    return states + np.stack([_of_steps(partial(noise, i), steps) for i in range(states.shape[1])], axis=1)
 
 
-def used_steps(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> IntArray:
-    """``used`` of ``Trajectory``, of a run with these graphs (N,) in which all steps are made in time."""
-    used = np.full((len(modes), model.agents, model.most_neighbours), NOTHING, dtype=np.int64)
-    for at, i, place, _, found in _sources(experiment, model, modes):
-        used[at, i, place] = found
-    return used
+class MessagesUsed:
+    """Which messages are used in a run in which all steps are made in time, block after block of steps."""
 
+    def __init__(self, experiment: ValidExperiment, model: Wiring) -> None:
+        self._air, self._lead, self._tables = Air(experiment), ahead(experiment), neighbour_tables(model)
+        self._pairs: list[tuple[int, int]] = [(i, j) for i, j in np.argwhere(model.listens()).tolist()]
+        # (n, m, D) number of the link from each neighbour in each graph; L beyond the last neighbour.
+        self._links = np.full(self._tables.senders.shape, len(self._pairs))
+        there = np.arange(model.most_neighbours) < self._tables.count[:, :, None]
+        numbers = np.zeros((model.agents, model.agents), dtype=np.int64)
+        for number, link in enumerate(self._pairs):
+            numbers[link] = number
+        receivers = np.arange(model.agents)[:, None]
+        self._links[there] = numbers[receivers, self._tables.senders][there]
 
-def lost_values(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> BoolArray:
-    """``lost`` of ``Trajectory``, of a run in lockstep with these graphs (N,)."""
-    lost = np.zeros((len(modes), model.agents, model.most_neighbours), dtype=np.bool_)
-    for at, i, place, newest, found in _sources(experiment, model, modes):
-        lost[at, i, place] = found != newest
-    return lost
+    def used(self, first: int, modes: IntArray) -> IntArray:
+        """(K, m, D) entries of ``used`` of ``Trajectory`` for the steps first, ... with these graphs (K,)."""
+        found = np.full((len(self._pairs) + 1, len(modes)), NOTHING, dtype=np.int64)
+        steps = np.arange(first, first + len(modes))
+        for number, (i, j) in enumerate(self._pairs if len(modes) else ()):
+            should = np.maximum(0, steps + self._lead[i, j] - self._air.delay)
+            found[number] = _of_steps(partial(self._air.sources, i, j), should) if self._air.loss else should
+        return np.asarray(found[self._links[modes], np.arange(len(modes))[:, None, None]])
 
-
-def _sources(
-    experiment: ValidExperiment, model: Wiring, modes: IntArray
-) -> Iterator[tuple[IntArray, int, int, IntArray, IntArray]]:
-    """For each neighbour of each agent in each graph: the steps (k,) with that graph, agent and place of the neighbour,
-    and of the message that these steps should use, and of the one that they use, the steps (k,).
-    """
-    air, lead, tables = Air(experiment), ahead(experiment), neighbour_tables(model)
-    steps_of = [np.flatnonzero(modes == mode) for mode in range(model.modes)]
-    for i, j in np.argwhere(model.listens()).tolist():
-        steps = np.maximum(0, np.arange(len(modes)) + lead[i, j] - air.delay)
-        found = _of_steps(partial(air.sources, i, j), steps) if air.loss else steps
-        for mode, at in enumerate(steps_of):
-            for place in np.flatnonzero(tables.senders[mode, i, : tables.count[mode, i]] == j).tolist():
-                yield at, i, place, steps[at], found[at]
-
-
-def lost_messages(experiment: ValidExperiment, receiver: int, sender: int, count: int) -> BoolArray:
-    """(count,) whether the messages of the first steps of a run, from sender to receiver, are lost."""
-    return _of_steps(partial(Air(experiment).losses, receiver, sender), np.arange(count))
+    def lost(self, first: int, used: IntArray, modes: IntArray) -> BoolArray:
+        """The same of ``lost``, in lockstep; ``used`` is that of these steps."""
+        newest = np.maximum(0, np.arange(first, first + len(modes)) - self._air.delay)
+        there = self._links[modes] < len(self._pairs)
+        return np.asarray(there & (used != newest[:, None, None]))
