@@ -43,7 +43,7 @@ from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.theory.system import packed_symmetric
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 MAX_WORK = 3e10  # multiplications, at most (seconds); the joint test is left out first, then the node errors
 
@@ -209,22 +209,47 @@ def steps_of_path(observation: Observation) -> tuple[IntArray, FloatArray, Float
     system, step, lost = observation.prediction.system, observation.step, observation.lost
     if lost is None or not step.loss:
         return observation.modes, system.matrices, system.noise
-    keys = np.column_stack([observation.modes, lost.reshape(len(lost), -1)])
-    kinds, which = np.unique(keys, axis=0, return_inverse=True)
-    if len(kinds) * step.agents**2 > MAX_NUMBERS:
+    found = _kinds(observation, lost, MAX_NUMBERS // step.agents**2)
+    if found is None:
         return None
+    which, kinds = found
     matrices, noise = np.empty((2, len(kinds), step.agents, step.agents))
-    for number, kind in enumerate(kinds):
-        matrices[number], noise[number] = _with_losses(observation, step, int(kind[0]), kind[1:])
+    for number, (mode, missing) in enumerate(kinds):
+        matrices[number], noise[number] = _with_losses(observation, step, mode, missing)
     lift = system.frame
-    return which.reshape(-1), lift.T @ matrices @ lift, lift.T @ noise @ lift
+    return which, lift.T @ matrices @ lift, lift.T @ noise @ lift
 
 
-def _with_losses(observation: Observation, step: StepModel, mode: int, lost: IntArray) -> tuple[FloatArray, FloatArray]:
-    """W and N (m, m) of a step under a graph in which these messages (m D,) are lost."""
+def _kinds(observation: Observation, lost: BoolArray, most: int) -> tuple[IntArray, list[tuple[int, BoolArray]]] | None:
+    """(N,) kind of every step; and of every kind the graph and the lost messages (m, D). None: more than ``most``."""
+    numbers: dict[bytes, int] = {}
+    which = np.empty(observation.steps, dtype=np.int64)
+    for first, last in observation.blocks(lost[:1].size, "kinds of steps"):
+        bits = np.packbits(lost[first:last].reshape(last - first, -1), axis=1)
+        modes = observation.modes[first:last].astype(">u4").view(np.uint8).reshape(last - first, 4)
+        rows, here = np.unique(np.concatenate([modes, bits], axis=1), axis=0, return_inverse=True)
+        which[first:last] = np.array([numbers.setdefault(row.tobytes(), len(numbers)) for row in rows])[
+            here.reshape(-1)
+        ]
+        if len(numbers) > most:
+            return None
+    keys = sorted(numbers)
+    places = np.empty(len(keys), dtype=np.int64)
+    places[[numbers[key] for key in keys]] = np.arange(len(keys))
+    kinds = []
+    for key in keys:
+        missing = np.unpackbits(np.frombuffer(key[4:], np.uint8), count=lost[0].size).astype(np.bool_)
+        kinds.append((int.from_bytes(key[:4], "big"), missing.reshape(lost.shape[1:])))
+    return places[which], kinds
+
+
+def _with_losses(
+    observation: Observation, step: StepModel, mode: int, lost: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """W and N (m, m) of a step under a graph in which these messages (m, D) are lost."""
     tables, air = neighbour_tables(step), observation.prediction.experiment.noise
     weights = step.nominal[mode].copy()
-    for i, missing in enumerate(lost.reshape(step.agents, -1).astype(np.bool_)):
+    for i, missing in enumerate(lost):
         count = tables.count[mode, i]
         for j in tables.senders[mode, i, :count][missing[:count]].tolist():
             weights[i, i] += weights[i, j]
