@@ -29,6 +29,7 @@ import numpy as np
 from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writer import BagWriter, exists_already
 from msg_analysis.common.files import require_utf8
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS, release
 from msg_analysis.errors import BagError
 from msg_analysis.model.arithmetic.payload import to_payload
 from msg_analysis.model.arithmetic.step_clock import StepClock
@@ -88,38 +89,65 @@ def _write(bag: BagWriter, names: Sequence[str], messages: Iterator[_Message]) -
 def _messages(trajectory: Trajectory) -> Iterator[_Message]:
     """The messages in the order of time."""
     experiment = trajectory.record.experiment
-    run, dt, modes = trajectory.record.run.bytes, experiment.step_length, trajectory.modes
+    run, dt = trajectory.record.run.bytes, experiment.step_length
     time = StepClock(dt).nanoseconds
-    used = trajectory.agent_modes
-    if used is None:
-        used = np.repeat(np.concatenate(([-1], modes))[:, None], experiment.agents, axis=1)
     truth = STATE if trajectory.published is None else TRUTH
     streams = [(_names(truth, experiment.agents), trajectory.states)]
     if trajectory.published is not None:
         streams.append((_names(STATE, experiment.agents), trajectory.published))
-    present = [np.asarray(~np.isnan(states).any(axis=2)) for _, states in streams]
-    widths = [states.shape[2] for _, states in streams]
-    codecs = [[StateCodec(run, i + 1, width, dt) for i in range(experiment.agents)] for width in widths]
-    heard = _heard(trajectory, used)
+    codecs = [[StateCodec(run, i + 1, states.shape[2], dt) for i in range(experiment.agents)] for _, states in streams]
+    heard = _heard(trajectory)
     sojourns = _sojourns(trajectory)
     sojourn = next(sojourns, None)
-    made = trajectory.made
-    if made is None:
-        steps = range(len(trajectory.states))
-        made = np.repeat(np.array([time(k) for k in steps])[:, None], experiment.agents, axis=1)
-    for cell in np.argsort(made, axis=None, kind="stable").tolist():
-        k, i = divmod(cell, experiment.agents)
-        now = int(made[k, i])
-        while sojourn is not None and sojourn.stamp <= now:
-            yield _graph_message(sojourn, time)
-            sojourn = next(sojourns, None)
-        for (topics, states), there, codec in zip(streams, present, codecs, strict=True):
-            if there[k, i]:
-                payload = to_payload(states[k, i])
-                yield topics[i], codec[i].wrap(k, int(used[k, i]) + 1, payload, heard(k, i), now), now, None
+    for steps, agents, times in _in_order(trajectory):
+        if trajectory.agent_modes is not None:
+            graphs = trajectory.agent_modes[steps, agents]
+        else:
+            graphs = np.where(steps > 0, trajectory.modes[steps - 1], -1)
+        values = [states[steps, agents] for _, states in streams]
+        there = [np.asarray(~np.isnan(each).any(axis=1)).tolist() for each in values]
+        cells = zip(steps.tolist(), agents.tolist(), times.tolist(), graphs.tolist(), strict=True)
+        for place, (k, i, now, graph) in enumerate(cells):
+            while sojourn is not None and sojourn.stamp <= now:
+                yield _graph_message(sojourn, time)
+                sojourn = next(sojourns, None)
+            for (topics, _), codec, is_there, value in zip(streams, codecs, there, values, strict=True):
+                if is_there[place]:
+                    payload = to_payload(value[place])
+                    yield topics[i], codec[i].wrap(k, graph + 1, payload, heard(k, i, graph), now), now, None
+        trajectory.release()
     while sojourn is not None:
         yield _graph_message(sojourn, time)
         sojourn = next(sojourns, None)
+
+
+def _in_order(trajectory: Trajectory) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
+    """Steps, agents and times (e,) of all states by time, those of one time by step and agent, a part at once."""
+    count, m, made = len(trajectory.states), trajectory.states.shape[1], trajectory.made
+    clock = StepClock(trajectory.record.experiment.step_length)
+    rows = max(1, BLOCK_NUMBERS // trajectory.states[:1].size)
+    # Nothing of step k or a later one is earlier than later[k].
+    later = np.empty(count + 1, dtype=np.int64)
+    later[count] = np.iinfo(np.int64).max
+    for first in range(0, count if made is not None else 0, rows):
+        assert made is not None
+        times = made[first : first + rows]
+        later[first : first + len(times)] = np.where(times < 0, later[count], times).min(axis=1)
+        release(made)
+    later[:count] = np.minimum.accumulate(later[::-1])[::-1][:count]
+    waiting = np.empty(0, dtype=np.int64)
+    for first in range(0, count, rows):
+        end = min(first + rows, count)
+        cells = np.concatenate([waiting, np.arange(first * m, end * m)])
+        steps, agents = np.divmod(cells, m)
+        if made is None:
+            yield steps, agents, np.repeat(clock.times(np.arange(first, end)), m)
+            continue
+        times = made[steps, agents]
+        by = np.lexsort((cells, times))
+        ready, behind = np.split(by, [int(np.searchsorted(times[by], later[end], side="left"))])
+        waiting = cells[behind]
+        yield steps[ready], agents[ready], times[ready]
 
 
 def _graph_message(sojourn: ActiveGraph, time: Callable[[int], int]) -> _Message:
@@ -130,22 +158,22 @@ def _names(topic: Topic, agents: int) -> list[str]:
     return [f"/{topic.of(i)}" for i in range(agents)]
 
 
-def _heard(trajectory: Trajectory, used: IntArray) -> Callable[[int, int], list[int]]:
-    """Function of (k, agent from 0) that gives ``heard`` of that state: the steps used in the step that led there.
+def _heard(trajectory: Trajectory) -> Callable[[int, int, int], list[int]]:
+    """Function of (k, agent and graph from 0): ``heard`` of that state, the steps used in the step that led there.
 
     Empty in lockstep where nothing was lost; complete in real time.
     """
     lost, values = trajectory.lost, trajectory.used
     if lost is None and values is None:
-        return lambda _k, _i: []
+        return lambda _k, _i, _graph: []
     model, delay = trajectory.record.model, trajectory.record.experiment.noise.delay
     modes, agents = range(model.modes), range(model.agents)
     counts = [[len(model.neighbours(mode, i)) for i in agents] for mode in modes]
 
-    def listed(k: int, i: int) -> list[int]:
+    def listed(k: int, i: int, graph: int) -> list[int]:
         if k == 0:
             return []
-        neighbours = counts[used[k, i]][i]
+        neighbours = counts[graph][i]
         newest = max(0, k - 1 - delay)
         if values is not None:
             steps = values[k - 1, i, :neighbours].tolist()

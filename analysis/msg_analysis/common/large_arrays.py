@@ -21,7 +21,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -43,6 +43,50 @@ def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:
             os.posix_fallocate(file.fileno(), 0, size)  # a write to a full disk would end the process
             return np.memmap(file, dtype=dtype, mode="r+", shape=shape)
     return np.zeros(shape, dtype)
+
+
+class LargeRows:
+    """Rows that are found one part after the other: in a file from ``LARGE`` / 8 bytes on, if there is room for it."""
+
+    def __init__(self, columns: int, dtype: Any) -> None:
+        self._shape, self._dtype = (-1, columns), np.dtype(dtype)
+        self._parts: list[AnyArray] = []
+        self._kept = self._written = 0  # bytes
+        self._file: IO[bytes] | None = None
+
+    def append(self, rows: AnyArray) -> int:
+        """Add rows; the number of those before."""
+        part = np.ascontiguousarray(rows, self._dtype)
+        before: int = (self._kept + self._written) // (self._shape[1] * self._dtype.itemsize)
+        self._parts.append(part)
+        self._kept += part.nbytes
+        if self._kept + self._written >= LARGE // 8:
+            self._move()
+        return before
+
+    def array(self) -> AnyArray:
+        """(rows, columns), when all have been added: read-only where it is in a file."""
+        kept = np.concatenate([np.empty((0, self._shape[1]), self._dtype), *self._parts])
+        if self._file is None:
+            return kept
+        with self._file as file:
+            if not self._written:
+                return kept
+            written = np.memmap(file, dtype=self._dtype, mode="r", shape=(self._written // self._dtype.itemsize,))
+        return np.concatenate([written.reshape(self._shape), kept]) if len(kept) else written.reshape(self._shape)
+
+    def _move(self) -> None:
+        """Into the file; they stay in memory where the disk is full."""
+        with suppress(OSError):
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(prefix="msg_analysis.", buffering=0)  # noqa: SIM115  until `array`
+            while self._parts:
+                self._file.seek(self._written)
+                left = memoryview(self._parts[0].tobytes())
+                while left:
+                    left = left[self._file.write(left) :]
+                self._written += self._parts[0].nbytes
+                self._kept -= self._parts.pop(0).nbytes
 
 
 def in_file(array: AnyArray) -> bool:

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import release
 from msg_analysis.common.long_work import tell
 from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.run.graph_path import mode_path
@@ -119,20 +118,10 @@ def _in_real_time(trajectory: Trajectory, path: IntArray) -> tuple[str | None, i
 
 def _with_progress(trajectory: Trajectory, blocks: Iterable[RunBlock]) -> Iterable[RunBlock]:
     """The blocks; the memory of what was read of the log is given back after each."""
-    log = (
-        trajectory.states,
-        trajectory.published,
-        trajectory.lost,
-        trajectory.used,
-        trajectory.made,
-        trajectory.agent_modes,
-    )
     for block in blocks:
         tell("comparing with the twin", block.first, len(trajectory.states))
         yield block
-        for array in log:
-            if array is not None:
-                release(array)
+        trajectory.release()
 
 
 def _earliest(found: Iterable[_Found]) -> str | None:

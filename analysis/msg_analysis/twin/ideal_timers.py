@@ -19,9 +19,12 @@ Every agent steps when it is due, and hears at once what others made.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from msg_analysis.common.large_arrays import large_zeros
+from msg_analysis.common.large_arrays import large_zeros, release
+from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.step.air_reception import MessagesUsed
@@ -33,7 +36,13 @@ from msg_analysis.types import IntArray
 def ideal_log(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """``agent_modes``, ``used`` and ``made`` of ``Trajectory`` for a run with these graphs (N,), from 0."""
     agent_modes, made = ideal_times(experiment, modes)
-    return agent_modes, MessagesUsed(experiment, model).used(0, modes), made
+    messages, shape = MessagesUsed(experiment, model), (len(modes), model.agents, model.most_neighbours)
+    used = large_zeros(shape, np.int64, total=8 * math.prod(shape))
+    for first in range(0, len(modes), STEPS_PER_BLOCK):
+        now = slice(first, first + STEPS_PER_BLOCK)
+        used[now] = messages.used(first, modes[now])
+        release(used)
+    return agent_modes, used, made
 
 
 def ideal_times(experiment: ValidExperiment, modes: IntArray) -> tuple[IntArray, IntArray]:

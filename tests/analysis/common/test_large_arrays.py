@@ -15,7 +15,7 @@ from msg_analysis.bags import trajectory_builder
 from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.common import large_arrays
-from msg_analysis.common.large_arrays import LARGE, in_file, large_zeros, release
+from msg_analysis.common.large_arrays import LARGE, LargeRows, in_file, large_zeros, release
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
@@ -118,3 +118,40 @@ def test_a_run_that_is_read_into_files(
         assert np.array_equal(one.published, other.published, equal_nan=True)
     assert (one.published is None) == (other.published is None) == (not changes)
     assert compare(one).to_json() == compare(other).to_json()
+
+
+@pytest.mark.parametrize("limit", [None, 1, 900, 10**6])
+def test_rows_one_part_after_the_other(limit: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In memory, in a file from some size on, or all in a file; none at all, too."""
+    monkeypatch.setattr(large_arrays, "LARGE", LARGE if limit is None else 8 * limit)
+    random = np.random.default_rng(4)
+    rows, parts = LargeRows(3, np.int32), [random.integers(-9, 9, (count, 3)) for count in (4, 0, 50, 1, 300)]
+    assert [rows.append(part) for part in parts] == [0, 4, 4, 54, 55]
+    found = rows.array()
+    assert in_file(found) == (limit in (1, 900))
+    assert found.dtype == np.int32
+    assert np.array_equal(found, np.concatenate(parts))
+    assert LargeRows(2, np.int64).array().shape == (0, 2)
+
+
+def test_rows_without_room_on_the_disk() -> None:
+    """Files of this process may have 1 MB: what does not fit stays in memory, and no row is lost."""
+    script = """
+import signal
+import numpy as np
+from msg_analysis.common import large_arrays
+large_arrays.LARGE = 8
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+rows, parts = large_arrays.LargeRows(2, np.int64), [np.full((20_000, 2), number) for number in range(9)]
+for part in parts:
+    rows.append(part)
+found = rows.array()
+assert not large_arrays.in_file(found)
+assert np.array_equal(found, np.concatenate(parts))
+"""
+    subprocess.run(
+        [sys.executable, "-c", script],
+        check=True,
+        timeout=60,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (10**6, 10**6)),
+    )

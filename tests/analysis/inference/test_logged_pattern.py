@@ -5,10 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from msg_analysis.common import large_arrays
+from msg_analysis.common.large_arrays import in_file
 from msg_analysis.inference.errors.estimates import covariance_test, estimates
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.realtime import logged_pattern as module
-from msg_analysis.inference.realtime.event_order import newest_steps, order_events, sampled
+from msg_analysis.inference.realtime.event_order import EventOrder, newest_steps, order_events, sampled
 from msg_analysis.inference.realtime.logged_pattern import PatternUnavailableError, pattern_means
 from msg_analysis.inference.realtime.pattern_events import Periods
 from msg_analysis.model.experiment.experiment import ValidExperiment
@@ -139,7 +141,7 @@ def test_against_all_noise_written_out(late_timers, case, kind):
     total, nodes = estimates(means, system)
     diagonal = [0, 2, 5]
     error = np.sqrt(covariance[np.ix_(diagonal, diagonal)].sum())
-    x = sampled(observation)[:-1] - observation.step.reference
+    x = sampled(observation, order)[:-1] - observation.step.reference
     if system.dimension == 2:
         x = x - x.mean(axis=1, keepdims=True)
     measured = np.einsum("kir,kjr->ij", x, x) / x.shape[0] / x.shape[2]
@@ -160,24 +162,24 @@ def test_against_all_noise_written_out(late_timers, case, kind):
 def test_what_has_to_be_remembered(late_timers):
     """Nothing with ideal timers; with slow messages what others still use; noise of a step half made, if correlated."""
     ideal = observe(simulate(CASES["correlated"]))
-    assert Periods(ideal, order_events(ideal).position).largest == 3
+    assert Periods(ideal, order_events(ideal)).largest == 3
     slow = observe(late_timers.run(CASES["consensus"], slow=late_timers.busy(0.7, 3.0)))
-    assert 3 < Periods(slow, order_events(slow).position).largest < 12
+    assert 3 < Periods(slow, order_events(slow)).largest < 12
     late = late_timers.run(CASES["correlated"], late=late_timers.busy(0.4, 2.5))
     late = observe(late)
-    assert Periods(late, order_events(late).position).largest > 5
+    assert Periods(late, order_events(late)).largest > 5
 
 
 def test_ideal_periods_are_the_sequential_law():
     observation = observe(simulate(experiment(noise={"process": CORRELATED}, **TRACKING)))
-    periods = Periods(observation, order_events(observation).position)
+    periods = Periods(observation, order_events(observation))
     system = observation.prediction.system
     for number in range(1, STEPS):
         g = observation.modes[number - 1]
         np.testing.assert_allclose(periods[number].matrix, system.matrices[g], atol=1e-14)
         np.testing.assert_allclose(periods[number].noise, system.noise[g], atol=1e-14)
     np.testing.assert_array_equal(newest_steps(observation), np.tile(np.arange(STEPS + 1)[:, None], (1, 3)))
-    np.testing.assert_array_equal(sampled(observation), observation.states)
+    np.testing.assert_array_equal(sampled(observation, order_events(observation)), observation.states)
 
 
 def test_a_clock_that_jumps(late_timers):
@@ -215,6 +217,7 @@ def test_blocks_change_nothing(late_timers, monkeypatch):
     monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 40)
     monkeypatch.setattr("msg_analysis.inference.realtime.pattern_events.CACHED_NUMBERS", 50)
     monkeypatch.setattr("msg_analysis.inference.realtime.logged_pattern.math.isqrt", lambda _: 7)
+    monkeypatch.setattr(large_arrays, "LARGE", 1)
     split = pattern_means(observation, order)
     for name in ("measured", "predicted", "covariance", "system_series", "system_variances"):
         np.testing.assert_allclose(getattr(split, name), getattr(whole, name), rtol=1e-9, atol=1e-14)
@@ -225,7 +228,7 @@ def test_less_is_tested_when_there_is_much(late_timers, monkeypatch):
     observation = observe(late_timers.run(CASES["tracking"], **timing(late_timers, "all")))
     system, order = observation.prediction.system, order_events(observation)
     whole = estimates(pattern_means(observation, order), system)
-    entries = Periods(observation, order.position).largest
+    entries = Periods(observation, order).largest
     for forms, joint in ((3, False), (1, False)):
         work = STEPS * entries**2 * (forms**2 + (3 * forms + 4) * entries)
         monkeypatch.setattr(module, "MAX_WORK", work)
@@ -243,3 +246,41 @@ def test_less_is_tested_when_there_is_much(late_timers, monkeypatch):
     monkeypatch.setattr(module, "MAX_ENTRIES", 3)
     with pytest.raises(PatternUnavailableError, match="expected at most 3"):
         pattern_means(observation, order)
+
+
+def test_order_in_blocks_and_in_files(late_timers, monkeypatch):
+    """With clocks that jump, agents that catch up, and many states of one time: as at once."""
+    trajectory = late_timers.run(CASES["consensus"], **timing(late_timers, "all"))
+    tick = 300_000_000
+    observation = observe(dataclasses.replace(trajectory, made=-(-trajectory.made // tick) * tick))
+    whole = order_events(observation)
+    assert sorted(whole.position.ravel().tolist()) == list(range(3 * STEPS))
+    by_time = np.argsort(whole.position.ravel())
+    made, used = observation.timers.made, observation.timers.used
+    assert (np.diff(made[1:].ravel()[by_time]) >= 0).all()
+    for k, i in np.ndindex(whole.position.shape):
+        if k:
+            assert whole.position[k - 1, i] < whole.position[k, i]
+        for d, j in enumerate(observation.step.neighbours(int(observation.timers.graphs[k, i]), i).tolist()):
+            if used[k, i, d] > 0:
+                assert whole.position[used[k, i, d] - 1, j] < whole.position[k, i]
+    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 90)
+    monkeypatch.setattr("msg_analysis.inference.realtime.event_order.TIES_AT_ONCE", 2)
+    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    split = order_events(observation)
+    assert in_file(split.position)
+    assert np.array_equal(split.position, whole.position)
+    assert np.array_equal(split.newest, whole.newest)
+    assert np.array_equal(sampled(observation, split), sampled(observation, whole))
+
+
+def test_the_order_in_lockstep():
+    """Of the states of a run in which all agents step at the same time, that by step and agent."""
+    observation = observe(simulate(experiment(run={"pace": "lockstep"}))).as_timed()
+    one, other = EventOrder.of_lockstep(STEPS, 3), order_events(observation)
+    assert np.array_equal(one.position, other.position)
+    assert np.array_equal(one.newest, other.newest)
+    for first, last in ((0, 1), (0, 5), (7, 60), (50, STEPS + 2)):
+        steps, agents = one.events(first, last)
+        expected = [(k, i) for i in range(3) for k in range(STEPS) if first <= k + 1 < last]
+        assert list(zip(steps.tolist(), agents.tolist(), strict=True)) == expected

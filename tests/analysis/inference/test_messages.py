@@ -13,6 +13,8 @@ import pytest
 from tests.support.message_runs import message_run
 from tests.support.switching_systems import LINE_RING
 
+from msg_analysis.common import large_arrays
+from msg_analysis.common.large_arrays import in_file
 from msg_analysis.inference.hypothesis_tests.innovations import innovations
 from msg_analysis.inference.hypothesis_tests.losses import LossTally, loss_test
 from msg_analysis.inference.observed.heard_values import HeardValues
@@ -21,6 +23,7 @@ from msg_analysis.inference.observed.repeated_noise import RepeatedNoise
 from msg_analysis.inference.realtime import pattern_events
 from msg_analysis.inference.realtime.event_order import newest_steps, order_events
 from msg_analysis.inference.realtime.logged_pattern import means_in_lockstep, pattern_means
+from msg_analysis.inference.realtime.period_tables import period_tables
 from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
@@ -292,3 +295,18 @@ def test_the_verdict_in_real_time_is_calibrated():
         alarms += found.verdict == "disagrees"
     assert covered >= 15
     assert alarms <= 8
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_values_in_use_in_blocks_and_in_files(case, monkeypatch):
+    """What is in use, block by block of one or two steps, is what is found for the whole run at once."""
+    observation = observed(case, duration=60)
+    timed = observation if observation.timers else observation.as_timed()
+    whole = period_tables(timed, order_events(timed))
+    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 300)
+    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    again = observation if observation.timers else observation.as_timed()
+    split = period_tables(again, order_events(again))
+    assert in_file(split.events)
+    for name in ("events", "event_ends", "extras", "extra_ends"):
+        assert np.array_equal(getattr(split, name), getattr(whole, name)), name

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tracemalloc
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,9 @@ from msg_analysis.bags.reader import read_bag
 from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.common import large_arrays
 from msg_analysis.common.large_arrays import in_file
+from msg_analysis.inference.verdict.compare import compare
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.graph_path import mode_path
-from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.air_reception import MessagesUsed
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record, simulate
@@ -41,14 +42,14 @@ RUNS: dict[str, dict[str, Any]] = {
 }
 
 
-def experiment(case: str, steps: int) -> ValidExperiment:
+def experiment(case: str, steps: int, replicas: int = 2) -> ValidExperiment:
     changes = RUNS[case]
     document: dict[str, Any] = {
         "name": "long",
         "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
         "switching": {"generator": [[-1, 1], [1, -1]]},
     }
-    run = {"dt": 0.05, "duration": 0.05 * steps, "replicas": 2, "seed": 5} | changes.get("run", {})
+    run = {"dt": 0.05, "duration": 0.05 * steps, "replicas": replicas, "seed": 5} | changes.get("run", {})
     return ValidExperiment.parse(document | changes | {"run": run})
 
 
@@ -76,19 +77,33 @@ def test_the_same_in_files(case: str, tmp_path: Path, monkeypatch: pytest.Monkey
     assert outcome.difference.startswith("agent 4 at step 551, replica 2: ")
 
 
-@pytest.mark.parametrize("case", RUNS)
+@pytest.mark.parametrize("case", ["held", "noisy", "real time", "protocol"])
 def test_check_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the steps need hardly more memory: 8 bytes of each step for its graph, and as much for a copy."""
     monkeypatch.setattr(large_arrays, "LARGE", 1)
-    short, long = (_peak(simulate(experiment(case, steps))) for steps in (1_024, 2_048))
-    assert long - short < 1_024 * 24
+    runs = [simulate(experiment(case, steps)) for steps in (768, 1_280)]
+    short, long = (_peak(lambda run=run: check(run)) for run in runs)
+    assert long - short < 512 * 32
 
 
-def _peak(run: Trajectory) -> int:
-    """Most bytes in use at once in ``check``, less those of before."""
+@pytest.mark.parametrize("case", ["lost", "held", "real time", "protocol in real time"])
+def test_comparison_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice the steps need at most some numbers more for each; its states alone have 320 bytes."""
+    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    for place in ("observed.observation.BLOCK_NUMBERS", "observed.measurement.BLOCK_NUMBERS"):
+        monkeypatch.setattr(f"msg_analysis.inference.{place}", 4_000)
+    monkeypatch.setattr("msg_analysis.inference.errors.given_path.SMALL_BLOCK", 4_000)
+    monkeypatch.setattr("msg_analysis.inference.realtime.pattern_events.CACHED_NUMBERS", 4_000)
+    runs = [simulate(experiment(case, steps, replicas=8)) for steps in (200, 400, 800)]
+    _, short, long = (_peak(lambda run=run: compare(run)) for run in runs)  # the first one imports and predicts
+    assert long - short < 400 * 160
+
+
+def _peak(work: Callable[[], object]) -> int:
+    """Most bytes in use at once in some work, less those of before."""
     tracemalloc.start()
     try:
-        assert check(run).difference is None
+        work()
         return tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

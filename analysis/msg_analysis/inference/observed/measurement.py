@@ -36,7 +36,8 @@ class Measurement:
 
     first: int  # step at which the errors begin
     step: Wiring
-    deviations: FloatArray  # (N - first, m, R) from the reference, or in consensus from the agents' mean
+    system_series: FloatArray  # (N - first,): system error of every step, replicas averaged
+    covariance: FloatArray  # (m, m): mean over steps and replicas of the products of the agents' deviations
     modes: IntArray  # (N,) g(0..N-1)
     lost: BoolArray | None  # (N, m, D) see ``Trajectory.lost``
     sure_messages: int  # see ``Observation.sure_messages``
@@ -45,15 +46,20 @@ class Measurement:
     def of(cls, trajectory: Trajectory) -> Measurement:
         """Everything before the first gap, of a run from a bag or from the twin."""
         experiment, steps = trajectory.record.experiment, max(trajectory.prefix, 0)
-        values = trajectory.values[:steps]
-        consensus = experiment.problem == "consensus"
-        deviations = values - (values.mean(axis=1, keepdims=True) if consensus else experiment.reference)
-        first = transient_length(_system_errors(deviations))
+        series = np.empty(steps)
+        for begin, end in _blocks(trajectory, 0, steps):
+            series[begin:end] = (_deviations(trajectory, begin, end) ** 2).sum(axis=1).mean(axis=1)
+        first = transient_length(series)
+        products = np.zeros((experiment.agents, experiment.agents))
+        for begin, end in _blocks(trajectory, first, steps):
+            flat = _deviations(trajectory, begin, end).transpose(1, 0, 2).reshape(experiment.agents, -1)
+            products += flat @ flat.T
         lost = trajectory.lost
         return cls(
             first=first,
             step=trajectory.record.model,
-            deviations=deviations[first:],
+            system_series=series[first:],
+            covariance=products / max(1, (steps - first) * experiment.run.replicas),
             modes=trajectory.modes[:steps],
             lost=None if lost is None else lost[:steps],
             sure_messages=experiment.noise.delay + (1 if experiment.noise.holds else 0),
@@ -63,17 +69,6 @@ class Measurement:
     def steps(self) -> int:
         """N."""
         return len(self.modes)
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(m, m): mean over steps and replicas of the products of the agents' deviations."""
-        flat = self.deviations.transpose(1, 0, 2).reshape(self.deviations.shape[1], -1)
-        return np.asarray(flat @ flat.T / flat.shape[1])
-
-    @property
-    def system_series(self) -> FloatArray:
-        """(N - first,): system error of every step, replicas averaged."""
-        return _system_errors(self.deviations)
 
     def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
         """See ``Observation.blocks``."""
@@ -104,5 +99,17 @@ def transient_length(series: FloatArray) -> int:
     return BATCH * int(np.argmin(scores[: count // 2 + 1]))
 
 
-def _system_errors(deviations: FloatArray) -> FloatArray:
-    return np.asarray((deviations**2).sum(axis=1).mean(axis=1))
+def _blocks(trajectory: Trajectory, first: int, end: int) -> Iterator[tuple[int, int]]:
+    """Blocks of the steps first..end-1."""
+    length = max(1, BLOCK_NUMBERS // max(1, trajectory.states[:1].size))
+    for begin in range(first, end, length):
+        tell("errors", begin, end)
+        yield begin, min(begin + length, end)
+        trajectory.release()
+
+
+def _deviations(trajectory: Trajectory, first: int, end: int) -> FloatArray:
+    """(end - first, m, R) from the reference, or in consensus from the agents' mean."""
+    experiment, values = trajectory.record.experiment, trajectory.values[first:end]
+    consensus = experiment.problem == "consensus"
+    return np.asarray(values - (values.mean(axis=1, keepdims=True) if consensus else experiment.reference))

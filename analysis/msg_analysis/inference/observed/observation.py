@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import BLOCK_NUMBERS, pieces, release
+from msg_analysis.common.large_arrays import BLOCK_NUMBERS, large_zeros, pieces, release
 from msg_analysis.common.long_work import tell
 from msg_analysis.common.text.agent_names import agent_text
 from msg_analysis.errors import InputError
@@ -115,12 +115,21 @@ class Observation:
     def as_timed(self) -> Observation:
         """A run in lockstep as one in real time in which all agents step together, always on time."""
         steps, m, most = self.steps, self.step.agents, self.step.most_neighbours
+        total = 8 * steps * m * (2 + most)
         used = self.used
         if used is None:
-            used = np.broadcast_to(np.arange(steps)[:, None, None], (steps, m, most))
-            used = used if self.lost is None else np.where(self.lost, -1, used)
-        graphs = np.repeat(self.modes[:, None], m, axis=1)
-        made = np.repeat(StepClock(self.step.dt).times(np.arange(steps + 1))[:, None], m, axis=1)
+            used = large_zeros((steps, m, most), np.int64, total=total)
+        graphs, made = (large_zeros((count, m), np.int64, total=total) for count in (steps, steps + 1))
+        clock = StepClock(self.step.dt)
+        for first, last in self.blocks((2 + most) * m, "times of the steps"):
+            graphs[first:last] = self.modes[first:last, None]
+            made[first : last + 1] = clock.times(np.arange(first, last + 1))[:, None]
+            if self.used is None:
+                used[first:last] = np.arange(first, last)[:, None, None]
+                if self.lost is not None:
+                    used[first:last][self.lost[first:last]] = -1
+            for array in (graphs, used, made):
+                release(array)
         return replace(self, timers=Timers(graphs, used, made), used=None)
 
     def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
@@ -136,7 +145,8 @@ class Observation:
 
     def release(self) -> None:
         """Give back the memory of a long run, whose states are in a file: after every block."""
-        for array in (self.states, self.published, self.lost):
+        timers = (self.timers.graphs, self.timers.used, self.timers.made) if self.timers else ()
+        for array in (self.states, self.published, self.lost, self.used, *timers):
             if array is not None:
                 release(array)
 

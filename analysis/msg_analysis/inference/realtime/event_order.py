@@ -12,26 +12,66 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Order of the steps of a run in real time, and the state of the network at the sampling times."""
+"""Order of the steps of a run in real time, and the state of the network at the sampling times.
+
+All is computed in blocks, and kept in arrays that are in a file where they are large.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import large_zeros, release
 from msg_analysis.inference.observed.observation import Observation, Timers
 from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.types import FloatArray, IntArray
 
+TIES_AT_ONCE = 100_000  # pairs of events at equal times that are put in order together
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EventOrder:
-    """The steps of all agents as one sequence of events."""
+    """The steps of all agents as one sequence of events. Event (k, i) is the one in which agent i makes x_i(k+1)."""
 
-    position: IntArray  # (N, m) place of the event in which agent i makes x_i(k+1)
-    contradiction: str | None  # why the times in the log contradict cause and effect; None where they do not
+    position: IntArray  # (N, m) place of the events
+    newest: IntArray  # (N + 1, m) step of each agent's newest state that was made at simulated time <= k dt
+    contradiction: str | None = None  # why the times in the log contradict cause and effect; None where they do not
+
+    @classmethod
+    def of_lockstep(cls, steps: int, agents: int) -> EventOrder:
+        """Of a run in which all agents make each step at the same time."""
+        position, newest = _zeros(steps, agents), _zeros(steps + 1, agents)
+        for k in range(0, steps + 1, _BLOCK):
+            rows = np.arange(k, min(k + _BLOCK, steps + 1))
+            newest[rows] = rows[:, None]
+            rows = rows[rows < steps]
+            position[rows] = agents * rows[:, None] + np.arange(agents)
+        return cls(position, newest)
+
+    def events(self, first: int, last: int) -> tuple[IntArray, IntArray]:
+        """Steps and agents (e,) of the events after sampling time first - 1 and up to last - 1, agent after agent.
+
+        ``first``: 0 for the beginning; ``last``: N + 2 for the end.
+        """
+        m = self.newest.shape[1]
+        begin = self.newest[first - 1] if first else np.zeros(m, dtype=np.int64)
+        end = self.newest[last - 1] if last <= len(self.newest) else np.full(m, len(self.position))
+        agents = np.repeat(np.arange(m), end - begin)
+        within = np.arange(len(agents)) - np.repeat(np.cumsum(end - begin) - (end - begin), end - begin)
+        return begin[agents] + within, agents
+
+
+_BLOCK = 2**14  # steps
+
+
+def _zeros(rows: int, columns: int) -> IntArray:
+    """One of several arrays like the times in the log."""
+    return large_zeros((rows, columns), np.int64, total=8 * 8 * rows * columns)
 
 
 def order_events(observation: Observation) -> EventOrder:
@@ -40,44 +80,83 @@ def order_events(observation: Observation) -> EventOrder:
     Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
     """
     timers = _timers(observation)
-    made = timers.made
-    senders = neighbour_tables(observation.step).senders[timers.graphs, np.arange(made.shape[1])]
-    heard = np.where(timers.used >= 0, made[timers.used, senders], np.int64(-1))
-    after = made[1:]
-    early = np.argwhere(heard > after[:, :, None])
-    contradiction = None
-    if len(early):
-        k, i, d = early[0].tolist()
-        contradiction = (
-            f"in step {k} agent {i + 1} used a value that agent {senders[k, i, d] + 1} computed "
-            f"{(heard[k, i, d] - after[k, i]) / 1e9:.3g} units of time later ({len(early)} such cases): their clocks "
-            "disagree"
-        )
-    elif (np.diff(made, axis=0) < 0).any() or (after <= 0).any():
-        contradiction = "the times of an agent's states decrease: its clock was set back"
-    own = np.argwhere(after == made[:-1])
-    own = own[own[:, 0] > 0]
-    others = np.argwhere((heard == after[:, :, None]) & (timers.used > 0))
-    k, i, d = others.T
-    m = made.shape[1]
-    target = np.concatenate([own, others[:, :2]]) @ [m, 1] + m
-    source = np.concatenate([own[:, 0] * m + own[:, 1], timers.used[k, i, d] * m + senders[k, i, d]])
-    turn, circular = _turns(source, target, made.size)
+    newest = newest_steps(observation)
+    contradiction, ties = _early_and_equal(observation, timers)
+    turn, circular = _turns_of(timers, ties)
     if circular:
         contradiction = contradiction or "agents used new values of each other at the same time"
-    level = turn.reshape(made.shape)
-    agents = np.tile(np.arange(made.shape[1]), len(after))
-    steps = np.repeat(np.arange(len(after)), made.shape[1])
-    order = np.lexsort((agents, steps, level[1:].ravel(), after.ravel()))
-    position = np.empty(len(order), dtype=np.int64)
-    position[order] = np.arange(len(order))
-    return EventOrder(position.reshape(after.shape), contradiction)
+    order = EventOrder(_zeros(*timers.graphs.shape), newest, contradiction)
+    placed = 0
+    for first, last in _blocks_of_periods(observation):
+        steps, agents = order.events(first, last)
+        chosen = np.lexsort((agents, steps, turn[steps + 1, agents], timers.made[steps + 1, agents]))
+        order.position[steps[chosen], agents[chosen]] = np.arange(placed, placed + len(chosen))
+        placed += len(chosen)
+        for array in (order.position, order.newest, turn):
+            release(array)
+    return order
+
+
+def _blocks_of_periods(observation: Observation) -> Iterator[tuple[int, int]]:
+    """As for ``EventOrder.events``, so that all events are in one of the blocks."""
+    numbers = (4 + observation.step.most_neighbours) * observation.step.agents
+    ends = [last for _, last in observation.blocks(numbers, "order of the steps")]
+    return pairwise([0, *ends[:-1], observation.steps + 2])
+
+
+def _early_and_equal(observation: Observation, timers: Timers) -> tuple[str | None, IntArray]:
+    """What contradicts cause and effect; (t, 4) pairs of states of one time, the first one first: step and agent."""
+    tables, agents = neighbour_tables(observation.step), np.arange(observation.step.agents)
+    early, text, decreasing = 0, "", False
+    ties = [np.empty((0, 4), dtype=np.int64)]
+    for first, last in observation.blocks(4 * timers.used[:1].size, "order of the steps"):
+        senders = tables.senders[timers.graphs[first:last], agents]
+        used, made = timers.used[first:last], timers.made[first : last + 1]
+        after = made[1:]
+        heard = np.where(used >= 0, timers.made[used, senders], np.int64(-1))
+        wrong = np.argwhere(heard > after[:, :, None])
+        if len(wrong) and not early:
+            k, i, d = wrong[0].tolist()
+            text = (
+                f"in step {first + k} agent {i + 1} used a value that agent {senders[k, i, d] + 1} computed "
+                f"{(heard[k, i, d] - after[k, i]) / 1e9:.3g} units of time later"
+            )
+        early += len(wrong)
+        decreasing = decreasing or bool((np.diff(made, axis=0) < 0).any() or (after <= 0).any())
+        k, i = np.nonzero(after == made[:-1])
+        ties.append(np.column_stack([first + k, i, first + k + 1, i])[first + k > 0])
+        k, i, d = np.nonzero((heard == after[:, :, None]) & (used > 0))
+        ties.append(np.column_stack([used[k, i, d], senders[k, i, d], first + k + 1, i]))
+    if early:
+        return f"{text} ({early} such cases): their clocks disagree", np.concatenate(ties)
+    return ("the times of an agent's states decrease: its clock was set back" if decreasing else None), np.concatenate(
+        ties
+    )
+
+
+def _turns_of(timers: Timers, ties: IntArray) -> tuple[IntArray, bool]:
+    """(N + 1, m): of states with equal times, which comes first; and whether there is a circle."""
+    turn, m, circular = _zeros(*timers.made.shape), timers.made.shape[1], False
+    times = timers.made[ties[:, 2], ties[:, 3]]
+    order = np.argsort(times, kind="stable")
+    ties, times = ties[order], times[order]
+    begin = 0
+    while begin < len(ties):  # all pairs of one time together
+        last = times[min(begin + TIES_AT_ONCE, len(ties)) - 1]
+        end = int(np.searchsorted(times, last, side="right"))
+        cells, place = np.unique(ties[begin:end].reshape(-1, 2) @ [m, 1], return_inverse=True)
+        source, target = place.reshape(-1, 2).T
+        found, circle = _turns(source, target, len(cells))
+        turn[cells // m, cells % m] = found
+        circular = circular or circle
+        begin = end
+    return turn, circular
 
 
 def _turns(source: IntArray, target: IntArray, count: int) -> tuple[IntArray, bool]:
     """A place for each of ``count`` items, every source before its target; and whether there is a cycle."""
     turn = np.zeros(count, dtype=np.int64)
-    order = np.argsort(source, kind="stable")
+    order = np.lexsort((target, source))
     ends = np.searchsorted(source[order], np.arange(count + 1)).tolist()
     targets = target[order].tolist()
     waits_for = np.bincount(target, minlength=count)
@@ -93,16 +172,26 @@ def _turns(source: IntArray, target: IntArray, count: int) -> tuple[IntArray, bo
 
 
 def newest_steps(observation: Observation) -> IntArray:
-    """(N + 1, m): step of each agent's newest state that was made at simulated time <= k dt."""
-    made = np.maximum.accumulate(_timers(observation).made, axis=0)
-    times = sampling_times(observation)
-    newest = [np.searchsorted(made[:, i], times, side="right") - 1 for i in range(made.shape[1])]
-    return np.stack(newest, axis=1)
+    """``EventOrder.newest`` of a run in real time."""
+    made, times = _timers(observation).made, sampling_times(observation)
+    newest = _zeros(*made.shape)
+    for i in range(made.shape[1]):
+        newest[:, i] = np.searchsorted(np.maximum.accumulate(made[:, i]), times, side="right") - 1
+        release(newest)
+        release(made)
+    return newest
 
 
-def sampled(observation: Observation) -> FloatArray:
+def sampled(observation: Observation, order: EventOrder) -> FloatArray:
     """(N + 1, m, R): the newest states at simulated time k dt, which are compared in real time."""
-    return np.asarray(observation.states[newest_steps(observation), np.arange(observation.step.agents)])
+    shape, agents = observation.states.shape, np.arange(observation.step.agents)
+    states = large_zeros(shape, np.float64, total=observation.states.nbytes)
+    for first, last in observation.blocks(observation.states[0].size, "states at the sampling times"):
+        rows = slice(first, last + 1)  # the last one again in the next block
+        states[rows] = observation.states[order.newest[rows], agents]
+        release(states)
+        release(order.newest)
+    return states
 
 
 def sampling_times(observation: Observation) -> IntArray:

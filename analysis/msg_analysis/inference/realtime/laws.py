@@ -95,7 +95,7 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
     reject them, or if more deadlines were missed than ``MAX_MISSED``. They are supported if what they leave out is
     known to change the system error by at most ``MAX_EFFECT``; otherwise the run is too short to decide.
     """
-    sequential = time_means(replace(observation, states=sampled(observation)))
+    sequential = time_means(replace(observation, states=sampled(observation, order)))
     error, p = _least(observation, sequential)
     effect = None
     try:

@@ -36,9 +36,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from msg_analysis.inference.errors.time_means import TimeMeans, forms_of, moments
+from msg_analysis.inference.errors.time_means import TimeMeans, forms_of, packed_moments
 from msg_analysis.inference.observed.observation import Observation, Timers
-from msg_analysis.inference.realtime.event_order import EventOrder, order_events, sampled
+from msg_analysis.inference.realtime.event_order import EventOrder, order_events
 from msg_analysis.inference.realtime.pattern_events import Periods
 from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.twin.ideal_timers import ideal_log
@@ -73,7 +73,7 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
     experiment = observation.prediction.experiment
     graphs, used, made = ideal_log(experiment, observation.step, observation.modes)
     ideal = replace(observation, timers=Timers(graphs[1:], used, made))
-    periods = Periods(ideal, order_events(ideal).position)
+    periods = Periods(ideal, order_events(ideal))
     total = _forward(periods, np.sum(periods.start(_start(observation)), axis=0))[0]
     frame = observation.prediction.system.frame
     expected = float(np.trace(frame.T @ total @ frame)) / observation.steps
@@ -98,7 +98,7 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
     if order.contradiction:
         raise PatternUnavailableError(order.contradiction)
     system, steps = observation.prediction.system, observation.steps
-    periods = Periods(observation, order.position)
+    periods = Periods(observation, order)
     entries = periods.largest
     if entries > MAX_ENTRIES:
         raise PatternUnavailableError(
@@ -117,11 +117,11 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
         raise PatternUnavailableError(f"{steps} steps of {entries} values are too many to compute")
     lifted = frame @ packed_symmetric.unpack(forms, frame.shape[1]) @ frame.T
 
-    x = sampled(observation)
-    seen = np.zeros(p)
+    seen, agents = np.zeros(p), np.arange(observation.step.agents)
     series = np.empty(steps)
     for first, last in observation.blocks(max(p, observation.states[0].size), "expected errors"):
-        found = moments(observation, first, last, x)
+        sampled = observation.states[order.newest[first:last], agents]
+        found = packed_moments(sampled - observation.step.reference, system, observation.largest)
         seen += found.sum(axis=0)
         series[first:last] = found @ (trace @ forms)
     total, covariance, variances = _follow(periods, _start(observation), lifted, trace)
@@ -145,10 +145,9 @@ def means_in_lockstep(observation: Observation) -> TimeMeans | None:
 
     None where that would take too long.
     """
-    timed = observation.as_timed()
-    steps, m = observation.steps, observation.step.agents
+    order = EventOrder.of_lockstep(observation.steps, observation.step.agents)
     try:
-        return pattern_means(timed, EventOrder(np.arange(steps * m).reshape(steps, m), None))
+        return pattern_means(observation.as_timed(), order)
     except PatternUnavailableError:
         return None
 

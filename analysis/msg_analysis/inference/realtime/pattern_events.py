@@ -31,16 +31,14 @@ import numpy as np
 
 from msg_analysis.inference.observed.heard_values import neighbour_weights
 from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.realtime.event_order import newest_steps, sampling_times
+from msg_analysis.inference.realtime.event_order import EventOrder
+from msg_analysis.inference.realtime.period_tables import OWN, Entries, period_tables
 from msg_analysis.model.step.neighbours import neighbour_tables
-from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.types import BoolArray, FloatArray, IntArray
 
 CACHED_NUMBERS = 20_000_000  # numbers in cached matrices: 160 MB
 
 NULL = 1e-12  # eigenvalues of second moments this small, relative to the largest, are rounding: some are 0 exactly
-
-_OWN = np.iinfo(np.int64).min  # stands for a value that was never heard; the agent's own value takes its place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,94 +61,22 @@ class _Law(NamedTuple):
 class Periods:
     """The periods K = 1..N-1 of a run in real time, from sampling time K-1 to K.
 
-    A stack begins with the m newest states. ``position`` (N, m) is the order in which the states were made.
+    A stack begins with the m newest states. ``order`` is that in which the states were made.
     """
 
-    def __init__(self, observation: Observation, position: IntArray) -> None:
-        assert observation.timers is not None
+    def __init__(self, observation: Observation, order: EventOrder) -> None:
         self._step = step = observation.step
-        links = np.argwhere(step.listens())
-        # Entries: the states of m agents, m sources of noise, what m agents published, what came on every link.
-        self._owners = np.concatenate([np.tile(np.arange(step.agents), 3), links[:, 1]])
-        self._numbers = np.full((step.agents, step.agents), -1)
-        self._numbers[links[:, 0], links[:, 1]] = 3 * step.agents + np.arange(len(links))
-        self._shared = _shared_sources(step)
+        self._observation, self._newest = observation, order.newest
+        self._tables = period_tables(observation, order)
+        self._numbers = Entries(step)
+        self._shared = self._numbers.shared
         self._laws: dict[tuple[int, int], _Law] = {}  # by graph and agent
-        graphs, used, made = observation.timers.graphs, observation.timers.used, observation.timers.made
-        steps, m = graphs.shape
-        self._observation, self._newest = observation, newest_steps(observation)[:steps]
-        newest = self._newest
-        period = np.searchsorted(sampling_times(observation)[:steps], made[1:], side="left")  # N: not seen
-        agents = np.arange(m)
-        senders = neighbour_tables(step).senders[graphs, agents]
-        known = np.minimum(period, steps - 1) - 1
-        offsets = np.where(used >= 0, used - newest[known[:, :, None], senders], _OWN)
-        seen = period < steps
-        used = np.where(seen[:, :, None], used, -1)
-        again = np.zeros_like(used)
-        if step.link:
-            again = self._again(used, senders, position)
-        self._extras(period, newest, used, senders, offsets, again)
-        own = np.arange(steps)[:, None] - newest[known, agents]
-        lag = np.arange(steps)[:, None] - period if self._shared.any() else np.zeros_like(period)
-        columns = [np.broadcast_to(agents, period.shape), graphs, lag, own]
-        table = np.concatenate([np.stack(columns, axis=2), offsets, again], axis=2).reshape(steps * m, -1)
-        order = np.lexsort((position.ravel(), period.ravel()))[: int(seen.sum())]
-        self._table = np.ascontiguousarray(table[order])
-        self._ends = np.searchsorted(period.ravel()[order], np.arange(steps + 1))
         self._cache: dict[bytes, Period] = {}
         self._cached = 0
-        self.steps = steps
-
-    def _again(self, used: IntArray, senders: IntArray, position: IntArray) -> IntArray:
-        """(N, m, D): 1 and 2 for the first and the later uses of a message that is used again, 0 for others."""
-        k, i, d = np.nonzero(used >= 0)
-        order = np.lexsort((position[k, i], used[k, i, d], senders[k, i, d], i))
-        message = np.column_stack([i, senders[k, i, d], used[k, i, d]])[order]
-        same = (message[1:] == message[:-1]).all(axis=1)
-        earlier, later = np.concatenate([[False], same]), np.concatenate([same, [False]])
-        again = np.zeros_like(used)
-        again[k[order], i[order], d[order]] = np.where(earlier, 2, later)
-        return again
-
-    def _extras(
-        self,
-        period: IntArray,
-        newest: IntArray,
-        used: IntArray,
-        senders: IntArray,
-        offsets: IntArray,
-        again: IntArray,
-    ) -> None:
-        """What is stacked after the newest states: rows (entry, its step from the newest one, or from K), by K."""
-        steps, m = period.shape
-        k, i, d = np.nonzero((used >= 0) & (again < 2) & ((offsets < 0) | (self._step.broadcast > 0.0)))
-        sender, step, last = senders[k, i, d], used[k, i, d], period[k, i] - 1
-        if self._step.broadcast:  # first sampling time at which it has been published
-            entry, first = 2 * m + sender, np.where(step > 0, period[step - 1, sender], 0)
-        else:  # first one at which that agent has a newer state
-            entry, first = sender, period[step, sender]
-        values = [_lasting(entry, step, first, last)]
-        k, i, d = np.nonzero(again == 2)
-        if k.size:
-            received = np.column_stack([self._numbers[i, senders[k, i, d]], used[k, i, d]])
-            k0, i0, d0 = np.nonzero(again == 1)
-            begun = np.column_stack([self._numbers[i0, senders[k0, i0, d0]], used[k0, i0, d0], period[k0, i0]])
-            values.append(_lasting(received[:, 0], received[:, 1], _looked_up(begun, received), period[k, i] - 1))
-        rows = []
-        for entry, step, first, last in values:
-            at, which = _spread(first, last)
-            rows.append(np.column_stack([at, entry[which], step[which] - newest[at, self._owners[entry[which]]]]))
-        if self._shared.any():
-            first, end = period.min(axis=1), np.minimum(period.max(axis=1), steps) - 1
-            at, which = _spread(first, end)
-            for source in np.flatnonzero(self._shared).tolist():
-                rows.append(np.column_stack([at, np.full(len(at), m + source), which - at]))
-        found = np.concatenate(rows)
-        found = found[np.lexsort((found[:, 2], found[:, 1], found[:, 0]))]
-        self._extra = np.ascontiguousarray(found[:, 1:])
-        self._extra_ends = np.searchsorted(found[:, 0], np.arange(steps + 1))
-        self.largest = m + int(np.diff(self._extra_ends).max(initial=0))  # entries of the largest stack
+        self.steps = observation.steps
+        self.largest = step.agents + int(
+            np.diff(self._tables.extra_ends).max(initial=0)
+        )  # entries of the largest stack
 
     @property
     def agents(self) -> int:
@@ -159,13 +85,13 @@ class Periods:
 
     def entries(self, number: int) -> int:
         """Entries of the stack at sampling time ``number``, from 0."""
-        return self._step.agents + int(self._extra_ends[number + 1] - self._extra_ends[number])
+        return self._step.agents + len(self._tables.of_extras(number))
 
     def start(self, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(S, S) each, of the stack at the start: without noise, from that of the states (m, m); of noise."""
         m = self._step.agents
-        entries = np.concatenate([np.arange(m), self._extra[: self._extra_ends[1], 0]])
-        owners = self._owners[entries]
+        entries = np.concatenate([np.arange(m), self._tables.of_extras(0)[:, 0]])
+        owners = self._numbers.owners[entries]
         noise = np.diag(np.where(entries >= 2 * m, self._step.broadcast**2, 0.0))
         return moment[np.ix_(owners, owners)], noise
 
@@ -178,14 +104,14 @@ class Periods:
         if self._shared.any():
             return None
         step, m, observation = self._step, self._step.agents, self._observation
-        extra = self._extra[self._extra_ends[number] : self._extra_ends[number + 1]]
+        extra = self._tables.of_extras(number)
         entries = np.concatenate([np.arange(m), extra[:, 0]])
-        steps = self._newest[number, self._owners[entries]]
+        steps = self._newest[number, self._numbers.owners[entries]]
         steps[m:] += extra[:, 1]
         known = entries < 3 * m
         entries, steps = entries[known], steps[known]
         states, published = observation.states, observation.published
-        found = states[steps, self._owners[entries]]
+        found = states[steps, self._numbers.owners[entries]]
         if published is not None:
             aired = entries >= 2 * m
             found[aired] = published[steps[aired], entries[aired] - 2 * m]
@@ -199,8 +125,8 @@ class Periods:
 
     def __getitem__(self, number: int) -> Period:
         """The period that ends at sampling time ``number`` (1..N-1)."""
-        events = self._table[self._ends[number] : self._ends[number + 1]]
-        before, after = (self._extra[self._extra_ends[k] : self._extra_ends[k + 1]] for k in (number - 1, number))
+        events = self._tables.of_events(number)
+        before, after = self._tables.of_extras(number - 1), self._tables.of_extras(number)
         key = b"|".join((events.tobytes(), before.tobytes(), after.tobytes()))
         if key not in self._cache:
             found = self._compile(events, before, after)
@@ -234,7 +160,7 @@ class Periods:
         step, m = self._step, self._step.agents
         most = neighbour_tables(step).senders.shape[2]
         sources = range(m, 2 * m)
-        owners = self._owners.tolist()
+        owners = self._numbers.owners.tolist()
         # Values by agent and step from the newest one at the beginning; noise by source and step from the end.
         known = [(j, 0) for j in range(m)]
         known += [(entry, offset - 1 if entry in sources else offset) for entry, offset in before.tolist()]
@@ -248,10 +174,10 @@ class Periods:
             variance = 0.0
             for d, (sender, weight) in enumerate(law.inputs):
                 key, again = mine, 0
-                if heard[d] != _OWN:
+                if heard[d] != OWN:
                     key, again = (published + sender, heard[d]), heard[most + d]
                     if again:
-                        received = int(self._numbers[agent, sender]), heard[d]
+                        received = int(self._numbers.links[agent, sender]), heard[d]
                         if again == 1:
                             rows.append((received, {key: 1.0}, step.link**2))
                         key = received
@@ -341,30 +267,6 @@ class _Live:
         return self._place[key]
 
 
-def _shared_sources(step: StepModel) -> BoolArray:
-    """(m,): whether more than one agent feels a source of noise, in any graph."""
-    return np.asarray((step.noise_gain != 0.0).any(axis=0).sum(axis=0) > 1)
-
-
-def _lasting(
-    entry: IntArray, step: IntArray, first: IntArray, last: IntArray
-) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Each (entry, step, first) once, with the last of its uses."""
-    values, owner = np.unique(np.column_stack([entry, step, first]), axis=0, return_inverse=True)
-    end = np.full(len(values), -1)
-    np.maximum.at(end, owner.reshape(-1), last)
-    entry, step, first = values.reshape(-1, 3).T
-    return entry, step, first, end
-
-
-def _looked_up(table: IntArray, keys: IntArray) -> IntArray:
-    """The third column of the rows of a table whose first two columns are the keys (K, 2)."""
-    size = int(table[:, 1].max()) + 1
-    codes = table[:, 0] * size + table[:, 1]
-    order = np.argsort(codes)
-    return np.asarray(table[order[np.searchsorted(codes[order], keys[:, 0] * size + keys[:, 1])], 2])
-
-
 def _completed(seen: FloatArray, known: BoolArray, moment: FloatArray, *, centred: bool) -> FloatArray:
     """E[z z^T] given the mean ``seen`` over the replicas for the ``known`` entries, by linear regression."""
     if centred:
@@ -376,11 +278,3 @@ def _completed(seen: FloatArray, known: BoolArray, moment: FloatArray, *, centre
     found[np.ix_(known, known)] = seen
     found[np.ix_(~known, ~known)] += rest
     return found
-
-
-def _spread(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
-    """All integers first..last of many ranges, and the index of each one's range."""
-    lengths = np.maximum(last - first + 1, 0)
-    which = np.repeat(np.arange(len(first)), lengths)
-    starts = np.cumsum(lengths) - lengths
-    return first[which] + np.arange(len(which)) - starts[which], which

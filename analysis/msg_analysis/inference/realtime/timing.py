@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,12 +24,13 @@ import numpy as np
 
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.realtime.unheard import UnheardMessages, unheard_messages
+from msg_analysis.inference.statistics.order_statistics import Pieces, extent, quantiles
 from msg_analysis.model.arithmetic.step_clock import StepClock
+from msg_analysis.model.step.air_reception import MessagesUsed
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.phases import phases
 from msg_analysis.model.step.sequential_law import ideal_uses
-from msg_analysis.twin.ideal_timers import ideal_log
-from msg_analysis.types import AnyArray, FloatArray, IntArray
+from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
 
 BINS = 60
 
@@ -43,11 +45,13 @@ class Quantiles:
     max: float | None
 
     @classmethod
-    def of(cls, values: AnyArray) -> Quantiles:
-        """Of all entries of an array of any shape."""
-        if not values.size:
+    def of(cls, values: Pieces) -> Quantiles:
+        """Of all numbers."""
+        count, _, high = extent(values)
+        if not count:
             return cls(None, None, None, None)
-        return cls(*(float(value) for value in (*np.quantile(values, (0.5, 0.95, 0.99)), values.max())))
+        p50, p95, p99 = quantiles(values, (0.5, 0.95, 0.99))
+        return cls(p50, p95, p99, high)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,61 +115,118 @@ class Timing:
 
 
 def measure_timing(observation: Observation) -> Timing:
-    """Measure the timing of a run in real time."""
-    timers, step = observation.timers, observation.step
-    assert timers is not None
-    experiment = observation.prediction.experiment
-    steps, m = timers.graphs.shape
-    agents = np.arange(m)
-    milliseconds = 1e-6 / experiment.run.speed  # of the agents' clock, in a nanosecond of simulated time
-    phase = phases(experiment)
-    due = np.stack([StepClock(step.dt, phi).times(np.arange(steps)) for phi in phase.tolist()], axis=1)
-    period = step.dt * 1e9
-    lateness = timers.made[1:] - due
-    late_ms = lateness * milliseconds
-
-    tables = neighbour_tables(step)
-    there = np.arange(step.most_neighbours) < tables.count[timers.graphs, agents][:, :, None]
-    heard = there & (timers.used >= 0)
-    made = timers.made[timers.used, tables.senders[timers.graphs, agents]]
-    age = (timers.made[1:, :, None] - made)[heard] * milliseconds
-    behind = (np.arange(1, steps + 1)[:, None, None] - timers.used)[heard]
-    ideal = _ideal(observation, phase)
-    jitter = np.abs(np.diff(timers.made[1:], axis=0) - period) * milliseconds
+    """Measure the timing of a run in real time, in passes over blocks of steps."""
+    log = _TimingLog(observation)
+    counts = np.zeros(5, dtype=np.int64)
+    for first, last in log.blocks():
+        counts += log.counts(first, last)
+    missed, uses, ideal_uses, never_heard, outdated = counts.tolist()
+    steps, m = observation.steps, observation.step.agents
     return Timing(
-        period_ms=period * milliseconds,
-        lateness_ms=Quantiles.of(late_ms),
+        period_ms=log.period * log.milliseconds,
+        lateness_ms=Quantiles.of(log.pieces(log.lateness)),
         steps=steps * m,
-        missed=int((lateness > period).sum()),
-        jitter_ms=Quantiles.of(jitter),
-        staleness_ms=Quantiles.of(age),
-        staleness_steps=Quantiles.of(behind),
-        uses=int(there.sum()),
-        ideal_uses=int((there & (timers.used == ideal)).sum()),
-        never_heard=int((there & ~heard & (ideal >= 0)).sum()),
+        missed=missed,
+        jitter_ms=Quantiles.of(log.pieces(log.jitter)),
+        staleness_ms=Quantiles.of(log.pieces(log.ages)),
+        staleness_steps=Quantiles.of(log.pieces(log.ages_in_steps)),
+        uses=uses,
+        ideal_uses=ideal_uses,
+        never_heard=never_heard,
         unheard=unheard_messages(observation),
-        outdated_graphs=int((timers.graphs != observation.modes[:, None]).sum()),
-        histogram=_histogram(late_ms),
-        ages=_histogram(age),
+        outdated_graphs=outdated,
+        histogram=_histogram(log.pieces(log.lateness)),
+        ages=_histogram(log.pieces(log.ages)),
     )
 
 
-def _ideal(observation: Observation, phase: FloatArray) -> IntArray:
-    """(N, m, D) steps of the values that ideal timers would have used; -1: the own value, -2: not known."""
-    timers, step, experiment = observation.timers, observation.step, observation.prediction.experiment
-    assert timers is not None
-    if not experiment.noise.steps_only:
-        steps = np.arange(len(timers.graphs))[:, None, None]
-        return np.asarray(ideal_uses(step, phase)[timers.graphs, np.arange(step.agents)] + steps)
-    # Which messages are lost is in the seed; under another graph than the network's the neighbours are others.
-    used = ideal_log(experiment, step, observation.modes)[1]
-    return np.where((timers.graphs == observation.modes[:, None])[:, :, None], used, -2)
+class _TimingLog:
+    """What blocks of steps say about timing, times in ms of the agents' clock."""
+
+    def __init__(self, observation: Observation) -> None:
+        assert observation.timers is not None
+        self._observation, self._timers, self._step = observation, observation.timers, observation.step
+        experiment = observation.prediction.experiment
+        self.milliseconds = 1e-6 / experiment.run.speed  # of the agents' clock, in a nanosecond of simulated time
+        self.period = observation.step.dt * 1e9
+        phase = phases(experiment)
+        self._clocks = [StepClock(observation.step.dt, phi) for phi in phase.tolist()]
+        self._tables = neighbour_tables(observation.step)
+        # Which messages are lost is in the seed; else steps from the step to what ideal timers use.
+        self._messages = MessagesUsed(experiment, observation.step) if experiment.noise.steps_only else None
+        self._ideal_uses = None if self._messages else ideal_uses(observation.step, phase)
+
+    def blocks(self) -> Iterator[tuple[int, int]]:
+        """Blocks of steps."""
+        return self._observation.blocks(8 * self._timers.used[:1].size, "timing")
+
+    def pieces(self, measure: Callable[[int, int], AnyArray]) -> Pieces:
+        """A measure of all steps."""
+        return lambda: (measure(first, last) for first, last in self.blocks())
+
+    def lateness(self, first: int, last: int) -> FloatArray:
+        """Of the steps first..last-1, (b, m)."""
+        return np.asarray(self._late(first, last) * self.milliseconds)
+
+    def jitter(self, first: int, last: int) -> FloatArray:
+        """The same of the time since the step before."""
+        made = self._timers.made[max(first, 1) : last + 1]
+        return np.asarray(np.abs(np.diff(made, axis=0) - self.period) * self.milliseconds)
+
+    def ages(self, first: int, last: int) -> FloatArray:
+        """(uses,) of the values that were used."""
+        heard, senders, used = self._heard(first, last)
+        made = self._timers.made
+        age = made[first + 1 : last + 1, :, None] - made[used, senders]
+        return np.asarray(age[heard] * self.milliseconds)
+
+    def ages_in_steps(self, first: int, last: int) -> IntArray:
+        """The same in steps."""
+        heard, _, used = self._heard(first, last)
+        return np.asarray((np.arange(first + 1, last + 1)[:, None, None] - used)[heard])
+
+    def counts(self, first: int, last: int) -> IntArray:
+        """Missed deadlines, uses, those of ideal timers, and of what was never heard, steps with an outdated graph."""
+        used, graphs, modes = self._timers.used[first:last], self._timers.graphs[first:last], self._observation.modes
+        there, ideal = self._there(graphs), self._ideal(first, last)
+        never = there & (used < 0) & (ideal >= 0)
+        outdated = graphs != modes[first:last, None]
+        missed = self._late(first, last) > self.period
+        return np.array([each.sum() for each in (missed, there, there & (used == ideal), never, outdated)])
+
+    def _late(self, first: int, last: int) -> IntArray:
+        steps = np.arange(first, last)
+        due = np.stack([clock.times(steps) for clock in self._clocks], axis=1)
+        return np.asarray(self._timers.made[first + 1 : last + 1] - due)
+
+    def _there(self, graphs: IntArray) -> BoolArray:
+        """(b, m, D): which neighbours there are."""
+        count = self._tables.count[graphs, np.arange(self._step.agents)]
+        return np.asarray(np.arange(self._step.most_neighbours) < count[:, :, None])
+
+    def _heard(self, first: int, last: int) -> tuple[BoolArray, IntArray, IntArray]:
+        """(b, m, D) each: of which neighbours a value was used, the neighbours, and the steps of the values."""
+        used, graphs = self._timers.used[first:last], self._timers.graphs[first:last]
+        senders = self._tables.senders[graphs, np.arange(self._step.agents)]
+        return self._there(graphs) & (used >= 0), senders, used
+
+    def _ideal(self, first: int, last: int) -> IntArray:
+        """(b, m, D) steps of the values that ideal timers would have used; -1: the own value, -2: not known."""
+        graphs, modes = self._timers.graphs[first:last], self._observation.modes[first:last]
+        if self._messages is None:
+            assert self._ideal_uses is not None
+            steps = np.arange(first, last)[:, None, None]
+            return np.asarray(self._ideal_uses[graphs, np.arange(self._step.agents)] + steps)
+        # Under another graph than the network's the neighbours are others.
+        used = self._messages.used(first, modes)
+        return np.where((graphs == modes[:, None])[:, :, None], used, -2)
 
 
-def _histogram(values: AnyArray) -> tuple[FloatArray, AnyArray]:
-    low, high = min(0.0, float(values.min(initial=0.0))), max(float(values.max(initial=0.0)), 1e-3)
-    counts, edges = np.histogram(values, bins=BINS, range=(low, high))
-    return edges, counts
+def _histogram(values: Pieces) -> tuple[FloatArray, AnyArray]:
+    _, low, high = extent(values)
+    ends = min(0.0, low), max(high, 1e-3)
+    counts = sum((np.histogram(piece, BINS, ends)[0] for piece in values()), np.zeros(BINS, np.int64))
+    return np.histogram_bin_edges(np.empty(0), BINS, ends), counts
 
 
 def _document(quantiles: Quantiles) -> dict[str, float | None]:

@@ -105,9 +105,7 @@ def unheard_messages(observation: Observation) -> UnheardMessages:
     """Judge the messages of a run in real time, see ``UnheardMessages``; with a delay, so many steps later."""
     timers, step = observation.timers, observation.step
     assert timers is not None
-    tables, agents = neighbour_tables(step), np.arange(step.agents)
-    senders = tables.senders[timers.graphs, agents]  # (N, m, D)
-    there = np.arange(step.most_neighbours) < tables.count[timers.graphs, agents][:, :, None]
+    tables = neighbour_tables(step)
     links = np.argwhere(step.listens())
     messages, unheard = np.zeros(len(links), np.int64), np.zeros(len(links), np.int64)
     late = step.delay
@@ -115,7 +113,9 @@ def unheard_messages(observation: Observation) -> UnheardMessages:
     for number, (receiver, sender) in enumerate(links.tolist()):
         if steps < 1:
             break
-        chosen = there[:, receiver] & (senders[:, receiver] == sender)  # (N, D): at most one of a step
+        graphs = timers.graphs[:, receiver]
+        there = np.arange(step.most_neighbours) < tables.count[graphs, receiver][:, None]
+        chosen = there & (tables.senders[graphs, receiver] == sender)  # (N, D): at most one of a step
         active = chosen.any(axis=1)
         used = np.where(chosen, timers.used[:, receiver], -1).max(axis=1, initial=-1)
         first, second = used[late : late + steps], used[late + 1 : late + 1 + steps]
@@ -126,6 +126,7 @@ def unheard_messages(observation: Observation) -> UnheardMessages:
         judged[: observation.sure_messages] = False
         messages[number] = judged.sum()
         unheard[number] = (judged & (first != newest) & (second != newest)).sum()
+        observation.release()
     probability = step.losses[links[:, 0], links[:, 1]] if step.loss else np.zeros(len(links))
     persistence = 0.0
     if step.burst is not None and probability.any():

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import pieces
+from msg_analysis.common.large_arrays import pieces, release
 from msg_analysis.common.text.markdown import markdown_table
 from msg_analysis.model.run.record import RunRecord
 from msg_analysis.types import BoolArray, FloatArray, IntArray
@@ -118,6 +118,12 @@ class Trajectory:
         states = f"x(0..{last}) of {experiment.agents} agents" if last >= 0 else "no states kept"
         replicas = f"{experiment.run.replicas} replicas, seed {experiment.run.seed}"
         return f"<{type(self).__name__} of {experiment.name!r}: {states}, {replicas}; {whole}>"
+
+    def release(self) -> None:
+        """Give the memory of a long run, whose arrays are in files, back to the system: after every part of it."""
+        for array in (self.states, self.published, self.lost, self.used, self.made, self.agent_modes):
+            if array is not None:
+                release(array)
 
     @property
     def values(self) -> FloatArray:
