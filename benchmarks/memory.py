@@ -1,8 +1,9 @@
-"""Memory over the length of a run: of the recorder, of agents and switcher, and of the comparison.
+"""Memory over the length of a run: of the recorder, of agents and switcher, and of what reads and writes long bags.
 
 The recorder gets batches of made-up states by hand, as fast as it takes them. Agents and switcher are those of a real
-network. The comparison reads bags of the offline twin. All values are resident memory [MB].
+network. Bags are those of the offline twin. All values are resident memory [MB].
 
+--bags: only bags of 20 agents, of all kinds of messages: simulate, compare with a report, and check.
 --hour: recorder and switcher over an hour of 1000 agents, at the speed that they have on two cores. The switcher is a
 real process, whose agents say that they have reached a step as soon as they know its graph.
 """
@@ -10,6 +11,7 @@ real process, whose agents say that they have reached a step as soon as they kno
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -17,6 +19,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +33,11 @@ from msg_agents.nodes.ros.lean_node import LeanNode
 from msg_agents.processes.environment import node_environment
 from msg_agents.running.runner import run_network
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.bags.writer import BagWriter
 from msg_analysis.model.arithmetic.step_clock import SECOND, StepClock
 from msg_analysis.model.experiment.experiment import ValidExperiment
 from msg_analysis.model.run.record import RunRecord
-from msg_analysis.twin.simulate import new_record, simulate
+from msg_analysis.twin.simulate import new_record
 from msg_analysis.wire.messages import STATE_HEAD, StateCodec
 from msg_analysis.wire.state_batches import encode_batch
 from msg_analysis.wire.topics import GRAPH, PROGRESS, STATE, STATES, agent_name, network_topics
@@ -45,17 +47,16 @@ AGENTS, STEPS_IN_AN_HOUR = 1000, 210_000  # at 58 steps a second, docs/scale.md
 TOGETHER = 25  # sojourns after which made-up agents tell their steps
 
 
-def ring(agents: int, steps: int, **run: Any) -> ValidExperiment:
-    """Agents on a line and a ring."""
+def ring(agents: int, steps: int, *, noise: dict[str, Any] | None = None, **run: Any) -> dict[str, Any]:
+    """The document of an experiment with agents on a line and a ring."""
     numbers = list(range(1, agents + 1))
-    return ValidExperiment.parse(
-        {
-            "name": "memory",
-            "graphs": {"line": {"path": numbers}, "ring": {"cycle": numbers}},
-            "switching": {"generator": [[-1, 1], [1, -1]]},
-            "run": {"dt": 0.05, "duration": steps * 0.05, "start": "zero", **run},
-        }
-    )
+    return {
+        "name": "memory",
+        "graphs": {"line": {"path": numbers}, "ring": {"cycle": numbers}},
+        "switching": {"generator": [[-1, 1], [1, -1]]},
+        "noise": noise or {},
+        "run": {"dt": 0.05, "duration": steps * 0.05, "start": "zero", **run},
+    }
 
 
 def resident(process: int | str = "self") -> float:
@@ -91,7 +92,7 @@ def batches(record: RunRecord, steps: int, rounds: int) -> Iterator[bytes]:
 
 def recorder(agents: int, steps: int, rounds: int = 20) -> None:
     """Record so many steps, ``rounds`` of each agent in a batch, and print the memory on the way."""
-    record = new_record(ring(agents, steps))
+    record = new_record(ValidExperiment.parse(ring(agents, steps)))
     keep_freed_memory()  # as the recorder does
     receiver = StateReceiver(record, STATES, STATE, "/")
     shown = []
@@ -126,7 +127,7 @@ def network(steps: int) -> None:
 
     thread = threading.Thread(target=watch)
     thread.start()
-    run_network(ring(5, steps, processes=1), None)
+    run_network(ValidExperiment.parse(ring(5, steps, processes=1)), None)
     done.set()
     thread.join()
     for name, values in found.items():
@@ -166,7 +167,7 @@ class MadeUpAgents(NetworkNode):
 
 def switcher(agents: int, steps: int) -> None:
     """The switcher of so many agents, which take no time."""
-    record = new_record(ring(agents, steps))
+    record = new_record(ValidExperiment.parse(ring(agents, steps)))
     shown: list[str] = []
     with tempfile.TemporaryDirectory() as folder, free_domain() as domain:
         file = Path(folder) / "run.json"
@@ -189,21 +190,40 @@ def switcher(agents: int, steps: int) -> None:
     print(f"| switcher, {agents} agents, {steps} steps | {' | '.join(shown)} |", flush=True)
 
 
-def comparison(steps: int) -> None:
-    """`msg-analysis compare` with a report, of 20 agents with 16 replicas."""
+KINDS: dict[str, dict[str, Any]] = {
+    "lockstep": {"replicas": 16},
+    "lost": {"replicas": 16, "noise": {"loss": 0.1}},
+    "held, late": {"replicas": 16, "noise": {"loss": 0.1, "on_loss": "hold", "delay": 2}},
+    "noisy": {"replicas": 8, "noise": {"broadcast": 0.3, "link": 0.2}},
+    "real time": {"replicas": 8, "noise": {"loss": 0.1, "broadcast": 0.1}, "pace": "realtime"},
+}
+
+
+def bags(kind: str, steps: int) -> None:
+    """The commands that write and read a long bag, of 20 agents."""
     with tempfile.TemporaryDirectory() as folder:
-        bag = Path(folder) / "bag"
-        write_trajectory(simulate(ring(20, steps, replicas=16)), bag)
-        size = sum(file.stat().st_size for file in bag.iterdir())
-        command = [sys.executable, "-m", "msg_analysis", "compare", str(bag), "--report", f"{folder}/report.html"]
-        begun = time.monotonic()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        _, _, usage = os.wait4(process.pid, 0)
-        process.returncode = 0
-        print(
-            f"| {steps} | {size / 1e6:.0f} MB | {time.monotonic() - begun:.1f} s | {usage.ru_maxrss / 1e3:.0f} MB |",
-            flush=True,
-        )
+        experiment, bag = Path(folder) / "experiment.json", f"{folder}/bag"
+        experiment.write_text(json.dumps(ring(20, steps, **KINDS[kind])), encoding="utf-8")
+        shown = [
+            _cost("msg_analysis", "simulate", str(experiment), "--out", bag),
+            _cost("msg_analysis", "compare", bag, "--report", f"{folder}/report.html"),
+            _cost("msg_agents", "check", bag),
+        ]
+        size = sum(file.stat().st_size for file in Path(bag).iterdir())
+    print(f"| {kind} | {steps} | {size / 1e6:.0f} MB | {' | '.join(shown)} |", flush=True)
+
+
+def _cost(*command: str) -> str:
+    """Time and largest resident memory of a command."""
+    begun, most = time.monotonic(), 0.0
+    process = subprocess.Popen([sys.executable, "-m", *command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while process.poll() is None:  # not `ru_maxrss`, in which the memory of this process counts
+        with suppress(OSError, StopIteration):
+            lines = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii").splitlines()
+            most = max(most, next(int(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM:")))
+        time.sleep(0.02)
+    failed = f" (exit code {process.returncode})" if process.returncode else ""
+    return f"{time.monotonic() - begun:.1f} s, {1.024 * most:.0f} MB{failed}"
 
 
 def main() -> None:
@@ -211,9 +231,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--states", type=int, default=20_000_000, help="states that the recorder gets")
     parser.add_argument("--steps", type=int, default=1_000_000, help="of the network")
-    parser.add_argument("--longest", type=int, default=350_000, help="steps of the longest bag that is compared")
+    parser.add_argument("--longest", type=int, default=350_000, help="steps of the longest bag")
+    parser.add_argument("--bags", action="store_true", help="only what reads and writes bags: a quarter of an hour")
     parser.add_argument("--hour", action="store_true", help="only an hour of 1000 agents: a quarter of an hour")
     arguments = parser.parse_args()
+    if arguments.bags:
+        long_bags(arguments.longest)
+        return
     print(f"| resident memory [MB] after | {' | '.join(f'{100 * (i + 1) // POINTS} %' for i in range(POINTS))} |")
     print(f"|---|{'---:|' * POINTS}")
     if arguments.hour:
@@ -223,9 +247,15 @@ def main() -> None:
     for agents in (10, 100, 1000):
         recorder(agents, arguments.states // agents)
     network(arguments.steps)
-    print("\n| steps | bag | time | most memory |\n|---:|---:|---:|---:|")
-    for share in (0.02, 0.1, 0.4, 1.0):
-        comparison(round(share * arguments.longest))
+    long_bags(arguments.longest)
+
+
+def long_bags(longest: int) -> None:
+    """Of all kinds, up to so many steps."""
+    print("\n| messages | steps | bag | simulate | compare with a report | check |\n|---|---:|---:|---:|---:|---:|")
+    for kind in KINDS:
+        for share in (0.1, 0.4, 1.0):
+            bags(kind, round(share * longest))
 
 
 if __name__ == "__main__":

@@ -86,7 +86,7 @@ def test_check_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPat
     assert long - short < 512 * 32
 
 
-@pytest.mark.parametrize("case", ["lost", "held", "real time", "protocol in real time"])
+@pytest.mark.parametrize("case", ["real time", "protocol in real time"])
 def test_comparison_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the steps need at most some numbers more for each; its states alone have 320 bytes."""
     monkeypatch.setattr(large_arrays, "LARGE", 1)
@@ -94,9 +94,11 @@ def test_comparison_needs_memory_for_a_block(case: str, monkeypatch: pytest.Monk
         monkeypatch.setattr(f"msg_analysis.inference.{place}", 4_000)
     monkeypatch.setattr("msg_analysis.inference.errors.given_path.SMALL_BLOCK", 4_000)
     monkeypatch.setattr("msg_analysis.inference.realtime.pattern_events.CACHED_NUMBERS", 4_000)
-    runs = [simulate(experiment(case, steps, replicas=8)) for steps in (200, 400, 800)]
-    _, short, long = (_peak(lambda run=run: compare(run)) for run in runs)  # the first one imports and predicts
-    assert long - short < 400 * 160
+    runs = [simulate(experiment(case, steps, replicas=8)) for steps in (300, 600)]
+    for run in runs:  # what is kept for comparisons to come
+        compare(run)
+    short, long = (_peak(lambda run=run: compare(run)) for run in runs)
+    assert long - short < 300 * 160
 
 
 def _peak(work: Callable[[], object]) -> int:

@@ -165,6 +165,7 @@ def _follow(
     for block in reversed(range(len(beginnings))):
         first, last = block * length, min((block + 1) * length, steps)
         beginning, here = beginnings[block]
+        periods.release()
         moments_of = [here]
         for number in range(first + 1, last):
             moments_of.append(_next(periods, number, moments_of[-1]))
@@ -208,6 +209,7 @@ def _forward(periods: Periods, start: FloatArray) -> tuple[FloatArray, list[tupl
             before, moment = moment, _next(periods, number, moment)
         if number % length == 0:
             beginnings.append((before, moment))
+            periods.release()
         total += moment[:m, :m]
     return total, beginnings, length
 

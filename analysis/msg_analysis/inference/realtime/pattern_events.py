@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import release
 from msg_analysis.inference.observed.heard_values import neighbour_weights
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.realtime.event_order import EventOrder
@@ -136,6 +137,12 @@ class Periods:
             self._cached += found.matrix.size + found.noise.size
             self._cache[key] = found
         return self._cache[key]
+
+    def release(self) -> None:
+        """Give the memory of a long run back to the system: after every block of periods."""
+        for array in (self._tables.events, self._tables.extras, self._newest):
+            release(array)
+        self._observation.release()
 
     def _law(self, graph: int, agent: int) -> _Law:
         found = self._laws.get((graph, agent))

@@ -85,14 +85,15 @@ class _Maker:
     def tables(self) -> PeriodTables:
         """Of all periods."""
         steps, most = self._observation.steps, self._step.most_neighbours
-        lives = self._lives()
+        lives, parts = self._lives()
         events, extras = LargeRows(4 + 2 * most, np.int32), LargeRows(2, np.int32)
         event_ends, extra_ends = np.zeros(steps + 1, np.int64), np.zeros(steps + 1, np.int64)
         for first, last in self._blocks():
             found = self._events(first, last)
             events.append(found[:, 1:])
             event_ends[first + 1 : last + 1] = np.bincount(found[:, 0] - first, minlength=last - first)
-            found = self._stacked(lives, first, last)
+            found = self._stacked(lives, parts, first, last)
+            release(lives)
             extras.append(found[:, 1:])
             extra_ends[first + 1 : last + 1] = np.bincount(found[:, 0] - first, minlength=last - first)
         return PeriodTables(events.array(), np.cumsum(event_ends), extras.array(), np.cumsum(extra_ends))
@@ -149,17 +150,16 @@ class _Maker:
         offsets = np.where(used >= 0, used - newest, OWN)
         return np.column_stack([period, i, graphs, lag, own, offsets, again])
 
-    def _lives(self) -> list[tuple[int, int, AnyArray]]:
-        """Values that are stacked, in parts: their first and last sampling time, and rows: entry, step, first, last."""
+    def _lives(self) -> tuple[AnyArray, list[tuple[int, int, slice]]]:
+        """Values that are stacked: entry, step, first and last sampling time; and the first and last one by part."""
         rows, parts = LargeRows(4, np.int32), []
         for first, last in self._blocks():
             found = np.concatenate([*self._lives_of_values(first, last), *self._lives_of_noise(first, last)])
             found = found[found[:, 3] >= found[:, 2]]
             begin = rows.append(found)
             if len(found):
-                parts.append((int(found[:, 2].min()), int(found[:, 3].max()), begin, begin + len(found)))
-        array = rows.array()
-        return [(low, high, array[begin:end]) for low, high, begin, end in parts]
+                parts.append((int(found[:, 2].min()), int(found[:, 3].max()), slice(begin, begin + len(found))))
+        return rows.array(), parts
 
     def _lives_of_values(self, begin: int, end: int) -> Iterator[IntArray]:
         """Of the values used in some steps."""
@@ -198,10 +198,10 @@ class _Maker:
             entry = np.full(end - begin, self._step.agents + source)
             yield np.column_stack([entry, np.arange(begin, end), first, last])
 
-    def _stacked(self, lives: list[tuple[int, int, AnyArray]], first: int, last: int) -> IntArray:
+    def _stacked(self, lives: AnyArray, parts: list[tuple[int, int, slice]], first: int, last: int) -> IntArray:
         """Rows of the sampling time and of ``PeriodTables.extras``, each once, sorted."""
-        parts = [rows.astype(np.int64) for low, high, rows in lives if low < last and high >= first]
-        entry, step, begin, end = np.concatenate([np.empty((0, 4), np.int64), *parts]).T
+        chosen = [lives[rows].astype(np.int64) for low, high, rows in parts if low < last and high >= first]
+        entry, step, begin, end = np.concatenate([np.empty((0, 4), np.int64), *chosen]).T
         at, which = spread(np.maximum(begin, first), np.minimum(end, last - 1))
         entry, step = entry[which], step[which]
         m, owner = self._step.agents, self._entries.owners[entry]
