@@ -26,7 +26,7 @@ import numpy as np
 
 from msg_analysis.bags.format.stored_file import Batch
 from msg_analysis.bags.state_columns import States, decode_states, run_number
-from msg_analysis.common.large_arrays import large_zeros, release
+from msg_analysis.common.large_arrays import column, large_zeros, pieces, release
 from msg_analysis.errors import BagError
 from msg_analysis.model.experiment.memory import amount, available_memory
 from msg_analysis.model.run.record import RunRecord
@@ -268,9 +268,10 @@ class Collected:
             setattr(self, name, getattr(self, name)[:cells])
         self._contradicted = [found[found < cells] for found in self._contradicted]
         if self._realtime:
-            beyond = (self._used > steps + 1).any(axis=1)  # of values that are left out
-            self.refused[Refusal.BAD_HEARD] += int(beyond.sum())
-            self._position[beyond] = 0
+            for piece in pieces(self._used):
+                beyond = (self._used[piece] > steps + 1).any(axis=1)  # of values that are left out
+                self.refused[Refusal.BAD_HEARD] += int(beyond.sum())
+                self._position[piece][beyond] = 0
 
     def finish(self) -> None:
         """Mark what is missing; call it after the last state."""
@@ -319,8 +320,9 @@ class Collected:
 def _out_of_order(position: IntArray) -> int:
     """How many states came after a later one of their agent, by (N + 1, m) place in the bag, from 1; 0: missing."""
     late = 0
-    for column in position.T:  # one agent at a time: less memory
-        came = np.where(column > 0, column, np.iinfo(np.int64).max)
+    for agent in range(position.shape[1]):  # one agent at a time: less memory
+        its = column(position, agent)
+        came = np.where(its > 0, its, np.iinfo(np.int64).max)
         first_of_later = np.minimum.accumulate(came[::-1])[::-1]
-        late += int((first_of_later[1:] < column[:-1]).sum())
+        late += int((first_of_later[1:] < its[:-1]).sum())
     return late

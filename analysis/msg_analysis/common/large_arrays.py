@@ -109,6 +109,11 @@ def pieces(array: AnyArray) -> Iterator[slice]:
         release(array)
 
 
+def column(array: AnyArray, which: int) -> AnyArray:
+    """A copy of ``array[:, which]``, for which only a piece of the array is in memory at a time."""
+    return np.concatenate([array[:0, which], *(array[piece, which].copy() for piece in pieces(array))])
+
+
 def _mapping(array: Any) -> mmap.mmap | None:
     while isinstance(array, np.ndarray):
         if isinstance(array, np.memmap):

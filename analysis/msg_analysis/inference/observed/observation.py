@@ -179,12 +179,18 @@ def _known_steps(trajectory: Trajectory) -> int:
             "log of a run in real time: expected graph, values used and time in every state: record it again with this "
             "version"
         )
-    unknown = np.argwhere((trajectory.agent_modes[1 : steps + 1] < 0) | (trajectory.made[1 : steps + 1] < 0))
-    if len(unknown):
-        step, agent = unknown[0].tolist()
-        named = agent_text(agent + 1, trajectory.record.experiment.names)
-        raise InputError(f"{named}: graph or time of step {step} missing: expected in the log of a run in real time")
-    newest = trajectory.used[:steps].max(axis=(1, 2), initial=-1)
+    end = max(steps, 0)
+    graphs, used, made = trajectory.agent_modes[1 : end + 1], trajectory.used[:end], trajectory.made[1 : end + 1]
+    newest = np.empty(end, dtype=np.int64)
+    for piece in pieces(used):
+        unknown = np.argwhere((graphs[piece] < 0) | (made[piece] < 0))
+        if len(unknown):
+            step, agent = unknown[0].tolist()
+            named = agent_text(agent + 1, trajectory.record.experiment.names)
+            wanted = "expected in the log of a run in real time"
+            raise InputError(f"{named}: graph or time of step {piece.start + step} missing: {wanted}")
+        newest[piece] = used[piece].max(axis=(1, 2), initial=-1)
+        trajectory.release()
     while (beyond := newest[:steps] > steps).any():  # only where the run is not complete
         steps = int(np.argmax(beyond))
     return steps

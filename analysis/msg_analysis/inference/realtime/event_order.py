@@ -25,7 +25,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import large_zeros, release
+from msg_analysis.common.large_arrays import column, large_zeros, pieces, release
 from msg_analysis.inference.observed.observation import Observation, Timers
 from msg_analysis.model.arithmetic.step_clock import StepClock
 from msg_analysis.model.step.neighbours import neighbour_tables
@@ -176,9 +176,9 @@ def newest_steps(observation: Observation) -> IntArray:
     made, times = _timers(observation).made, sampling_times(observation)
     newest = _zeros(*made.shape)
     for i in range(made.shape[1]):
-        newest[:, i] = np.searchsorted(np.maximum.accumulate(made[:, i]), times, side="right") - 1
-        release(newest)
-        release(made)
+        found = np.searchsorted(np.maximum.accumulate(column(made, i)), times, side="right") - 1
+        for piece in pieces(newest):
+            newest[piece, i] = found[piece]
     return newest
 
 

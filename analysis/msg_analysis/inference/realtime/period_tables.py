@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.common.large_arrays import LargeRows, large_zeros, release
+from msg_analysis.common.large_arrays import LargeRows, column, large_zeros, release
 from msg_analysis.inference.observed.observation import Observation, Timers
 from msg_analysis.inference.realtime.event_order import EventOrder, sampling_times
 from msg_analysis.model.step.neighbours import neighbour_tables
@@ -118,7 +118,7 @@ class _Maker:
             begun[first:last] = -1
         for i in range(self._step.agents):
             seen = int(self._order.newest[self._observation.steps - 1, i])
-            senders, heard = self._senders[graphs[:seen, i], i], used[:seen, i]
+            senders, heard = self._senders[column(graphs, i)[:seen], i], column(used, i)[:seen]
             for j in np.flatnonzero(self._step.listens()[i]).tolist():
                 k, d = np.nonzero((senders == j) & (heard >= 0))
                 message = heard[k, d]
@@ -130,7 +130,6 @@ class _Maker:
                 again = np.repeat(count > 1, count)
                 begun[k[again], i, d[again]] = np.repeat(k[start], count)[again]
             release(begun)
-            self._observation.release()
         return begun
 
     def _events(self, first: int, last: int) -> IntArray:

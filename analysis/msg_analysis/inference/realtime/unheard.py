@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from msg_analysis.common.large_arrays import column
 from msg_analysis.common.text.number_words import percent
 from msg_analysis.inference.observed.observation import Observation
 from msg_analysis.inference.statistics.distributions import binomial_interval
@@ -113,20 +114,19 @@ def unheard_messages(observation: Observation) -> UnheardMessages:
     for number, (receiver, sender) in enumerate(links.tolist()):
         if steps < 1:
             break
-        graphs = timers.graphs[:, receiver]
+        graphs, made = column(timers.graphs, receiver), column(timers.made, receiver)
         there = np.arange(step.most_neighbours) < tables.count[graphs, receiver][:, None]
         chosen = there & (tables.senders[graphs, receiver] == sender)  # (N, D): at most one of a step
         active = chosen.any(axis=1)
-        used = np.where(chosen, timers.used[:, receiver], -1).max(axis=1, initial=-1)
+        used = np.where(chosen, column(timers.used, receiver), -1).max(axis=1, initial=-1)
         first, second = used[late : late + steps], used[late + 1 : late + 1 + steps]
-        newest = np.searchsorted(timers.made[:, sender], timers.made[1 : steps + 1, receiver], side="left") - 1
+        newest = np.searchsorted(column(timers.made, sender), made[1 : steps + 1], side="left") - 1
         newest = np.maximum(newest, first)  # of equal times, a value comes before the steps that use it
         judged = active[late : late + steps] & active[late + 1 : late + 1 + steps]
         judged &= np.diff(newest, prepend=newest[0]) > 0
         judged[: observation.sure_messages] = False
         messages[number] = judged.sum()
         unheard[number] = (judged & (first != newest) & (second != newest)).sum()
-        observation.release()
     probability = step.losses[links[:, 0], links[:, 1]] if step.loss else np.zeros(len(links))
     persistence = 0.0
     if step.burst is not None and probability.any():
