@@ -213,11 +213,12 @@ def steps_of_path(observation: Observation) -> tuple[IntArray, FloatArray, Float
     if found is None:
         return None
     which, kinds = found
-    matrices, noise = np.empty((2, len(kinds), step.agents, step.agents))
-    for number, (mode, missing) in enumerate(kinds):
-        matrices[number], noise[number] = _with_losses(observation, step, mode, missing)
     lift = system.frame
-    return which, lift.T @ matrices @ lift, lift.T @ noise @ lift
+    matrices, noise = np.empty((2, len(kinds), lift.shape[1], lift.shape[1]))
+    for number, (mode, missing) in enumerate(kinds):
+        whole = _with_losses(observation, step, mode, missing)
+        matrices[number], noise[number] = (lift.T @ each @ lift for each in whole)
+    return which, matrices, noise
 
 
 def _kinds(observation: Observation, lost: BoolArray, most: int) -> tuple[IntArray, list[tuple[int, BoolArray]]] | None:
