@@ -94,11 +94,11 @@ def test_comparison_needs_memory_for_a_block(case: str, monkeypatch: pytest.Monk
         monkeypatch.setattr(f"msg_analysis.inference.{place}", 4_000)
     monkeypatch.setattr("msg_analysis.inference.errors.given_path.SMALL_BLOCK", 4_000)
     monkeypatch.setattr("msg_analysis.inference.realtime.pattern_events.CACHED_NUMBERS", 4_000)
-    runs = [simulate(experiment(case, steps, replicas=8)) for steps in (300, 600)]
+    runs = [simulate(experiment(case, steps, replicas=8)) for steps in (200, 400)]
     for run in runs:  # what is kept for comparisons to come
         compare(run)
     short, long = (_peak(lambda run=run: compare(run)) for run in runs)
-    assert long - short < 300 * 160
+    assert long - short < 200 * 160
 
 
 def _peak(work: Callable[[], object]) -> int:
