@@ -22,10 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from msg_analysis.common.long_work import tell
-from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.model.run.graph_path import mode_path
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.air import Air
+from msg_analysis.model.step.air_reception import by_sender_and_block
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.twin.log_replay import replay
 from msg_analysis.twin.run_blocks import RunBlock, run_blocks
@@ -85,8 +85,7 @@ def _in_lockstep(trajectory: Trajectory, path: IntArray) -> str | None:
     """The first difference: states follow from graphs and losses of earlier steps; the earliest is the cause."""
     for block in _with_progress(trajectory, run_blocks(trajectory.record, path)):
         found = [
-            _first_state(trajectory, block.first, trajectory.states, block.states, "logged"),
-            _first_state(trajectory, block.first, trajectory.published, block.published, "published"),
+            *(_first_state(trajectory, block.first, *states) for states in _states(trajectory, block)),
             _first_loss(trajectory, block, path),
             _first_use(trajectory, block, path),
             _first_graph(trajectory, block, path),
@@ -100,20 +99,24 @@ def _in_real_time(trajectory: Trajectory, path: IntArray) -> tuple[str | None, i
     """The first difference, and how many states could be compared."""
     difference, compared, air = None, 0, Air(trajectory.record.experiment)
     for block in _with_progress(trajectory, replay(trajectory)):
-        both = [(trajectory.states, block.states), (trajectory.published, block.published)]
-        for logged, law in both:
-            if logged is not None and law is not None:
-                compared += int((~np.isnan(logged[block.steps]) & ~np.isnan(law)).all(axis=2).sum())
-        difference = difference or _earliest(
-            [
-                _first_state(trajectory, block.first, trajectory.states, block.states, "logged"),
-                _first_state(trajectory, block.first, trajectory.published, block.published, "published"),
-                _first_early_use(trajectory, block),
-                _first_lost_use(trajectory, block, air),
+        both = _states(trajectory, block)
+        compared += sum(int((~np.isnan(logged) & ~np.isnan(law)).all(axis=2).sum()) for _, logged, law in both)
+        if difference is None:
+            uses = _uses(trajectory, block)
+            found = [
+                *(_first_state(trajectory, block.first, *states) for states in both),
+                _first_early_use(trajectory, *uses),
+                _first_lost_use(air, *uses),
                 _first_graph(trajectory, block, path),
             ]
-        )
+            difference = _earliest(found)
     return difference, compared
+
+
+def _states(trajectory: Trajectory, block: RunBlock) -> list[tuple[str, FloatArray, FloatArray]]:
+    """What is compared of states: a word for it, the logged ones of the block's steps, and those of the law."""
+    arrays = ("logged", trajectory.states, block.states), ("published", trajectory.published, block.published)
+    return [(word, log[block.steps], law) for word, log, law in arrays if log is not None and law is not None]
 
 
 def _with_progress(trajectory: Trajectory, blocks: Iterable[RunBlock]) -> Iterable[RunBlock]:
@@ -138,13 +141,8 @@ def _first(wrong: BoolArray, when: float, describe: Callable[..., str]) -> _Foun
     return when + where[0], describe(*where)
 
 
-def _first_state(
-    trajectory: Trajectory, first: int, logged: FloatArray | None, law: FloatArray | None, what: str
-) -> _Found:
-    """Of the states from step ``first`` on, of which ``law`` (K, m, R) has a block."""
-    if logged is None or law is None:
-        return None
-    here = logged[first : first + len(law)]
+def _first_state(trajectory: Trajectory, first: int, what: str, here: FloatArray, law: FloatArray) -> _Found:
+    """Of the states from step ``first`` on, (K, m, R) as logged and by the law."""
     there = ~(np.isnan(here) | np.isnan(law)).any(axis=2)
 
     def describe(k: int, agent: int) -> str:
@@ -222,10 +220,9 @@ def _uses(trajectory: Trajectory, block: RunBlock) -> tuple[int, IntArray, IntAr
     return first, trajectory.used[first - 1 : end - 1], senders
 
 
-def _first_early_use(trajectory: Trajectory, block: RunBlock) -> _Found:
+def _first_early_use(trajectory: Trajectory, first: int, used: IntArray, senders: IntArray) -> _Found:
     """The first value that was used in a state made before it, or at the same time."""
     assert trajectory.made is not None
-    first, used, senders = _uses(trajectory, block)
     made, heard = trajectory.made[first : first + len(used)], trajectory.made[used, senders]
 
     def describe(k: int, agent: int, which: int) -> str:
@@ -238,18 +235,14 @@ def _first_early_use(trajectory: Trajectory, block: RunBlock) -> _Found:
     return _first((used >= 0) & (made >= 0)[:, :, None] & (heard >= made[:, :, None]), first, describe)
 
 
-def _first_lost_use(trajectory: Trajectory, block: RunBlock, air: Air) -> _Found:
+def _first_lost_use(air: Air, first: int, used: IntArray, senders: IntArray) -> _Found:
     """In real time: the first message that was used although it was lost."""
     if not air.loss:
         return None
-    first, used, senders = _uses(trajectory, block)
     lost = np.zeros(used.shape, dtype=np.bool_)
-    number, within = np.divmod(used, STEPS_PER_BLOCK)
     for i in range(used.shape[1]):
-        heard = used[:, i] >= 0
-        for j, n in {*zip(senders[:, i][heard].tolist(), number[:, i][heard].tolist(), strict=True)}:
-            these = heard & (senders[:, i] == j) & (number[:, i] == n)
-            lost[:, i][these] = air.losses(i, j, n)[within[:, i][these]]
+        for j, number, these, within in by_sender_and_block(senders[:, i], used[:, i]):
+            lost[:, i][these] = air.losses(i, j, number)[within]
 
     def describe(k: int, agent: int, which: int) -> str:
         return (

@@ -26,7 +26,7 @@ from msg_analysis.model.arithmetic.update_law import step as update
 from msg_analysis.model.run.agent_law import ProtocolLaw
 from msg_analysis.model.run.trajectory import Trajectory
 from msg_analysis.model.step.air import NOTHING, Air
-from msg_analysis.model.step.air_reception import add_broadcast_noise
+from msg_analysis.model.step.air_reception import add_broadcast_noise, by_sender_and_block
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.twin.network_steps import noise_of_all
@@ -94,10 +94,8 @@ class _LinearReplay:
         published = self._log.states if self._log.published is None else self._log.published
         values = np.asarray(published[np.maximum(used, 0), senders])
         if self._air.link:
-            block, within = np.divmod(used, STEPS_PER_BLOCK)
-            for j, number in {*zip(senders[used >= 0].tolist(), block[used >= 0].tolist(), strict=True)}:
-                these = (senders == j) & (block == number)
-                values[these] += self._air.link_noise(i, j, number)[within[these]]
+            for j, number, these, within in by_sender_and_block(senders, used):
+                values[these] += self._air.link_noise(i, j, number)[within]
         return values
 
 

@@ -38,3 +38,4 @@ def test_as_of_all_at_once(name: str, at_once: int, monkeypatch: pytest.MonkeyPa
 
 def test_no_numbers() -> None:
     assert extent(lambda: [np.empty(0)]) == (0, np.inf, -np.inf)
+    assert quantiles(lambda: [np.empty(0)], (0.5, 1.0)) == []

@@ -47,13 +47,16 @@ class Measurement:
         """Everything before the first gap, of a run from a bag or from the twin."""
         experiment, steps = trajectory.record.experiment, max(trajectory.prefix, 0)
         series = np.empty(steps)
-        for begin, end in _blocks(trajectory, 0, steps):
+        numbers = int(trajectory.states[:1].size)
+        for begin, end in _blocks(0, steps, numbers, "errors"):
             series[begin:end] = (_deviations(trajectory, begin, end) ** 2).sum(axis=1).mean(axis=1)
+            trajectory.release()
         first = transient_length(series)
         products = np.zeros((experiment.agents, experiment.agents))
-        for begin, end in _blocks(trajectory, first, steps):
+        for begin, end in _blocks(first, steps, numbers, "covariance"):
             flat = _deviations(trajectory, begin, end).transpose(1, 0, 2).reshape(experiment.agents, -1)
             products += flat @ flat.T
+            trajectory.release()
         lost = trajectory.lost
         return cls(
             first=first,
@@ -72,10 +75,7 @@ class Measurement:
 
     def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
         """See ``Observation.blocks``."""
-        length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
-        for first in range(0, self.steps, length):
-            tell(what, first, self.steps)
-            yield first, min(first + length, self.steps)
+        return _blocks(0, self.steps, numbers_per_step, what)
 
 
 def transient_length(series: FloatArray) -> int:
@@ -99,13 +99,12 @@ def transient_length(series: FloatArray) -> int:
     return BATCH * int(np.argmin(scores[: count // 2 + 1]))
 
 
-def _blocks(trajectory: Trajectory, first: int, end: int) -> Iterator[tuple[int, int]]:
-    """Blocks of the steps first..end-1."""
-    length = max(1, BLOCK_NUMBERS // max(1, trajectory.states[:1].size))
+def _blocks(first: int, end: int, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
+    """Blocks of the steps first..end-1; other arguments as of ``Observation.blocks``."""
+    length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
     for begin in range(first, end, length):
-        tell("errors", begin, end)
+        tell(what, begin, end)
         yield begin, min(begin + length, end)
-        trajectory.release()
 
 
 def _deviations(trajectory: Trajectory, first: int, end: int) -> FloatArray:

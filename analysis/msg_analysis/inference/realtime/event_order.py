@@ -46,11 +46,10 @@ class EventOrder:
     def of_lockstep(cls, steps: int, agents: int) -> EventOrder:
         """Of a run in which all agents make each step at the same time."""
         position, newest = _zeros(steps, agents), _zeros(steps + 1, agents)
-        for k in range(0, steps + 1, _BLOCK):
-            rows = np.arange(k, min(k + _BLOCK, steps + 1))
-            newest[rows] = rows[:, None]
-            rows = rows[rows < steps]
-            position[rows] = agents * rows[:, None] + np.arange(agents)
+        for piece in pieces(newest):
+            newest[piece] = np.arange(*piece.indices(steps + 1))[:, None]
+        for piece in pieces(position):
+            position[piece] = agents * np.arange(*piece.indices(steps))[:, None] + np.arange(agents)
         return cls(position, newest)
 
     def events(self, first: int, last: int) -> tuple[IntArray, IntArray]:
@@ -61,12 +60,7 @@ class EventOrder:
         m = self.newest.shape[1]
         begin = self.newest[first - 1] if first else np.zeros(m, dtype=np.int64)
         end = self.newest[last - 1] if last <= len(self.newest) else np.full(m, len(self.position))
-        agents = np.repeat(np.arange(m), end - begin)
-        within = np.arange(len(agents)) - np.repeat(np.cumsum(end - begin) - (end - begin), end - begin)
-        return begin[agents] + within, agents
-
-
-_BLOCK = 2**14  # steps
+        return spread(begin, end - 1)
 
 
 def _zeros(rows: int, columns: int) -> IntArray:
@@ -192,6 +186,14 @@ def sampled(observation: Observation, order: EventOrder) -> FloatArray:
         release(states)
         release(order.newest)
     return states
+
+
+def spread(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
+    """All integers first..last of many ranges, and the index of each one's range."""
+    lengths = np.maximum(last - first + 1, 0)
+    which = np.repeat(np.arange(len(first)), lengths)
+    starts = np.cumsum(lengths) - lengths
+    return first[which] + np.arange(len(which)) - starts[which], which
 
 
 def sampling_times(observation: Observation) -> IntArray:

@@ -23,7 +23,7 @@ import numpy as np
 
 from msg_analysis.common.large_arrays import LargeRows, column, large_zeros, release
 from msg_analysis.inference.observed.observation import Observation, Timers
-from msg_analysis.inference.realtime.event_order import EventOrder, sampling_times
+from msg_analysis.inference.realtime.event_order import EventOrder, sampling_times, spread
 from msg_analysis.model.step.neighbours import neighbour_tables
 from msg_analysis.model.step.step_model import StepModel
 from msg_analysis.types import AnyArray, BoolArray, IntArray
@@ -119,16 +119,14 @@ class _Maker:
         for i in range(self._step.agents):
             seen = int(self._order.newest[self._observation.steps - 1, i])
             senders, heard = self._senders[column(graphs, i)[:seen], i], column(used, i)[:seen]
-            for j in np.flatnonzero(self._step.listens()[i]).tolist():
-                k, d = np.nonzero((senders == j) & (heard >= 0))
-                message = heard[k, d]
-                by = np.argsort(message, kind="stable")  # an agent makes its steps in their order
-                k, d, message = k[by], d[by], message[by]
-                new = np.diff(message, prepend=-1) > 0
-                start = np.flatnonzero(new)
-                count = np.diff(start, append=len(k))
-                again = np.repeat(count > 1, count)
-                begun[k[again], i, d[again]] = np.repeat(k[start], count)[again]
+            k, d = np.nonzero(heard >= 0)
+            by = np.lexsort((heard[k, d], senders[k, d]))  # uses of a message stay in the order of the agent's steps
+            k, d = k[by], d[by]
+            new = (np.diff(heard[k, d], prepend=-1) != 0) | (np.diff(senders[k, d], prepend=-1) != 0)
+            start = np.flatnonzero(new)
+            count = np.diff(start, append=len(k))
+            again = np.repeat(count > 1, count)
+            begun[k[again], i, d[again]] = np.repeat(k[start], count)[again]
             release(begun)
         return begun
 
@@ -211,11 +209,3 @@ class _Maker:
         new = np.ones(len(rows), dtype=np.bool_)
         new[1:] = (rows[1:] != rows[:-1]).any(axis=1)
         return np.asarray(rows[new])
-
-
-def spread(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
-    """All integers first..last of many ranges, and the index of each one's range."""
-    lengths = np.maximum(last - first + 1, 0)
-    which = np.repeat(np.arange(len(first)), lengths)
-    starts = np.cumsum(lengths) - lengths
-    return first[which] + np.arange(len(which)) - starts[which], which

@@ -47,11 +47,8 @@ class Quantiles:
     @classmethod
     def of(cls, values: Pieces) -> Quantiles:
         """Of all numbers."""
-        count, _, high = extent(values)
-        if not count:
-            return cls(None, None, None, None)
-        p50, p95, p99 = quantiles(values, (0.5, 0.95, 0.99))
-        return cls(p50, p95, p99, high)
+        found = quantiles(values, (0.5, 0.95, 0.99, 1.0))
+        return cls(*found) if found else cls(None, None, None, None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

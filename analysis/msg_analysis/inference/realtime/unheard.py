@@ -111,22 +111,23 @@ def unheard_messages(observation: Observation) -> UnheardMessages:
     messages, unheard = np.zeros(len(links), np.int64), np.zeros(len(links), np.int64)
     late = step.delay
     steps = len(timers.graphs) - 1 - late  # that can be the first one after a message was published
-    for number, (receiver, sender) in enumerate(links.tolist()):
-        if steps < 1:
-            break
+    for receiver in np.unique(links[:, 0]).tolist() if steps >= 1 else ():
         graphs, made = column(timers.graphs, receiver), column(timers.made, receiver)
         there = np.arange(step.most_neighbours) < tables.count[graphs, receiver][:, None]
-        chosen = there & (tables.senders[graphs, receiver] == sender)  # (N, D): at most one of a step
-        active = chosen.any(axis=1)
-        used = np.where(chosen, column(timers.used, receiver), -1).max(axis=1, initial=-1)
-        first, second = used[late : late + steps], used[late + 1 : late + 1 + steps]
-        newest = np.searchsorted(column(timers.made, sender), made[1 : steps + 1], side="left") - 1
-        newest = np.maximum(newest, first)  # of equal times, a value comes before the steps that use it
-        judged = active[late : late + steps] & active[late + 1 : late + 1 + steps]
-        judged &= np.diff(newest, prepend=newest[0]) > 0
-        judged[: observation.sure_messages] = False
-        messages[number] = judged.sum()
-        unheard[number] = (judged & (first != newest) & (second != newest)).sum()
+        senders, heard = tables.senders[graphs, receiver], column(timers.used, receiver)
+        for number in np.flatnonzero(links[:, 0] == receiver).tolist():
+            sender = int(links[number, 1])
+            chosen = there & (senders == sender)  # (N, D): at most one of a step
+            active = chosen.any(axis=1)
+            used = np.where(chosen, heard, -1).max(axis=1, initial=-1)
+            first, second = used[late : late + steps], used[late + 1 : late + 1 + steps]
+            newest = np.searchsorted(column(timers.made, sender), made[1 : steps + 1], side="left") - 1
+            newest = np.maximum(newest, first)  # of equal times, a value comes before the steps that use it
+            judged = active[late : late + steps] & active[late + 1 : late + 1 + steps]
+            judged &= np.diff(newest, prepend=newest[0]) > 0
+            judged[: observation.sure_messages] = False
+            messages[number] = judged.sum()
+            unheard[number] = (judged & (first != newest) & (second != newest)).sum()
     probability = step.losses[links[:, 0], links[:, 1]] if step.loss else np.zeros(len(links))
     persistence = 0.0
     if step.burst is not None and probability.any():

@@ -39,8 +39,10 @@ def extent(pieces: Pieces) -> tuple[int, float, float]:
 
 
 def quantiles(pieces: Pieces, shares: Sequence[float]) -> list[float]:
-    """Quantiles of all numbers, at least one, between neighbours linearly: as ``numpy.quantile``."""
+    """Quantiles of all numbers, between neighbours linearly: as ``numpy.quantile``; empty where there are none."""
     count, low, high = extent(pieces)
+    if not count:
+        return []
     place = np.array(shares) * (count - 1)
     below = np.floor(place).astype(np.int64)
     ranks = np.unique(np.concatenate([below, np.minimum(below + 1, count - 1)]))

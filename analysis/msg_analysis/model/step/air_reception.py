@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TypeVar
 
@@ -110,6 +110,18 @@ def add_broadcast_noise(air: Air, states: FloatArray, first: int) -> FloatArray:
     """(K, m, R) what the agents publish of x(first), ..., their values."""
     noise, steps = partial(air.broadcast_noise, until=first + len(states)), np.arange(first, first + len(states))
     return states + np.stack([_of_steps(partial(noise, i), steps) for i in range(states.shape[1])], axis=1)
+
+
+def by_sender_and_block(senders: IntArray, used: IntArray) -> Iterator[tuple[int, int, BoolArray, IntArray]]:
+    """Of messages from ``senders`` with the steps ``used`` (NOTHING: none), arrays of one shape: each sender and block.
+
+    With each, which entries are its messages, and the places of their steps in the block.
+    """
+    block, within = np.divmod(used, STEPS_PER_BLOCK)
+    heard = used != NOTHING
+    for sender, number in {*zip(senders[heard].tolist(), block[heard].tolist(), strict=True)}:
+        these = (senders == sender) & (block == number)
+        yield sender, number, these, within[these]
 
 
 class MessagesUsed:
