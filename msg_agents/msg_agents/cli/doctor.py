@@ -25,10 +25,9 @@ from typing import TYPE_CHECKING
 import click
 
 from msg_agents.processes.fork_server import early_server, prepared
-from msg_analysis.cli.console import complain, examples, print_json, print_text, result_console
+from msg_analysis.cli.console import complain, examples, print_json, result_console
 from msg_analysis.cli.options import PATH, json_option
 from msg_analysis.common.exit_codes import ExitCode
-from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from msg_agents.doctor.check import Check
     from msg_agents.doctor.networks.outcome import Outcome
 
-DEFAULT_TRIES = 20  # of a cell of --qos
 STYLES = {"ok": "green", "warning": "bold yellow", "error": "bold red"}
 NETWORKS = 10
 
@@ -45,7 +43,6 @@ NETWORKS = 10
     epilog=examples(
         "msg-agents doctor",
         "msg-agents doctor --network --networks 50 --first-seed 7",
-        "msg-agents doctor --qos --only reliable,transient_local,late --tries 5",
     )
 )
 @click.option(
@@ -64,20 +61,6 @@ NETWORKS = 10
 @click.option(
     "--out", type=PATH, metavar="DIR", show_default="runs", help="Directory in which networks that fail are kept."
 )
-@click.option("--qos", is_flag=True, help="Instead, measure what the middleware does for each quality of service.")
-@click.option(
-    "--tries",
-    type=click.IntRange(min=1),
-    metavar="N",
-    show_default=str(DEFAULT_TRIES),
-    help="With --qos: tries of each cell; ten times as many for late readers of reliable, transient-local topics.",
-)
-@click.option(
-    "--only",
-    metavar="WORDS",
-    help="With --qos: only cells with these words, such as best_effort,keep_last_10,killed,many.",
-)
-@click.option("--markdown", "as_markdown", is_flag=True, help="With --qos: tables in Markdown.")
 @json_option
 def doctor(
     *,
@@ -85,10 +68,6 @@ def doctor(
     networks: int | None,
     first_seed: int | None,
     out: Path | None,
-    qos: bool,
-    tries: int | None,
-    only: str | None,
-    as_markdown: bool,
     as_json: bool,
 ) -> None:
     """Say what this machine and shell would do to a run, and what to do about it.
@@ -97,22 +76,10 @@ def doctor(
 
     With --network: whether random networks in lockstep, whose processes are killed and stopped, are equal to their
     twins to the last bit. Exit code 1: one differs; 3: none differs, but one has failed.
-
-    With --qos: whether messages are lost, doubled or out of order where ROS 2 does not allow it, for every quality of
-    service and for readers that are late, slow, killed or stopped; takes a quarter of an hour. Exit code 1: some are;
-    3: some tries do not count: processes did not find each other.
     """
-    if network and qos:
-        raise click.UsageError("--network --qos: expected one of them: leave the other one out")
     of_networks = {"--networks": networks, "--first-seed": first_seed, "--out": out}
-    of_qos = {"--tries": tries, "--only": only, "--markdown": as_markdown or None}
     if not network and (alone := [name for name, value in of_networks.items() if value is not None]):
         raise click.UsageError(f"{alone[0]} {of_networks[alone[0]]}: it is for random networks: add --network")
-    if not qos and (alone := [name for name, value in of_qos.items() if value is not None]):
-        raise InputError(f"{alone[0]}: given without --qos: add --qos, or leave {alone[0]} out")
-    if qos:
-        _measure_qos(DEFAULT_TRIES if tries is None else tries, only, as_markdown=as_markdown, as_json=as_json)
-        return
     click.get_current_context().with_resource(prepared() if network else early_server())
     if network:
         _run_networks(NETWORKS if networks is None else networks, first_seed or 0, out or Path("runs"), as_json)
@@ -137,27 +104,6 @@ def _examine(as_json: bool) -> None:
         console.print(_summary(counts["error"], counts["warning"]), soft_wrap=True)
     if not can_run:
         sys.exit(ExitCode.BAD_INPUT)
-
-
-def _measure_qos(tries: int, only: str | None, *, as_markdown: bool, as_json: bool) -> None:
-    from msg_agents.doctor.qos.cells import select_cells
-    from msg_agents.doctor.qos.matrix import measure_matrix
-    from msg_agents.doctor.qos.table import markdown, print_matrix
-    from msg_analysis.cli.progress import WorkProgress
-    from msg_analysis.common.long_work import watched
-
-    if as_json and as_markdown:
-        raise InputError("--markdown: given with --json: expected one of them: leave one out")
-    cells = select_cells(only)
-    with WorkProgress() as progress, watched(progress):
-        matrix = measure_matrix(cells, tries)
-    if as_json:
-        print_json(matrix.to_json())
-    elif as_markdown:
-        print_text(markdown(matrix))
-    else:
-        print_matrix(result_console(), matrix)
-    sys.exit(matrix.exit_code)
 
 
 def _print_check(console: Console, check: Check) -> None:
