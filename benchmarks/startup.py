@@ -1,6 +1,6 @@
 """How long `--help` takes, of both command lines and of every command, beside Python that does nothing; a network of
-one step, as a command; and how long the processes of a network need from the call to the last x(0): forked, with the
-process that forks them prepared or not, or on their own.
+one step, as a command; and how long the processes of a network need from the call to the last x(0): forked, or
+on their own.
 
 python benchmarks/startup.py
 
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import yaml
 
-from msg_agents import prepared, run_network
+from msg_agents import run_network
 from msg_agents.cli.main import main as agents
 from msg_analysis.cli.main import main as analysis
 from msg_analysis.model.experiment.experiment import ValidExperiment
@@ -50,19 +50,15 @@ def main() -> None:
         report(
             {f"run, {NETWORKS[0]} agents": command, f"run, {NETWORKS[0]} agents, --no-fork": [*command, "--no-fork"]}
         )
-    print("\nagents   from the call to the last x(0): prepared   forked   on their own   ratios")
+    print("\nagents   from the call to the last x(0): forked   on their own   ratio")
     for size in NETWORKS:
-        soon, forked, alone = (min(values) for values in zip(*(starts(size) for _ in range(STARTS)), strict=True))
-        ratios = f"{alone / soon:.1f} {alone / forked:.1f}"
-        print(f"{size:6} {soon:41.2f} s {forked:6.2f} s {alone:12.2f} s   {ratios}", flush=True)
+        forked, alone = (min(values) for values in zip(*(starts(size) for _ in range(STARTS)), strict=True))
+        print(f"{size:6} {forked:39.2f} s {alone:12.2f} s {alone / forked:7.1f}", flush=True)
 
 
-def starts(agents: int) -> tuple[float, float, float]:
-    """Start-up times [s] of a network: the second one that is prepared, one that is not, one without forks."""
-    with prepared():
-        start_up(agents, fork=True)
-        soon = start_up(agents, fork=True)
-    return soon, start_up(agents, fork=True), start_up(agents, fork=False)
+def starts(agents: int) -> tuple[float, float]:
+    """Start-up times [s] of a network: forked, and without forks."""
+    return start_up(agents, fork=True), start_up(agents, fork=False)
 
 
 def start_up(agents: int, *, fork: bool) -> float:

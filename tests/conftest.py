@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import functools
 import gc
-import importlib.util
 import itertools
 import math
 import os
@@ -51,17 +50,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--nothing-skipped", action="store_true", help=f"fail if a test is skipped, unless its reason is {MACHINE!r}"
     )
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_sessionstart(session: pytest.Session) -> Iterator[None]:
-    """Workers of xdist, which are started here, are forked from a process that has imported most of what they need."""
-    if session.config.pluginmanager.hasplugin("dsession") and importlib.util.find_spec("rclpy"):
-        from forked_commands import installed
-
-        with installed():
-            return (yield)
-    return (yield)
 
 
 @pytest.hookimpl(trylast=True)

@@ -87,7 +87,6 @@ LAYERS = {  # lowest first; msg_agents is above msg_analysis
         "replay",
         "watching",
         "running",
-        "doctor/networks",
         "doctor",
         "__init__",
         "nodes/ros",

@@ -24,14 +24,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from msg_agents.processes.fork_server import prepared as prepared
     from msg_agents.running.run_result import RunResult as RunResult
     from msg_agents.running.run_result import conclude as conclude
     from msg_agents.running.runner import run_network as run_network
 
     __version__: str
 
-__all__ = ["RunResult", "conclude", "prepared", "run_network"]
+__all__ = ["RunResult", "conclude", "run_network"]
 
 
 def __getattr__(name: str) -> Any:
@@ -39,11 +38,9 @@ def __getattr__(name: str) -> Any:
         return _version()
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from msg_agents.processes import fork_server
     from msg_agents.running import run_result, runner
 
-    modules = {"prepared": fork_server, "run_network": runner}
-    return getattr(modules.get(name, run_result), name)
+    return getattr(runner if name == "run_network" else run_result, name)
 
 
 def _version() -> str:

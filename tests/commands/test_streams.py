@@ -15,7 +15,6 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
-import forked_workers
 import many_commands
 import pytest
 from programs import COMMANDS, command_of, without_progress
@@ -81,8 +80,7 @@ def outcomes(folder: Path, *jobs: tuple[tuple[str, str], str]) -> Iterator[tuple
         words = [uuid.uuid4().hex if word == NEW else word for word in words]
         words += ["--json"] * (kind == "json")
         lines.append([program, [name, *words], "pipe" if kind in ("plain", "json") else kind])
-    sweeps = forked_workers.NEEDED if any(name == "sweep" for (_, name), _ in jobs) else ()
-    found = many_commands.outcomes(lines, folder, sweeps, COLUMNS="80", NO_COLOR="1", TERM="xterm-256color")
+    found = many_commands.outcomes(lines, folder, COLUMNS="80", NO_COLOR="1", TERM="xterm-256color")
     for (command, kind), outcome in zip(jobs, found, strict=True):
         yield (command, kind, *outcome)
 
@@ -128,7 +126,7 @@ def test_stdout_that_has_few_characters(folder: Path) -> None:
 def test_commands_on_a_stdout_that_has_few_characters(folder: Path) -> None:
     words = (["tabulate", "result.json"], ["info", "bag"], ["sweep", *SWEEP])
     lines = [["msg-analysis", one, "ascii"] for one in words]
-    found = many_commands.outcomes(lines, folder, forked_workers.NEEDED, COLUMNS="80")
+    found = many_commands.outcomes(lines, folder, COLUMNS="80")
     for (name, *_), (code, stdout, stderr) in zip(words, found, strict=True):
         assert (code, "Traceback" in stderr) == (0, False), stderr
         assert stdout.isascii()

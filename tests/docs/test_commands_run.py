@@ -15,7 +15,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import click
-import forked_commands
 import pytest
 from click.testing import CliRunner
 from pages import EXPERIMENTS, FENCED, INDENTED, PAGES, PRINTING, ROOT, blocks, console, experiments, missing
@@ -174,8 +173,7 @@ def test_command_runs(command: str, twins: Path, tmp_path: Path, monkeypatch: py
     for file in twins.glob("*.json"):
         shutil.copy(file, tmp_path)
     arguments = [match for word in arguments for match in ([*map(str, Path().glob(word))] if "*" in word else [word])]
-    with forked_commands.installed():  # the nodes of networks
-        result = CliRunner().invoke(OURS[program], arguments, prog_name=program)
+    result = CliRunner().invoke(OURS[program], arguments, prog_name=program)
     assert result.exit_code == (2 if "bad.yaml" in command else 0), result.output
     assert result.output
     assert missing(SHOWN.get(command, []), result.output) == []

@@ -17,12 +17,11 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import forked_commands
 import pytest
 import yaml
 from left_processes import describe, last_words
@@ -79,10 +78,9 @@ class Process:
 
     @property
     def kind(self) -> str:
-        """Command of msg-agents that it runs: agent, switcher, recorder, run, ..., or node_server, run_server."""
-        for server in ("node_server", "run_server"):
-            if f"msg_agents.cli.servers.{server}" in self.command:
-                return server
+        """Command of msg-agents that it runs: agent, switcher, recorder, run, ..., or node_server."""
+        if "msg_agents.cli.servers.node_server" in self.command:
+            return "node_server"
         for program in ("msg_agents", "msg-agents", str(PROGRAM)):
             if program in self.command:
                 return self.command[self.command.index(program) + 1]
@@ -171,17 +169,14 @@ class Network:
         """Files of Fast DDS in shared memory that the nodes have mapped: a killed node would leave them behind."""
         return {path for node in self.nodes() for path in _mapped(node.pid)}
 
-    def start(
-        self, *arguments: str | Path, first: Callable[[], None] | None = None, **environment: str
-    ) -> subprocess.Popen[str]:
-        """Start ``msg-agents`` with these arguments; ``first``, of tests/support, is called in its process before."""
+    def start(self, *arguments: str | Path, machine: Sequence[str] = (), **environment: str) -> subprocess.Popen[str]:
+        """Start ``msg-agents`` with these arguments; ``machine``: see ``ill_machines``."""
         command = subprocess.Popen(
-            [str(PROGRAM), *(str(argument) for argument in arguments)],
+            [*machine, str(PROGRAM), *(str(argument) for argument in arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             env=os.environ | {"NO_COLOR": "1", **environment},
-            preexec_fn=first,
         )
         self.commands.append(command)
         return command
@@ -254,12 +249,6 @@ class Network:
         steps: Path = self.run_file().with_name(STEPS)
         self.wait_for(lambda: min(read_steps(steps) or [-1]) > 0, 60, "steps")
         return steps
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _forked() -> Iterator[None]:
-    with forked_commands.installed():
-        yield
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,11 +97,11 @@ def test_a_foreign_profile(plain_shell: Any, tmp_path: Path) -> None:
     assert (code, checks["round_trip"]["status"]) == (0, "ok")
 
 
-def refused(network: Any, name: str, first: Callable[[], None] | None = None, **variables: str) -> None:
-    """The doctor has this error, and a run the same, before anything is started; ``first`` makes their machine ill."""
-    code, checks = examined(network.start("doctor", "--json", first=first, **variables))
+def refused(network: Any, name: str, machine: Sequence[str] = (), **variables: str) -> None:
+    """The doctor has this error, and a run the same, before anything is started; ``machine``: see ``ill_machines``."""
+    code, checks = examined(network.start("doctor", "--json", machine=machine, **variables))
     assert (code, checks[name]["status"], checks["round_trip"]["status"]) == (2, "error", "warning")
-    run = network.start("run", network.file(), "--no-record", first=first, **variables)
+    run = network.start("run", network.file(), "--no-record", machine=machine, **variables)
     stdout, stderr = run.communicate(timeout=60)
     assert (run.returncode, stdout) == (2, "")
     assert stderr == f"error: {checks[name]['text']}\n"
@@ -127,16 +127,16 @@ def need_unshare(*words: str) -> None:
 
 def test_a_full_shared_memory(plain_shell: Any) -> None:
     need_unshare("--mount")
-    refused(plain_shell, "shared_memory", ill_machines.full_shared_memory)
+    refused(plain_shell, "shared_memory", ill_machines.FULL_SHARED_MEMORY)
 
 
 def test_no_loopback(plain_shell: Any) -> None:
     """A new network namespace has an interface that is down."""
     need_unshare("--net")
-    refused(plain_shell, "loopback", ill_machines.no_loopback)
+    refused(plain_shell, "loopback", ill_machines.NO_LOOPBACK)
 
 
 def test_few_descriptors(plain_shell: Any) -> None:
     """Too few for two processes: the round trip says so, without a traceback."""
-    code, checks = examined(plain_shell.start("doctor", "--json", first=ill_machines.few_descriptors))
+    code, checks = examined(plain_shell.start("doctor", "--json", machine=ill_machines.FEW_DESCRIPTORS))
     assert (code, checks["round_trip"]["status"]) == (2, "error")

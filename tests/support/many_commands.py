@@ -25,9 +25,6 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-import forked_commands
-import forked_workers
-
 PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.cli.main"}
 PREPARED = (
     *PROGRAMS.values(),
@@ -50,6 +47,11 @@ BY_COMMAND = {  # what takes long to import, and no other command needs
     "export": ("pyarrow.csv", "pyarrow.parquet"),
     "figures": ("msg_analysis.paper.figures",),
     "spectrum": ("scipy.signal",),
+    "sweep": (
+        "msg_analysis.report.figures.sweep_figure",
+        "msg_analysis.report.html.sweep_page",
+        "msg_analysis.sweep.conduct",
+    ),
 }
 CODE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); import many_commands; many_commands.main()"
 MEMORY = 1 << 30  # bytes
@@ -61,7 +63,7 @@ def outcomes(
 ) -> list[list[Any]]:
     """Exit code, stdout, stderr of each job, with this folder to work in and additions to the environment.
 
-    ``prepared``: more modules that are to be imported before; ``forked_workers.NEEDED`` for sweeps that begin.
+    ``prepared``: more modules that are to be imported before.
     """
     server = _server()
     assert server.stdin is not None
@@ -82,14 +84,13 @@ def outcomes(
 @functools.cache
 def _server() -> subprocess.Popen[str]:
     """It ends with this process, which holds the other end of its stdin."""
-    with forked_commands.installed():
-        server = subprocess.Popen(
-            [sys.executable, "-P", "-c", CODE],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-        )
+    server = subprocess.Popen(
+        [sys.executable, "-P", "-c", CODE],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+    )
     atexit.register(server.wait)
     atexit.register(server.terminate)
     return server
@@ -112,8 +113,6 @@ def child(program: str, arguments: list[str], kind: str, stdout: int, stderr: in
         sys.stdout = None  # type: ignore[assignment]  # as Python has it at its start
     else:
         os.dup2(stdout, 1)
-    if arguments[:1] == ["sweep"]:
-        forked_workers.install()
     try:
         importlib.import_module(PROGRAMS[program]).main(arguments, prog_name=program)
     except SystemExit as end:

@@ -123,18 +123,6 @@ class SweepProgress(_Progress):
         self._show(self._title, done, total, without, without)
 
 
-class NetworkProgress(_Progress):
-    """Progress of networks that run one after the other, a context manager."""
-
-    def __init__(self, title: str) -> None:
-        super().__init__(title, time_left=True)
-
-    def done(self, done: int, total: int, failed: int) -> None:
-        """Show how many networks are done, and how many of these did not go well."""
-        words = f"{failed} failed" if failed else ""
-        self._show(self._title, done, total, words, words)
-
-
 class SolveProgress(_Progress):
     """Progress of a search: a ``SearchProgress`` of ``theory.leaders.search``, and a context manager."""
 

@@ -31,7 +31,6 @@ from msg_agents.cli.doctor import doctor
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.web_options import WebCommand, announce, page, web_options
 from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
-from msg_agents.processes.fork_server import early_server
 from msg_agents.terminal.interruption import Interruption
 from msg_analysis.cli.console import CommandGroup, examples
 from msg_analysis.cli.options import (
@@ -212,8 +211,6 @@ def run(
 
     On a terminal, a panel shows the progress; with --web, a page for browsers does, too.
     """
-    if not no_fork:
-        click.get_current_context().with_resource(early_server())
     from msg_agents.running.experiment_overrides import load_with_overrides
     from msg_agents.running.runner import run_network
     from msg_agents.watching.run_view import RunView
@@ -323,8 +320,6 @@ def host(
     Give all hosts the same RUN_RECORD (from `msg-agents prepare`) and HOSTS; start them in any order. The recorder's
     host compares the record with the theory, as `msg-agents run` does; the others end with the run.
     """
-    if not (no_fork or only_profile):
-        click.get_current_context().with_resource(early_server())
     from msg_agents.processes.hosts import Hosts, this_host
     from msg_agents.running.run_folder import workshop
     from msg_agents.running.runner import run_network

@@ -12,15 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A process that has imported everything and forks others: nodes for a network, or runs for a sweep.
+"""The fork server of a network: a process that has imported everything and forks the processes of nodes.
 
-What asks for them is in ``msg_analysis.common.forked_processes``.
+Every forked process is a child of the process that asked for it, which waits for it as for any other: the fork server
+may end, or be killed, at any time.
 """
 
 from __future__ import annotations
 
 import atexit
 import contextlib
+import ctypes
 import functools
 import gc
 import json
@@ -32,71 +34,74 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, NoReturn
-
-from msg_agents.processes.environment import start_environment
-from msg_analysis.common.forked_processes import (
-    ALL_FORKED,
-    LONGEST,
-    MOST_DESCRIPTORS,
-    ForkedProcess,
-    ForkServer,
-    Process,
-    start_server,
-)
+from typing import Any, NoReturn, Protocol, Self
 
 PROGRAM = [sys.executable, "-m", "msg_agents.cli.servers.node_server"]  # calls ``serve``
-EARLY = "--early"  # argument of a server that is there before its run
-TRIAL, NEXT = "try the middleware", "fork server of the next run"  # instead of a command
-TRIAL_PATIENCE = 30.0  # s
-TRIAL_LOOK = 1e-3  # s between two looks
+LONGEST_TITLE = 200  # bytes; ROS names a log file by the title, and a longer name than 255 cannot be written
+LONGEST = 1 << 16  # bytes of a message
+MOST_DESCRIPTORS = 250  # that come with a message; Linux: 253
+ALL_FORKED = b"all"  # what the server says after the numbers of the processes that it has forked
+ANSWER_TIMEOUT = 60.0  # s; the first answer comes after all imports
+TRIAL = "try the middleware"  # instead of a command
+TRIAL_TIMEOUT = 30.0  # s
+TRIAL_POLL = 1e-3  # s
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
-ADOPTION = 1e-4  # s between two looks whether a forked process has its new parent
-READ_LATE = ("AMENT_", "CYCLONEDDS_", "FASTDDS_", "FASTRTPS_", "MSG_AGENTS_", "RCUTILS_", "RMW_", "ROS_")
-"""How variables begin that no process reads before it is a node."""
+PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # of linux/prctl.h
 _ending_at_once = False  # see ``ends_at_once``
-_forked_by = 0  # see ``await_adoption``
 
 
-@dataclass(frozen=True, slots=True)
-class _Waiting:
-    """A fork server that is there before its run."""
+class Process(Protocol):
+    """A started process: what ``subprocess.Popen`` and ``ForkedProcess`` share."""
 
-    process: Process
-    told: socket.socket  # where it will hear of its run
-    environment: Mapping[str, str]  # that it has
-    directory: Path | None  # in which it is
-    owner: int  # process that started it: one that this forks has no part in it
+    @property
+    def pid(self) -> int:
+        """Its number."""
 
-    def serves(self, environment: Mapping[str, str]) -> bool:
-        """Whether it is what a new process with this environment would be."""
-        lasting, wanted = (
-            {name: value for name, value in each.items() if not name.startswith(READ_LATE)}
-            for each in (self.environment, environment)
-        )
-        return lasting == wanted and self.directory == _directory()
+    def poll(self) -> int | None:
+        """Its exit code, or minus the signal that killed it; None while it runs."""
 
-    def end(self) -> None:
-        """End the process."""
-        self.told.close()
-        self.process.send_signal(signal.SIGKILL)
-        self.process.wait()
+    def wait(self) -> int:
+        """The same, once it has ended."""
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal, unless it has ended."""
 
 
-_waiting: _Waiting | None = None
-_several = False  # whether a run leaves a fork server for the next one
+class ForkedProcess:
+    """A child of this process that was not made by ``subprocess``."""
 
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self._code: int | None = None
 
-def _directory() -> Path | None:
-    """The working directory, unless that is gone."""
-    try:
-        return Path.cwd()
-    except OSError:
-        return None
+    def poll(self) -> int | None:
+        """Its exit code, or minus the signal that killed it; None while it runs."""
+        self._reap(os.WNOHANG)
+        return self._code
+
+    def wait(self) -> int:
+        """The same, once it has ended."""
+        while self._code is None:
+            self._reap(0)
+        return self._code
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal, unless it has ended."""
+        if self.poll() is None:
+            os.kill(self.pid, sig)
+
+    def _reap(self, options: int) -> None:
+        if self._code is None:
+            try:
+                pid, status = os.waitpid(self.pid, options)
+            except ChildProcessError:  # this program ignores SIGCHLD, and nobody knows any more: as in Popen
+                self._code = 0
+            else:
+                self._code = os.waitstatus_to_exitcode(status) if pid else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,173 +114,134 @@ class NodeStart:
     core: int | None  # to which it keeps
 
 
-class NodeServer(ForkServer):
-    """The fork server of a network, as seen by the process that runs it."""
+class NodeServer:
+    """The fork server of a network, as seen by the process that runs it: a context, at whose end the server is gone.
+
+    It imports while its user goes on; the first fork waits for that. It leaves no process behind but those that it has
+    forked. Where the system cannot do it, or the server cannot start, nothing is forked.
+    """
 
     def __init__(self, environment: Mapping[str, str], log: Path) -> None:
-        super().__init__(PROGRAM, environment, log)
-        self._directory = _directory()  # in which its process is
+        self._environment = environment
+        self._log = log  # of what the server itself prints
+        self._control: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        self._adopted = _adopt_orphans(adopt=True)
+        if self._adopted is None:
+            return self
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._control.settimeout(ANSWER_TIMEOUT)
+        with theirs, self._log.open("ab") as output:
+            self._process = subprocess.Popen(
+                [*PROGRAM, str(theirs.fileno()), " " * LONGEST_TITLE],  # room for the titles of forked processes
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=dict(self._environment),
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
+        return self
+
+    @property
+    def pid(self) -> int | None:
+        """Its number; None if it was never started."""
+        return None if self._process is None else self._process.pid
 
     def fork_nodes(self, nodes: Sequence[NodeStart]) -> list[ForkedProcess]:
-        """Fork processes, each in a session of its own; see ``fork``."""
-        return self.fork(
-            [
-                (
-                    {"arguments": node.arguments, "options": list(node.descriptors), "core": node.core},
-                    [node.output, *node.descriptors.values()],
-                )
-                for node in nodes
-            ]
-        )
+        """Fork processes, each in a session of its own.
 
-    def has_middleware(self) -> bool:
+        Fewer come back if the server ends, or cannot do it: it is then gone.
+        """
+        forked: list[ForkedProcess] = []
+        for message, descriptors in _messages(nodes):
+            if self._control is None or len(message) > LONGEST:
+                break
+            try:
+                socket.send_fds(self._control, [message], descriptors)
+                while (answer := self._control.recv(LONGEST)) != ALL_FORKED:
+                    forked.append(ForkedProcess(int(answer)))
+            except (OSError, ValueError):  # no answer, or it has ended
+                self._stop()
+        return forked
+
+    def has_middleware(self, timeout: float = TRIAL_TIMEOUT) -> bool:
         """Whether a forked process could use ROS 2: see ``middleware_check``."""
         with Path(os.devnull).open("wb") as nothing:
             trials = self.fork_nodes([NodeStart([TRIAL], {}, nothing.fileno(), None)])
-        deadline = time.monotonic() + TRIAL_PATIENCE
+        deadline = time.monotonic() + timeout
         for trial in trials:  # one, or none if nothing can be forked
             try:
                 while trial.poll() is None and time.monotonic() < deadline:
-                    time.sleep(TRIAL_LOOK)
+                    time.sleep(TRIAL_POLL)
             finally:
                 trial.send_signal(signal.SIGKILL)  # it hangs, or this process is interrupted
         return [trial.wait() for trial in trials] == [0]
 
-    def _start(self, control: socket.socket, output: IO[bytes]) -> Process:
-        return _wake(self._environment, control, output) or super()._start(control, output)
+    def _stop(self) -> None:
+        """End the fork server; what it has forked goes on."""
+        if self._process is not None and self._control is not None:
+            self._control.close()
+            self._control = None
+            self._process.kill()
+            self._process.wait()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if _several and kind is None and _waiting is None:
-            self._leave_next()
-        super().__exit__(kind, error, trace)
-
-    def _leave_next(self) -> None:
-        """Fork the fork server of the next run: it has imported everything."""
-        global _waiting
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs, Path(os.devnull).open("wb") as nothing:
-            forked = self.fork_nodes([NodeStart([NEXT], {EARLY: theirs.fileno()}, nothing.fileno(), None)])
-        if forked:
-            _waiting = _Waiting(forked[0], ours, self._environment, self._directory, os.getpid())
-        else:
-            ours.close()
+        self._stop()
+        if self._adopted is False:
+            _adopt_orphans(adopt=False)
+        with contextlib.suppress(OSError):
+            if self._log.is_file() and not self._log.stat().st_size:
+                self._log.unlink()
 
 
-@contextlib.contextmanager
-def early_server() -> Iterator[None]:
-    """Start the fork server of a run that is made within: it imports while this process goes on.
+def _messages(nodes: Sequence[NodeStart]) -> Iterator[tuple[bytes, list[int]]]:
+    """As few messages as the limits allow; each lists the requests with the places of their descriptors."""
+    texts: list[str] = []
+    together: list[int] = []
+    for node in nodes:
+        request = {"arguments": node.arguments, "options": list(node.descriptors), "core": node.core}
+        descriptors = [node.output, *node.descriptors.values()]
+        new = [number for number in dict.fromkeys(descriptors) if number not in together]
+        length = sum(map(len, texts)) + len(json.dumps(request))
+        if texts and (len(together) + len(new) > MOST_DESCRIPTORS or length > LONGEST // 2):
+            yield f"[{','.join(texts)}]".encode(), together
+            texts, together = [], []
+            new = list(dict.fromkeys(descriptors))
+        together = together + new
+        texts.append(json.dumps([request, [together.index(number) for number in descriptors]]))
+    if texts:
+        yield f"[{','.join(texts)}]".encode(), together
 
-    Nothing is done if one is waiting already.
+
+def _adopt_orphans(*, adopt: bool) -> bool | None:
+    """Whether this process becomes the parent of processes below it whose own parent has ended: set it.
+
+    Returns what was set before; None where the system has no such setting.
     """
-    global _waiting
-    if _waiting is not None or sys.platform != "linux":
-        yield
-        return
-    environment = start_environment()
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with theirs:
-        server = start_server([*PROGRAM, EARLY], environment, theirs, subprocess.DEVNULL)
-    _waiting = _Waiting(server, ours, environment, _directory(), os.getpid())
-    try:
-        yield
-    finally:
-        _end_waiting()  # no network was run, or the next one is not
-
-
-@contextlib.contextmanager
-def prepared() -> Iterator[None]:
-    """Make the runs within start sooner: a process that has imported everything waits for each of them.
-
-    It starts at once, and is there for the next run when one has ended without an exception. It is gone at the end of
-    the context. Where the system cannot fork such processes, nothing is done.
-    """
-    global _several
-    before, _several = _several, True
-    try:
-        with early_server():
-            yield
-    finally:
-        _several = before
-        if not before:
-            _end_waiting()  # of the last run; early_server had nothing to do if one was waiting already
-
-
-def _end_waiting() -> None:
-    """End the fork server whose run will not be."""
-    global _waiting
-    left, _waiting = _waiting, None
-    if left is not None:
-        left.end()
-
-
-def leave_one_waiting(serve_nodes: Callable[[socket.socket], NoReturn], unneeded: Iterable[int]) -> None:
-    """Fork a process that becomes the fork server of the run that this process will make, if it has imported all.
-
-    To be called before there are threads. ``unneeded``: descriptors that are not for that process.
-    """
-    global _waiting
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    try:
-        pid = os.fork()
-    except OSError:  # the fork server will start as without this function
-        ours.close()
-        theirs.close()
-        return
-    if pid:
-        theirs.close()
-        _waiting = _Waiting(ForkedProcess(pid), ours, dict(os.environ), _directory(), os.getpid())
-        return
-    ours.close()
-    for descriptor in unneeded:
-        os.close(descriptor)
-    serve_nodes(await_run(theirs))
-
-
-def await_run(early: socket.socket) -> socket.socket:
-    """In a process that was there before its run: take that one's environment and log; the socket to serve at."""
-    with early:
-        message, descriptors, _, _ = socket.recv_fds(early, LONGEST, MOST_DESCRIPTORS)
-    if not message:  # no network is run
-        os._exit(0)
-    control, output = descriptors
-    if os.getsid(0) != os.getpid():
-        os.setsid()
-    environment = json.loads(message)
-    for name in environment["removed"]:
-        os.environ.pop(name, None)
-    os.environ.update(environment["changed"])
-    print_to(output)
-    return socket.socket(fileno=control)
-
-
-def _wake(environment: Mapping[str, str], control: socket.socket, output: IO[bytes]) -> Process | None:
-    """Make the waiting process the fork server; None if there is none, or a new one would be another."""
-    global _waiting
-    if _waiting is None or _waiting.owner != os.getpid():
+    if sys.platform != "linux":
         return None
-    waiting, _waiting = _waiting, None
-    before = waiting.environment
-    changed = {name: value for name, value in environment.items() if before.get(name) != value}
-    message = json.dumps({"changed": changed, "removed": list(before.keys() - environment.keys())}).encode()
-    if len(message) <= LONGEST and (not _several or waiting.serves(environment)):
-        with contextlib.suppress(OSError), waiting.told:  # it has been killed
-            socket.send_fds(waiting.told, [message], [control.fileno(), output.fileno()])
-            return waiting.process
-    waiting.end()
-    return None
+    try:
+        prctl = ctypes.CDLL(None).prctl
+    except (OSError, AttributeError):
+        return None
+    before = ctypes.c_int()
+    if prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(before), 0, 0, 0) or prctl(PR_SET_CHILD_SUBREAPER, adopt, 0, 0, 0):
+        return None
+    return bool(before.value)
 
 
 def serve(
-    control: socket.socket,
-    run: Callable[[Any, list[int]], object],
-    read_ahead: Callable[[Any], object] = lambda _: None,
+    control: socket.socket, run: Callable[[list[str]], object], read_ahead: Callable[[list[str]], object]
 ) -> NoReturn:
     """Fork processes as the other side requests it, and end when that does.
 
-    A forked process does ``run`` with its request and its descriptors. It is a child of our parent. Before, this
-    process does ``read_ahead`` with every request: what that leaves, the forked ones have.
+    A forked process does ``run`` with the arguments of its command. Before, this process does ``read_ahead`` with the
+    arguments of every command: what that leaves, the forked ones have.
     """
     gc.freeze()  # the collector writes to the objects that it looks at, and their memory would be copied
     gc.enable()
@@ -287,7 +253,7 @@ def serve(
             os._exit(0)
         requests = json.loads(message)
         for request, _ in requests:
-            read_ahead(request)
+            read_ahead(request["arguments"])
         try:
             between = os.fork()  # the parent of those that it forks, until it ends
         except OSError:
@@ -302,11 +268,9 @@ def serve(
 
 
 def _fork_each(
-    control: socket.socket, requests: list[Any], descriptors: list[int], run: Callable[[Any, list[int]], object]
+    control: socket.socket, requests: list[Any], descriptors: list[int], run: Callable[[list[str]], object]
 ) -> NoReturn:
     """Fork a process for each request, say its number, and end; exit code 1: that could not be done for all."""
-    global _forked_by
-    _forked_by = os.getpid()
     for request, places in requests:
         try:
             pid = os.fork()
@@ -316,15 +280,9 @@ def _fork_each(
             control.close()
             for descriptor in {*descriptors} - {descriptors[place] for place in places}:
                 os.close(descriptor)
-            run_and_end(functools.partial(run, request, [descriptors[place] for place in places]))
+            run_and_end(functools.partial(_run_node, run, request, [descriptors[place] for place in places]))
         control.send(str(pid).encode())
     os._exit(0)
-
-
-def await_adoption() -> None:
-    """Wait until this forked process is a child of the process that asked for it."""
-    while os.getppid() == _forked_by:
-        time.sleep(ADOPTION)
 
 
 def run_and_end(run: Callable[[], object]) -> NoReturn:
@@ -362,22 +320,17 @@ def ends_at_once() -> bool:
     return _ending_at_once
 
 
-def print_to(output: int) -> None:
-    """Make a descriptor, which is closed, stdout and stderr of this process."""
+def _run_node(run: Callable[[list[str]], object], request: dict[str, Any], descriptors: list[int]) -> None:
+    """Make a forked process one of its own, and run its command."""
+    output, *others = descriptors
+    os.setsid()
     for stream in (sys.stdout, sys.stderr):
         os.dup2(output, stream.fileno())
     os.close(output)
-
-
-def begin_node(request: dict[str, Any], descriptors: list[int]) -> list[str]:
-    """Make a forked process one of its own; the arguments of its command."""
-    output, *others = descriptors
-    os.setsid()
-    print_to(output)
     if request["core"] is not None:
         with contextlib.suppress(OSError):  # the core has been taken from us
             os.sched_setaffinity(0, {request["core"]})
-    for option, descriptor in zip(request["options"], others, strict=True):
-        request["arguments"] += [option, str(descriptor)]
     arguments: list[str] = request["arguments"]
-    return arguments
+    for option, descriptor in zip(request["options"], others, strict=True):
+        arguments += [option, str(descriptor)]
+    run(arguments)

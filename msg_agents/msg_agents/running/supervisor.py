@@ -32,12 +32,11 @@ from typing import Any, Self
 
 from msg_agents.discovery.introducer import Introducer
 from msg_agents.processes.core_pinning import keep_to
-from msg_agents.processes.fork_server import NodeServer, NodeStart
+from msg_agents.processes.fork_server import NodeServer, NodeStart, Process
 from msg_agents.processes.hung_process import SHOW_STACKS, HungDetector
 from msg_agents.processes.process_plan import CHANNEL, RECORDER, SWITCHER, ProcessPlan
 from msg_agents.processes.status_file import Account, read_accounts, read_clocks, read_steps
 from msg_analysis.common.exit_codes import ExitCode
-from msg_analysis.common.forked_processes import Process
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
 """Signals and the seconds that a process has to obey each."""

@@ -22,12 +22,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
+from msg_agents.processes.fork_server import Process
 from msg_agents.watching.display import Display
 from msg_agents.watching.run_observer import RunObserver
 from msg_agents.watching.snapshot import SnapshotSource
 from msg_agents.watching.terminal_panel import plain_line
 from msg_agents.watching.view import View
-from msg_analysis.common.forked_processes import Process
 from msg_analysis.common.text.notes import print_note
 from msg_analysis.wire.topics import agent_name
 

@@ -19,8 +19,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from msg_agents.processes.fork_server import Process
 from msg_agents.watching.run_observer import RunObserver
-from msg_analysis.common.forked_processes import Process
 from msg_analysis.model.run.record import RunRecord
 
 

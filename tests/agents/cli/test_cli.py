@@ -19,7 +19,6 @@ from click.testing import CliRunner
 
 pytest.importorskip("rclpy")
 
-import forked_commands
 
 from msg_agents.cli.main import main
 from msg_analysis.bags.trajectory_writer import write_trajectory
@@ -54,12 +53,6 @@ def execute(*arguments: str | Path, directory: Path | None = None) -> subprocess
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1"}
     command = [str(PROGRAM), *(str(argument) for argument in arguments)]
     return subprocess.run(command, env=environment, cwd=directory, capture_output=True, text=True, timeout=60)
-
-
-def fork(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """In a process that is forked from one that has imported all."""
-    with forked_commands.installed():
-        return execute(*arguments)
 
 
 def refused(process: subprocess.CompletedProcess[str], *words: str) -> None:
@@ -136,7 +129,7 @@ def test_a_place_where_no_bag_can_be_made(experiment: Path, out: str, reason: st
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    refused(fork("run", tmp_path / "nowhere.yaml"), "nowhere.yaml")
+    refused(execute("run", tmp_path / "nowhere.yaml"), "nowhere.yaml")
     refused(call("run", tmp_path), str(tmp_path))
     (tmp_path / "binary").write_bytes(bytes(range(256)))
     refused(call("run", tmp_path / "binary"), "binary")
@@ -219,7 +212,7 @@ def test_unknown_agents(run_file: Path, numbers: list[str], words: list[str]) ->
 def test_the_recorder_never_overwrites(tmp_path: Path, run_file: Path) -> None:
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "mine").write_text("mine")
-    refused(fork("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
+    refused(execute("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
     assert [file.name for file in (tmp_path / "bag").iterdir()] == ["mine"]
 
 
@@ -236,7 +229,7 @@ def test_check(tmp_path: Path) -> None:
     process = call("check", tmp_path / "bad")
     assert process.returncode == 1
     assert "first: agent 2 at step 40" in process.stdout
-    process = fork("check", tmp_path / "bad", "--json")
+    process = execute("check", tmp_path / "bad", "--json")
     assert process.returncode == 1
     found = json.loads(process.stdout)
     assert (found["equal"], found["compared"], found["missing"]) == (False, 303, 0)
@@ -276,19 +269,3 @@ def test_help_and_version() -> None:
     assert "Examples:" in execute("run", "--help").stdout
     assert execute("--version").stdout.startswith("msg-agents, version ")
     refused(execute("fly"), "fly")
-
-
-@pytest.mark.parametrize(
-    ("words", "named"),
-    [
-        (["--networks", "3"], ["--networks 3", "add --network"]),
-        (["--first-seed", "0"], ["--first-seed 0", "add --network"]),
-        (["--network", "--networks", "0"], ["--networks", "0 is not in the range x>=1"]),
-        (["--network", "--first-seed", "-1"], ["--first-seed", "-1 is not in the range x>=0"]),
-        (["--network", "--out", "a_file/runs"], ["--out: a_file/runs: ", "a_file is a file: give a directory"]),
-    ],
-)
-def test_random_networks_refuse_wrong_options(tmp_path: Path, words: list[str], named: list[str]) -> None:
-    (tmp_path / "a_file").write_text("")
-    refused(call("doctor", *words, directory=tmp_path), *named)
-    assert [path.name for path in tmp_path.iterdir()] == ["a_file"]

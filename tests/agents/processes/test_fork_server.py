@@ -17,12 +17,10 @@ pytest.importorskip("rclpy")
 from waiting import gone, participants, record_of_two, wait_for
 
 from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes import fork_server
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, early_server, prepared
+from msg_agents.processes.fork_server import LONGEST_TITLE, ForkedProcess, NodeServer, NodeStart
 from msg_agents.processes.middleware_check import require_middleware
 from msg_analysis.common.cores import available_cores
-from msg_analysis.common.forked_processes import LONGEST_TITLE, ForkedProcess
 from msg_analysis.errors import InputError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="this machine: not Linux")
@@ -144,13 +142,12 @@ def children() -> set[str]:
     return {pid for file in Path("/proc/self/task").glob("*/children") for pid in file.read_text().split()}
 
 
-def test_a_middleware_that_hangs(tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_middleware_that_hangs(tmp_path: Path, domain: int) -> None:
     """It cannot be used, and the process that tried it is ended."""
-    monkeypatch.setattr(fork_server, "TRIAL_PATIENCE", 1.0)
     (tmp_path / "sitecustomize.py").write_text("import rclpy, time\nrclpy.init = lambda: time.sleep(600)\n")
     with NodeServer(node_environment(domain) | {"PYTHONPATH": str(tmp_path)}, tmp_path / "server.log") as server:
         before = children()
-        assert not server.has_middleware()
+        assert not server.has_middleware(timeout=1.0)
         assert children() <= before
 
 
@@ -167,7 +164,7 @@ PARENT = """
 import sys, time
 from pathlib import Path
 from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import EARLY, NodeServer, NodeStart, early_server
+from msg_agents.processes.fork_server import NodeServer, NodeStart
 log = Path(sys.argv[1])
 with NodeServer(node_environment(0), log / "server.log") as server, (log / "log").open("w") as output:
     (process,) = server.fork_nodes([NodeStart(["agent", "--help"], {}, output.fileno(), None)])
@@ -184,147 +181,6 @@ def test_it_ends_when_its_user_is_killed(tmp_path: Path) -> None:
         assert server.exists()
         parent.kill()
     wait_for(lambda: gone(int(server.name)))
-
-
-def early_servers(parent: int) -> list[int]:
-    """Processes that a process has started as fork servers of a later run, at least one.
-
-    Between its fork and its own command, such a process has the command of its parent.
-    """
-    wait_for(lambda: found_early_servers(parent))
-    return found_early_servers(parent)
-
-
-def found_early_servers(parent: int) -> list[int]:
-    found = []
-    for entry in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has just ended
-            of_parent = (entry / "stat").read_text().rpartition(")")[2].split()[1] == str(parent)
-            if of_parent and EARLY in (entry / "cmdline").read_text().split("\0"):
-                found.append(int(entry.name))
-    return found
-
-
-def test_a_server_that_is_there_before_its_run(tmp_path: Path, waiting: list[str], domain: int) -> None:
-    """Its processes are those of the run all the same: in its domain, with their titles."""
-    with early_server(), early_server():  # the second is not needed
-        (early,) = early_servers(os.getpid())
-        with NodeServer(node_environment(domain), tmp_path / "server.log") as server:
-            assert server.pid == early
-            process = start(server, tmp_path / "log", *waiting)
-            wait_for(lambda: participants(domain))
-            assert title(process) == ["msg-agents", *waiting]
-            process.send_signal(signal.SIGINT)
-            assert process.wait() == 3
-        assert gone(early)
-
-
-def test_an_early_server_is_killed(tmp_path: Path) -> None:
-    """The run has another one."""
-    with early_server():
-        (early,) = early_servers(os.getpid())
-        os.kill(early, signal.SIGKILL)
-        wait_for(lambda: gone(early))
-        with NodeServer(node_environment(0), tmp_path / "server.log") as server:
-            assert server.pid != early
-            assert start(server, tmp_path / "log", "agent", "--help").wait() == 0
-
-
-def test_an_early_server_without_a_run() -> None:
-    with early_server():
-        (early,) = early_servers(os.getpid())
-    assert gone(early)
-
-
-def the_new_one(before: set[str]) -> int:
-    """Number of the only child that was not there before."""
-    (child,) = children() - before
-    return int(child)
-
-
-def one_run(log: Path, environment: dict[str, str]) -> int | None:
-    """Number of the fork server of a network, whose only process says how a command is used."""
-    with NodeServer(environment, log) as server:
-        help_of_agents = start(server, log.with_suffix(".help"), "agent", "--help")
-        assert help_of_agents.wait() == 0
-        return server.pid
-
-
-def test_several_runs_are_prepared(tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each has a fork server of its own, which waits for it: forked by that of the one before."""
-    log, environment, before = tmp_path / "log", node_environment(domain), children()
-    with prepared():
-        (first,) = early_servers(os.getpid())
-        assert one_run(log, environment) == first
-        for _ in range(2):
-            waits = the_new_one(before)
-            assert fork_server.PROGRAM[-1] in title(ForkedProcess(waits))
-            assert one_run(log, environment | {"ROS_DOMAIN_ID": "7"}) == waits
-            assert gone(waits)
-        # What a process reads at its start has changed: another one is started.
-        waits = the_new_one(before)
-        assert one_run(log, environment | {"PYTHONPATH": str(tmp_path)}) != waits
-        assert gone(waits)
-        waits = the_new_one(before)
-        monkeypatch.chdir(tmp_path)
-        with NodeServer(environment | {"PYTHONPATH": str(tmp_path)}, log) as server:
-            assert server.pid != waits
-            assert start(server, tmp_path / "help", "agent", "--help").wait() == 0
-            monkeypatch.chdir("/")  # the process for the next run is still where this one began
-        waits = the_new_one(before)
-        assert one_run(log, environment | {"PYTHONPATH": str(tmp_path)}) != waits
-        # It has been killed.
-        waits = the_new_one(before)
-        os.kill(waits, signal.SIGKILL)
-        wait_for(lambda: gone(waits))
-        assert one_run(log, environment | {"PYTHONPATH": str(tmp_path)}) != waits
-        # A process that this one forks has no part in it.
-        waits = the_new_one(before)
-        if not (pid := os.fork()):
-            os._exit(one_run(log, environment | {"PYTHONPATH": str(tmp_path)}) == waits)
-        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
-    assert children() == before
-    with NodeServer(environment, log) as server:  # and leaves none
-        assert start(server, tmp_path / "help", "agent", "--help").wait() == 0
-    assert children() == before
-    assert not log.exists()
-
-
-def test_the_next_server_of_a_process_that_had_one_is_ended_too(tmp_path: Path, domain: int) -> None:
-    before = children()
-    with early_server():
-        (first,) = early_servers(os.getpid())
-        with prepared():
-            assert one_run(tmp_path / "log", node_environment(domain)) == first
-            waits = the_new_one(before)
-        assert gone(waits)
-        assert children() == before
-
-
-def test_a_prepared_run_that_fails_leaves_nothing(tmp_path: Path, domain: int) -> None:
-    before = children()
-    with prepared():
-        with pytest.raises(KeyboardInterrupt), NodeServer(node_environment(domain), tmp_path / "log"):
-            raise KeyboardInterrupt
-        assert children() == before
-
-
-WITHOUT_RUN = """
-import time
-from msg_agents.processes.fork_server import early_server
-with early_server():
-    print(flush=True)
-    time.sleep(600)
-"""
-
-
-def test_an_early_server_whose_process_is_killed() -> None:
-    with subprocess.Popen([sys.executable, "-P", "-c", WITHOUT_RUN], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        (early,) = early_servers(process.pid)
-        process.kill()
-    wait_for(lambda: gone(early))
 
 
 RUN = """

@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import forked_commands
 import pytest
 from click.testing import CliRunner, Result
 
@@ -310,9 +309,8 @@ def test_exit_codes_of_the_process() -> None:
     assert process("predict", LINE_RING, "--json").returncode == 0
     assert process("nonsense").returncode == 2
     program = Path(sys.executable).with_name("msg-analysis")
-    with forked_commands.installed():
-        for words in (["predict", "nope.yaml"], ["predict"]):
-            assert subprocess.run([program, *words], capture_output=True, timeout=60).returncode == 2
+    for words in (["predict", "nope.yaml"], ["predict"]):
+        assert subprocess.run([program, *words], capture_output=True, timeout=60).returncode == 2
 
 
 def test_interrupt_is_quiet(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import forked_commands
 import pyarrow.parquet
 import pytest
 import yaml
@@ -42,15 +41,14 @@ def file(directory: Path, **sweep: Any) -> Path:
 
 
 def start(*arguments: str | Path) -> subprocess.Popen[str]:
-    with forked_commands.installed():
-        return subprocess.Popen(
-            [PROGRAM, "sweep", *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-            env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1"},
-        )
+    return subprocess.Popen(
+        [PROGRAM, "sweep", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1"},
+    )
 
 
 @pytest.fixture

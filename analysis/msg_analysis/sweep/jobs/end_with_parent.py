@@ -28,10 +28,10 @@ import sys
 PR_SET_PDEATHSIG = 1
 
 
-def end_with_parent(parent: int, number: signal.Signals = signal.SIGTERM) -> None:
+def end_with_parent(parent: int) -> None:
     """Ask for the signal; if the parent has ended already, end."""
     with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(number))
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM))
     if os.getppid() != parent:
         sys.exit(1)
 

@@ -20,7 +20,6 @@ Nothing of ROS is imported here: only the process that is started needs it.
 from __future__ import annotations
 
 import fcntl
-import functools
 import json
 import os
 import shutil
@@ -35,12 +34,10 @@ from pathlib import Path
 from typing import Any
 
 from msg_analysis.common.blas_threads import SINGLE_THREAD
-from msg_analysis.common.forked_processes import ForkServer, Process
 from msg_analysis.errors import InputError
 from msg_analysis.sweep.jobs.job import Job, NetworkOptions, NetworkStoppedError
 
 PROGRAM = "msg-agents"
-RUN_SERVER = "msg_agents.cli.servers.run_server"
 POLL = 0.1  # s
 # Signals, and the seconds that a run then has to end: it ends its own processes in order.
 ESCALATION = ((signal.SIGINT, 30.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 5.0))
@@ -134,34 +131,23 @@ def _run(
     return document, said, process.wait()
 
 
-def _start(program: str, arguments: Sequence[str], descriptors: Sequence[int]) -> Process:
+def _start(program: str, arguments: Sequence[str], descriptors: Sequence[int]) -> subprocess.Popen[bytes]:
     """Start the command; the descriptors are for its stdout, its stderr and the slot."""
     # In a session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The slot is
     # inherited: if this worker is killed, the next network waits until this one has ended.
-    server = _fork_server(program)
-    if server and (forked := server.fork([({"arguments": arguments, "parent": os.getpid()}, descriptors)])):
-        return forked[0]
     stdout, stderr, slot = descriptors
     return subprocess.Popen(
         [sys.executable, str(_LEASH), str(os.getpid()), program, *arguments],
         stdin=subprocess.DEVNULL,
         stdout=stdout,
         stderr=stderr,
+        env={**os.environ, **SINGLE_THREAD},  # networks and workers share the cores
         start_new_session=True,
         pass_fds=[slot],
     )
 
 
-@functools.cache
-def _fork_server(program: str) -> ForkServer | None:
-    """What forks the runs of this worker, until the worker ends; None where the program is no script of Python."""
-    python = _interpreter(Path(program))
-    if python is None:
-        return None
-    return ForkServer([python, "-P", "-m", RUN_SERVER], {**os.environ, **SINGLE_THREAD}).__enter__()
-
-
-def _end(process: Process) -> None:
+def _end(process: subprocess.Popen[bytes]) -> None:
     for number, patience in ESCALATION:
         process.send_signal(number)
         deadline = time.monotonic() + patience

@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Programs that import everything and fork processes: started by other processes, not by users."""
+"""The program of the fork server: started by runs, not by users."""

@@ -12,10 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""``python -m msg_agents.cli.servers.node_server [--early] SOCKET``: imports what nodes need, and forks them.
-
-With ``--early`` it is told of its run later: see ``fork_server.early_server``.
-"""
+"""``python -m msg_agents.cli.servers.node_server SOCKET``: imports what nodes need, and forks them."""
 
 from __future__ import annotations
 
@@ -25,7 +22,6 @@ import os
 import socket
 import sys
 from pathlib import Path
-from typing import Any, NoReturn
 
 MODULES = (
     "importlib.readers",  # by the recorder: the definitions of messages
@@ -47,11 +43,9 @@ NODES = ("agent", "recorder", "switcher")  # commands that take a run record
 def main() -> None:
     """Import all, and serve."""
     prepare()
-    from msg_agents.processes.fork_server import EARLY, await_run
+    from msg_agents.processes.fork_server import serve
 
-    early = sys.argv[1] == EARLY
-    control = socket.socket(fileno=int(sys.argv[2 if early else 1]))
-    serve_nodes(await_run(control) if early else control)
+    serve(socket.socket(fileno=int(sys.argv[1])), run_command, _read_record)
 
 
 def prepare() -> None:
@@ -72,41 +66,13 @@ def prepare() -> None:
     getproctitle()  # it finds the place of titles only as long as the environment has not been changed
 
 
-def serve_nodes(control: socket.socket) -> NoReturn:
-    """Fork nodes; in a forked process, run the command of one."""
-    from msg_agents.nodes.ros.middleware import use_middleware
-    from msg_agents.processes.fork_server import EARLY, NEXT, TRIAL, await_run, begin_node, serve
-
-    def run(request: dict[str, Any], descriptors: list[int]) -> None:
-        arguments = begin_node(request, descriptors)
-        if arguments == [TRIAL]:
-            _show_as(arguments)
-            use_middleware()
-        elif arguments[:2] == [NEXT, EARLY]:
-            serve_waiting(await_run(socket.socket(fileno=int(arguments[2]))))
-        else:
-            run_command(arguments)
-
-    serve(control, run, _read_record)
-
-
-def _read_record(request: dict[str, Any]) -> None:
+def _read_record(arguments: list[str]) -> None:
     """Read the run record of a node once for all that are forked: each would take a fifth of its start for it."""
     from msg_agents.cli.nodes import read_record_ahead
 
-    command, *rest = request["arguments"]
+    command, *rest = arguments
     if command in NODES:
         read_record_ahead(Path(rest[0]))
-
-
-def serve_waiting(control: socket.socket) -> NoReturn:
-    """The same in a process that was forked for its network: see ``fork_server.leave_one_waiting``."""
-    from setproctitle import setproctitle
-
-    from msg_agents.processes.fork_server import PROGRAM
-
-    setproctitle(" ".join(PROGRAM))
-    serve_nodes(control)
 
 
 def run_command(arguments: list[str]) -> None:
@@ -114,8 +80,13 @@ def run_command(arguments: list[str]) -> None:
     import numpy as np
 
     from msg_agents.cli.main import main as command
+    from msg_agents.nodes.ros.middleware import use_middleware
+    from msg_agents.processes.fork_server import TRIAL
 
     _show_as(arguments)
+    if arguments == [TRIAL]:
+        use_middleware()
+        return
     np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
     sys.argv = ["msg-agents", *arguments]
     command(arguments, prog_name="msg-agents")
@@ -125,7 +96,7 @@ def _show_as(arguments: list[str]) -> None:
     """In ``ps``, and in the names of log files of ROS."""
     from setproctitle import setproctitle
 
-    from msg_analysis.common.forked_processes import LONGEST_TITLE
+    from msg_agents.processes.fork_server import LONGEST_TITLE
 
     title = os.fsencode(f"msg-agents {' '.join(arguments)}")
     setproctitle(title[:LONGEST_TITLE].decode(errors="ignore"))

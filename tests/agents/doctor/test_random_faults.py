@@ -1,0 +1,254 @@
+"""Random faults of the tests: when they come, what a run survives, and what is wrong with a run that has met them."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from random_faults import Fault, FaultInjection, FaultPlan, Verdict, judge, plan_faults
+from waiting import state_of, wait_for
+
+from msg_agents.processes.environment import RESTARTS
+from msg_agents.running.run_result import RunResult
+from msg_agents.terminal.interruption import Interruption
+from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.twin.simulate import simulate
+
+AGENTS, STEPS = 3, 1000
+NODES = {"agent_1", "agent_2", "agent_3", "switcher", "recorder"}
+KILL, STOP = Fault("agent_2", 10, 0.0), Fault("agent_1", 20, 0.0, stopped=1.0)
+KILL_RECORDER = Fault("recorder", 10, 0.0)
+KILLED = "agent_2: killed by SIGKILL after step 12, started again"
+SALVAGED = "the bag was salvaged: 100 messages kept"
+LAST = "last recorded step: agent 1: 40, agent 2: 41, agent 3: 40"
+
+Processes = dict[str, subprocess.Popen[bytes]]
+
+
+@pytest.fixture
+def processes() -> Iterator[Processes]:
+    """Of two agents and a recorder, which do nothing."""
+    started = {name: subprocess.Popen(["sleep", "600"]) for name in ("agent_1", "agent_2", "recorder")}
+    yield started
+    for process in started.values():
+        process.kill()
+        process.wait()
+
+
+def injection(processes: Processes, *faults: Fault) -> FaultInjection:
+    made = FaultInjection(FaultPlan(faults, 3))
+    made.started(processes)
+    return made
+
+
+def stopped(process: subprocess.Popen[bytes]) -> bool:
+    return state_of(process.pid) == "T"
+
+
+def test_a_kill_comes_when_all_agents_have_made_its_step(processes: Processes) -> None:
+    late, early = Fault("agent_2", 7, 0.0), Fault("agent_1", 5, 0.0)
+    made = injection(processes, early, late)
+    made.look([])
+    made.look([4, 9])
+    assert made.delivered == []
+    made.look([6, 9])
+    assert made.delivered == [early]
+    assert processes["agent_1"].wait() == -signal.SIGKILL
+    made.look([7, 9])
+    assert made.delivered == [early, late]
+    assert processes["agent_2"].wait() == -signal.SIGKILL
+    assert processes["recorder"].poll() is None
+
+
+def test_a_fault_before_the_first_step(processes: Processes) -> None:
+    made = injection(processes, Fault("agent_1", -1, 0.0))
+    made.look([])
+    assert processes["agent_1"].wait() == -signal.SIGKILL
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="this machine: no /proc")
+@pytest.mark.parametrize("ending", [False, True])
+def test_a_stopped_process_goes_on(processes: Processes, ending: bool) -> None:
+    """After its time, or as soon as the run is over."""
+    made = injection(processes, Fault("recorder", 0, 0.0, stopped=600.0 if ending else 0.0))
+    made.look([0, 0])
+    wait_for(lambda: stopped(processes["recorder"]))
+    if ending:
+        made.look([1, 1])
+        assert stopped(processes["recorder"])
+        made.end()
+    else:
+        made.look([1, 1])
+    wait_for(lambda: not stopped(processes["recorder"]))
+
+
+def test_a_process_that_has_ended_meets_no_fault(processes: Processes) -> None:
+    made = injection(processes, Fault("agent_1", 0, 0.0), Fault("agent_2", 0, 0.0, stopped=1.0))
+    for name in ("agent_1", "agent_2"):
+        processes[name].kill()
+        processes[name].wait()
+    made.look([3, 3])
+    assert made.delivered == []
+
+
+def test_the_process_of_a_restarted_node(processes: Processes) -> None:
+    made = injection(processes, Fault("agent_1", 2, 0.0))
+    processes["agent_1"].kill()
+    processes["agent_1"].wait()
+    made.started(processes | {"agent_1": processes["recorder"]})
+    made.look([2, 2])
+    assert processes["recorder"].wait() == -signal.SIGKILL
+
+
+def test_a_run_that_stands_still_is_ended_once(processes: Processes) -> None:
+    made = FaultInjection(FaultPlan((), 3), patience=0.0)
+    made.started(processes)
+    made.note("no step for 5 s: cause unknown")
+    with Interruption() as interruption:
+        made.look([2, 3])
+        assert interruption.caught is None
+        wait_for(lambda: made.look([2, 3]) or made.standstill)
+        assert interruption.caught == signal.SIGINT
+        interruption.caught = None
+        made.look([2, 3])
+        assert interruption.caught is None
+    assert made.standstill == "ended after 0 s without a step: no step for 5 s: cause unknown"
+
+
+def plan(*faults: Fault, restarts: int = 3) -> FaultPlan:
+    return FaultPlan(faults, restarts)
+
+
+def kill(node: str) -> Fault:
+    return Fault(node, 0, 0.0)
+
+
+def test_all_nodes_and_all_times() -> None:
+    faults = [fault for seed in range(300) for fault in plan_faults(seed, AGENTS, STEPS).faults]
+    for kills in (False, True):
+        assert {fault.node for fault in faults if fault.kills == kills} == NODES
+    assert min(fault.step for fault in faults) == -1
+    assert 600 < max(fault.step for fault in faults) < STEPS
+    assert min(fault.stopped for fault in faults if fault.stopped is not None) > 0
+
+
+def test_most_runs_go_on() -> None:
+    plans = [plan_faults(seed, AGENTS, STEPS) for seed in range(300)]
+    ends = [each for each in plans if not each.survivable]
+    assert 20 < len(ends) < 60
+    assert {each.restarts for each in plans if each.survivable} == {RESTARTS}
+    assert {sum(fault.kills for fault in each.faults) for each in plans if each.survivable} == set(range(RESTARTS + 1))
+    for each in ends:
+        killed = [fault.node for fault in each.faults if fault.kills]
+        assert killed.count("recorder") == 1 or len(killed) == each.restarts + 1
+
+
+def test_what_a_run_survives() -> None:
+    """As docs/faults.md says: as many killed agents and switchers as there are restarts, and no killed recorder."""
+    assert plan().survivable
+    assert plan(kill("agent_1"), kill("switcher"), kill("agent_1")).survivable
+    assert plan(Fault("recorder", 0, 0.0, stopped=1.0)).survivable
+    assert not plan(kill("recorder")).survivable
+    assert plan(kill("agent_1"), restarts=1).survivable
+    assert not plan(kill("agent_1"), restarts=0).survivable
+    assert not plan(*(kill("switcher") for _ in range(4))).survivable
+
+
+def simulated(seed: int) -> Trajectory:
+    document = {
+        "name": "small",
+        "graphs": {"line": {"path": [1, 2, 3]}, "pair": {"path": [1, 2]}},
+        "switching": {"rates": {"line": {"pair": 2.0}, "pair": {"line": 2.0}}},
+        "run": {"duration": 5, "start": "zero", "seed": seed},
+    }
+    return simulate(ValidExperiment.parse(document))
+
+
+@pytest.fixture(scope="module")
+def twin() -> Trajectory:
+    return simulated(0)
+
+
+def run(trajectory: Trajectory, **changes: Any) -> RunResult:
+    return RunResult(trajectory.record.experiment, None, trajectory=trajectory, **changes)
+
+
+def test_equal(twin: Trajectory) -> None:
+    assert judge(run(twin), plan()) == Verdict("equal", "303 states", 303)
+    assert judge(run(twin, restarts=[KILLED]), plan(KILL, STOP)).status == "equal"
+
+
+def one_bit(states: Any) -> None:
+    states[57, 1, 0] = np.nextafter(states[57, 1, 0], np.inf)
+
+
+def changed(twin: Trajectory, change: Callable[[Any], None]) -> Trajectory:
+    states = twin.states.copy()
+    change(states)
+    return replace(twin, states=states)
+
+
+def test_one_bit(twin: Trajectory) -> None:
+    """In the last place of one number; whatever else has happened."""
+    wrong = changed(twin, one_bit)
+    for verdict in (
+        judge(run(wrong), plan()),
+        judge(run(wrong, failures=["recorder: killed by SIGKILL", SALVAGED]), plan(KILL_RECORDER)),
+        judge(run(wrong), plan(), "ended after 60 s without a step"),
+    ):
+        assert verdict.status == "differs"
+        assert verdict.text.startswith("agent 2 at step 57, replica 1: logged ")
+
+
+def test_another_seed(twin: Trajectory) -> None:
+    other = replace(simulated(1), record=twin.record)
+    assert judge(run(other), plan(KILL)).status == "differs"
+
+
+def test_missing_and_twice(twin: Trajectory) -> None:
+    count = twin.completeness
+    for found in (replace(count, missing=1), replace(count, missing_modes=1), replace(count, duplicates=1)):
+        verdict = judge(run(replace(twin, completeness=found)), plan(KILL))
+        assert verdict.status == "failed", found
+
+
+@pytest.mark.parametrize(
+    ("faults", "restarts", "failures"),
+    [
+        ([KILL_RECORDER], 3, ["recorder: killed by SIGKILL", SALVAGED, LAST]),
+        ([KILL_RECORDER, STOP], 3, ["recorder: killed by SIGKILL", "nothing was recorded: the run ended before"]),
+        ([KILL], 0, ["agent_2: killed by SIGKILL: a last word", LAST]),
+        ([KILL] * 4, 3, ["agents_2_to_3: killed by SIGKILL. Not started again: all restarts are used up", LAST]),
+    ],
+)
+def test_ended_by_its_faults(twin: Trajectory, faults: list[Fault], restarts: int, failures: list[str]) -> None:
+    """But not without them, or if it could have gone on."""
+    short = replace(twin, completeness=replace(twin.completeness, missing=200))
+    ended = run(short, failures=failures)
+    assert judge(ended, plan(*faults, restarts=restarts)) == Verdict("ended", failures[0], 303)
+    assert judge(ended, plan(STOP, restarts=restarts)) == Verdict("failed", failures[0], 303)
+    assert judge(ended, plan(KILL, restarts=1)).status == "failed"
+    worse = run(short, failures=[*failures, "agent_1: exit code 1: MemoryError"])
+    assert judge(worse, plan(*faults, restarts=restarts)).status == "failed"
+
+
+def test_restarts_without_a_fault(twin: Trajectory) -> None:
+    crash = "agent_2: exit code 1 (KeyError: 3), started again"
+    for restarts, faults in (([crash], [KILL]), ([KILLED, crash], [KILL, KILL]), ([KILLED, KILLED], [KILL, STOP])):
+        verdict = judge(run(twin, restarts=restarts), plan(*faults))
+        assert verdict.status == "failed"
+        assert verdict.text == f"restarted without a fault: {restarts[-1]}"
+
+
+def test_a_standstill(twin: Trajectory) -> None:
+    """Its bag was not read."""
+    result = RunResult(twin.record.experiment, None, interrupted_by=2, failures=["stopped by Ctrl-C at step 3"])
+    words = "ended after 60 s without a step"
+    assert judge(result, plan(KILL), words) == Verdict("failed", words)
