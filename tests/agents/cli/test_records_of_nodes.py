@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ def written(directory: Path, **changes: Any) -> Path:
     graphs = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
     switching = {"generator": [[-1, 1], [1, -1]]}
     document = {"name": "net", "problem": "consensus", "time": "continuous", "graphs": graphs, "switching": switching}
-    run = {"dt": 0.05, "duration": 5, "start": [1.0, -1.0, 2.0]}
+    run = {"dt": changes.pop("dt", 0.05), "duration": 5, "start": [1.0, -1.0, 2.0]}
     file = directory / "run.json"
     file.write_text(new_record(ValidExperiment.parse({**document, **changes, "run": run})).to_json(with_key=True))
     return file
@@ -57,4 +58,15 @@ def test_what_is_no_record_is_an_error_of_the_node(tmp_path: Path, text: str) ->
     read_record_ahead(file)
     read_record_ahead(tmp_path / "missing.json")
     with pytest.raises(InputError, match=r"run\.json: not a run record"):
+        load_record(file)
+
+
+@pytest.mark.parametrize(("key", "words"), [("started", "KeyError: 'started'"), ("step", "step: missing")])
+def test_what_every_record_has(tmp_path: Path, key: str, words: str) -> None:
+    """The time of its start, and matrices in discrete time: those of before the first release did not."""
+    file = written(tmp_path, time="discrete", switching={"transition": [[0.5, 0.5], [0.5, 0.5]]}, dt=1)
+    document = json.loads(file.read_text())
+    del document[key]
+    file.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=words):
         load_record(file)

@@ -30,7 +30,6 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.common.blas_threads import one_blas_thread
 from msg_analysis.common.version import __version__, ros_distribution
 from msg_analysis.errors import InputError
 from msg_analysis.model.experiment.experiment import ValidExperiment
@@ -42,7 +41,6 @@ from msg_analysis.model.step.step_model import (
     Wiring,
     build_model,
     build_step_model,
-    step_matrices,
 )
 from msg_analysis.types import FloatArray
 
@@ -93,7 +91,7 @@ class RunRecord:
         with which the nodes sign what steers the run: see ``wire.signatures``; None where it is not known, in bags for
         example, or not used
     started
-        when the record was made; None in records of the first edition
+        when the record was made
     until
         when the run may end before its duration; None: it does not
     planned
@@ -107,7 +105,7 @@ class RunRecord:
     versions: dict[str, str] = field(default_factory=software_versions)
     matrices: StepMatrices | None = None
     key: bytes | None = field(default=None, repr=False)
-    started: datetime.datetime | None = field(default_factory=_now)
+    started: datetime.datetime = field(default_factory=_now)
     until: Until | None = None
     planned: int | None = None
 
@@ -149,9 +147,8 @@ class RunRecord:
             "experiment": self.experiment.to_document(),
             "start": self.start.tolist(),
             "versions": self.versions,
+            "started": self.started.isoformat(),
         }
-        if self.started:
-            document["started"] = self.started.isoformat()
         if self.until:
             document["until"] = str(self.until)
         if self.planned:
@@ -192,7 +189,9 @@ class RunRecord:
             experiment = ValidExperiment.parse(document["experiment"], source=source, recorded=info_of(document))
             start = np.array(document["start"], dtype=float)
             step = document.get("step")
-            matrices = _without_matrices(experiment) if step is None else _matrices(step, experiment, source)
+            matrices = None if step is None else _matrices(step, experiment, source)
+            if matrices is None and experiment.time == "discrete" and not experiment.protocol:
+                raise InputError(f"{source}: step: missing: expected the matrices of a step: record the run again")
             run, versions = uuid.UUID(document["run"]), dict(document["versions"])
             key = bytes.fromhex(document["key"]) if "key" in document else None
             until = Until.parse(document["until"], f"{source}: until") if "until" in document else None
@@ -210,9 +209,7 @@ class RunRecord:
         return record
 
 
-def _started(document: dict[str, Any]) -> datetime.datetime | None:
-    if "started" not in document:
-        return None
+def _started(document: dict[str, Any]) -> datetime.datetime:
     found = datetime.datetime.fromisoformat(document["started"])
     return (found if found.tzinfo else found.replace(tzinfo=datetime.UTC)).astimezone(datetime.UTC)
 
@@ -237,13 +234,3 @@ def _matrices(document: Any, experiment: ValidExperiment, source: str) -> StepMa
             stack[mode, agents[:, 0], agents[:, 1]] = entries[:, 2]
         stacks[key] = stack
     return StepMatrices(**stacks)
-
-
-def _without_matrices(experiment: ValidExperiment) -> StepMatrices | None:
-    """For records of the first edition, which carry no matrices: in discrete time they used scipy's exponential."""
-    if experiment.time == "continuous" or experiment.protocol:
-        return None
-    import scipy.linalg  # here, since the processes of a run would wait for it
-
-    with one_blas_thread():
-        return step_matrices(experiment, scipy.linalg.expm)

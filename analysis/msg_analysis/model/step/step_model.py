@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
@@ -169,8 +168,8 @@ def build_model(experiment: ValidExperiment, matrices: StepMatrices | None = Non
     )
 
 
-def step_matrices(experiment: ValidExperiment, expm: Callable[[FloatArray], FloatArray] = exponential) -> StepMatrices:
-    """Compute the matrices of a step; ``expm`` is the exponential of a matrix (m, m).
+def step_matrices(experiment: ValidExperiment) -> StepMatrices:
+    """Compute the matrices of a step.
 
     InputError: the experiment has a protocol that is not linear, is not available, or fails.
     """
@@ -181,7 +180,7 @@ def step_matrices(experiment: ValidExperiment, expm: Callable[[FloatArray], Floa
         weights[:, range(agents), range(agents)] -= dt * np.where(grounded, 0.0, experiment.leader_gains)
         weights[:, grounded] = 0.0
     else:
-        weights, gain = _built_in(experiment, expm), experiment.step_noise_gain
+        weights, gain = _built_in(experiment), experiment.step_noise_gain
     if experiment.time == "continuous":
         gain[:, grounded] = 0.0  # a leader held at the reference has no noise either
     return StepMatrices(weights, gain)
@@ -233,7 +232,7 @@ def build_step_model(experiment: ValidExperiment, matrices: StepMatrices | None 
     )
 
 
-def _built_in(experiment: ValidExperiment, expm: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def _built_in(experiment: ValidExperiment) -> FloatArray:
     """(n, m, m): W_g of the law that the agents have by themselves, with its leaders."""
     gains, agents = experiment.leader_gains, experiment.agents
     grounded = np.isinf(gains)
@@ -247,7 +246,7 @@ def _built_in(experiment: ValidExperiment, expm: Callable[[FloatArray], FloatArr
         else:
             # The limit of exp(-(L + K)) for gains to infinity: leaders forget, followers no longer hear them.
             block = np.ix_(follows, follows)
-            weights[mode][block] = expm(-z[block])
+            weights[mode][block] = exponential(-z[block])
     return weights
 
 

@@ -34,7 +34,7 @@ def page_title(comparison: Comparison) -> str:
     parts = [records[0].experiment.name]
     if len(records) > 1:
         parts.append(counted(len(records), "run"))
-    parts += [_seeds(records), *_dates(records)[:1]]
+    parts += [_seeds(records), _dates(records)[0]]
     return f"{SYMBOLS[comparison.verdict]} {', '.join(parts)}: {comparison.verdict}"
 
 
@@ -43,8 +43,8 @@ def run_facts(comparison: Comparison, wall_time: float | None) -> list[tuple[str
     records = _records(comparison)
     experiment = records[0].experiment
     facts = [("seed" if len(records) == 1 else "seeds", _seeds(records).partition(" ")[2])]
-    if dates := _dates(records):
-        facts.append(("date", " to ".join(dict.fromkeys((dates[0], dates[-1]))) + " UTC"))
+    dates = _dates(records)
+    facts.append(("date", " to ".join(dict.fromkeys((dates[0], dates[-1]))) + " UTC"))
     durations = sorted({record.experiment.run.duration for record in records})
     time = " to ".join(f"{each:g}" for each in dict.fromkeys((durations[0], durations[-1])))
     steps = f", {counted(experiment.steps, 'step')} of {experiment.step_length:g}" if len(durations) == 1 else ""
@@ -66,9 +66,9 @@ def _seeds(records: Sequence[RunRecord]) -> str:
 
 
 def _dates(records: Sequence[RunRecord]) -> list[str]:
-    """Ascending, to the minute; the first edition did not record them."""
-    known = sorted(record.started for record in records if record.started)
-    return [date.astimezone(datetime.UTC).strftime("%Y-%m-%d %H:%M") for date in known]
+    """Ascending, to the minute."""
+    dates = sorted(record.started for record in records)
+    return [date.astimezone(datetime.UTC).strftime("%Y-%m-%d %H:%M") for date in dates]
 
 
 def _pace(experiment: ValidExperiment) -> str:
