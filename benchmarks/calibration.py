@@ -75,7 +75,6 @@ def summary(case: str, comparison: Comparison) -> dict[str, Any]:
         "disagrees": comparison.verdict == "disagrees",
         "order": order is not None and any(pair.predicted is False for pair in order.distinctions),
         "p": {test.name: test.p for test in comparison.tests},
-        "by": sorted({test.name.partition(" of agent")[0] for test in comparison.tests if test.rejected}),
     }
     if case in FALSE and comparison.blame:
         first = comparison.blame[0]

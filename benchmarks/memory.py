@@ -43,7 +43,7 @@ from msg_analysis.wire.state_batches import encode_batch
 from msg_analysis.wire.topics import GRAPH, PROGRESS, STATE, STATES, agent_name, network_topics
 
 POINTS = 5
-AGENTS, STEPS_IN_AN_HOUR = 1000, 210_000  # at 58 steps a second, docs/scale.md
+AGENTS, STEPS_IN_AN_HOUR = 1000, 210_000  # at 58 steps a second, docs/performance.md
 TOGETHER = 25  # sojourns after which made-up agents tell their steps
 
 
