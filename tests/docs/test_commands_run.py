@@ -46,7 +46,6 @@ TESTED = {  # and where
     r"msg-agents host": "tests/integration/test_hosts.py",
     r"msg-agents check$": "tests/integration/test_docs.py",
     r"(ROS_DISCOVERY_SERVER=\S+ )?msg-agents doctor$": "tests/integration/test_doctor.py",
-    r"msg-agents doctor --network": "tests/integration/test_random_networks.py",
     r"msg-agents doctor --qos": "tests/integration/test_qos.py",
     r"msg-analysis sweep (rates|rates_and_loss)\.yaml": "tests/analysis/cli/test_sweep.py",
     r"msg-analysis figures 3": "tests/analysis/paper/test_paper.py",
