@@ -185,20 +185,20 @@ def test_what_the_launch_files_do(network: Any) -> None:
     assert check(read_bag(launched.bag)).difference is None
 
 
-def stranger() -> str:
+def watcher() -> str:
     """The node of docs/ros.md."""
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs/ros.md").read_text(encoding="utf-8"), re.M | re.S)
-    (code,) = [block for block in blocks if "class Stranger" in block]
+    (code,) = [block for block in blocks if "class Watcher" in block]
     assert "msg_agents." not in code
     assert "msg_analysis" not in code
     return code
 
 
 @pytest.mark.timeout(150)
-def test_a_stranger(network: Any, domain: int) -> None:
+def test_a_node_of_your_own(network: Any, domain: int) -> None:
     """A plain rclpy node sees graphs and states of a running network, and ends with it."""
-    watching = start("python", "-P", "-c", stranger(), cwd=network.directory)
-    network.wait_for(lambda: participants(domain), 60, "the stranger has a node")  # later it would wait for ever
+    watching = start("python", "-P", "-c", watcher(), cwd=network.directory)
+    network.wait_for(lambda: participants(domain), 60, "the watcher has a node")  # later it would wait for ever
     file = network.file(run={"pace": "realtime", "speed": 2.5, "processes": 2})  # 6 s
     result = network.completed(network.record(file, "--domain", str(domain), "--json"))
     assert result["strangers"] == []

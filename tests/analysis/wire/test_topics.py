@@ -6,10 +6,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.topics import CLOCK, DIAGNOSTICS, STATE, TOPICS, TRUTH, network_topics
+from msg_analysis.wire.topics import STATE, TOPICS, TRUTH, network_topics
 
 DOCS = Path(__file__).parents[3] / "docs"
 
@@ -43,11 +41,9 @@ def rows(page: str) -> Iterator[list[str]]:
         yield from ([name, *before[1:]] for name in re.findall("`(.*?)`", before[0]))
 
 
-@pytest.mark.parametrize(("page", "with_qos"), [("messages.md", False), ("ros.md", True)])
-def test_documentation(page: str, with_qos: bool) -> None:
-    found = {name: (kind.strip("`"), rest[-1] if with_qos else "") for name, kind, *rest in rows(page)}
-    listed = TOPICS if with_qos else [topic for topic in TOPICS if topic not in (DIAGNOSTICS, CLOCK)]
-    assert found == {topic.name: (topic.type.full_name, str(topic.qos) if with_qos else "") for topic in listed}
+def test_documentation() -> None:
+    found = {name: (kind.strip("`"), qos) for name, kind, _, qos in rows("ros.md")}
+    assert found == {topic.name: (topic.type.full_name, str(topic.qos)) for topic in TOPICS}
 
 
 def test_publishers_in_the_documentation() -> None:
